@@ -1,0 +1,36 @@
+# `make demo` and `make test` need Python 3.11-3.13, make and git; the rest is installed into .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+JOBS ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2)
+
+.PHONY: help demo test lint clean
+
+help:
+	@echo "make demo   set up, run a small suite of the shipped model on the shipped maps, write report and playback"
+	@echo "make test   set up, run the tests"
+	@echo "make lint   ruff and mypy"
+
+# The stamp depends on what is installed, so a second run installs nothing.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null || { \
+	  echo "benchnav: expected Python 3.11, 3.12 or 3.13, got \"$$($(PYTHON) --version 2>&1)\" from $(PYTHON); run make PYTHON=/path/to/python3.12" >&2; exit 2; }
+	@echo "benchnav: setting up $(VENV) (several minutes and about 7 GB, once)"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/benchnav-eval run --config benchnav/eval/suites/demo.yaml --out runs/demo --overwrite true --jobs $(JOBS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n $(JOBS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,1 @@
+"""Synthetic 2.5D terrain: generation, storage and reading of datasets (paper, III-A)."""

@@ -1,0 +1,120 @@
+"""Rough ground: fractal elevation, craters, and slope by Horn's method.
+
+Batched NumPy in float64: NumPy's Fourier transform gives the same numbers on every machine, those
+that PyTorch links to do not. Letters in shapes: B maps, H×W cells.
+
+Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Horn (1981), "Hill shading and
+the reflectance map", for slope; Pike (1977) for the proportions of craters.
+"""
+
+import numpy as np
+
+from benchnav import rng
+
+
+def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: float) -> np.ndarray:
+    """Synthesises fractal surfaces from a power-law spectrum.
+
+    Args:
+        key: stream key.
+        indices: elements of the stream, shape [B].
+        shape: (H, W).
+        roughness: Hurst exponent in (0, 1); amplitude falls with frequency to the −(roughness + 1).
+
+    Returns:
+        Surfaces scaled to a relief (highest minus lowest) of 1, float64, shape [B, H, W].
+    """
+    height, width = shape
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.normal(key, indices, shape)) * frequency ** -(roughness + 1)
+    surface = np.fft.irfft2(spectrum, s=shape)
+    low = surface.min(axis=(1, 2), keepdims=True)
+    return (surface - low) / (surface.max(axis=(1, 2), keepdims=True) - low)
+
+
+def place_craters(
+    key: int, indices: np.ndarray, extent_m: tuple[float, float], count: np.ndarray, radius_m: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws centres and radii of craters whose rims do not overlap, by sequential rejection.
+
+    Args:
+        key: stream key.
+        indices: elements of the stream, shape [B].
+        extent_m: size of the map along x and y.
+        count: craters asked for in each map, shape [B]; a map too crowded for them gets fewer.
+        radius_m: smallest and largest radius of a rim.
+
+    Returns:
+        Centres (x, y) in metres, shape [B, N, 2], and radii, shape [B, N]; radius 0 means no crater.
+    """
+    tries = 12 * int(count.max(initial=0))
+    draws = rng.uniform(key, indices, (max(tries, 1), 3))
+    centres = draws[..., :2] * np.asarray(extent_m)
+    # Small craters are the more frequent: uniform in log radius.
+    low, high = np.log(radius_m)
+    radii = np.exp(low + (high - low) * draws[..., 2])
+    kept = np.zeros_like(radii)
+    for i in range(tries):
+        gap = np.hypot(*np.moveaxis(centres[:, :i] - centres[:, i : i + 1], -1, 0))
+        apart = ((kept[:, :i] == 0) | (gap > kept[:, :i] + radii[:, i : i + 1])).all(axis=1)
+        wanted = (kept[:, :i] > 0).sum(axis=1) < count
+        kept[:, i] = np.where(apart & wanted, radii[:, i], 0)
+    return centres, kept
+
+
+def crater_elevation(
+    centres_m: np.ndarray, radii_m: np.ndarray, shape: tuple[int, int], resolution_m: float, depth_ratio: float
+) -> np.ndarray:
+    """Raises rims and sinks parabolic bowls.
+
+    Args:
+        centres_m: shape [B, N, 2].
+        radii_m: radius of each rim, 0 for none, shape [B, N].
+        shape: (H, W).
+        resolution_m: cell width.
+        depth_ratio: depth of a bowl below its rim over its diameter; the rim stands a fifth of the
+            depth over the plain and falls off outside with the cube of the distance.
+
+    Returns:
+        Elevation to be added, metres, shape [B, H, W].
+    """
+    y, x = ((np.arange(n) + 0.5) * resolution_m for n in shape)
+    added = np.zeros((len(radii_m), *shape))
+    for i in range(radii_m.shape[1]):
+        radius = radii_m[:, i, None, None]
+        if not radius.any():
+            continue
+        centre_x, centre_y = (centres_m[:, i, k, None, None] for k in (0, 1))
+        distance = np.hypot(x[None, None, :] - centre_x, y[None, :, None] - centre_y)
+        ratio = distance / np.where(radius > 0, radius, 1)
+        depth = 2 * radius * depth_ratio
+        bowl = depth * (ratio**2 - 0.8)
+        rim = 0.2 * depth * np.maximum(ratio, 1) ** -3.0
+        added += np.where(ratio < 1, bowl, rim)
+    return added
+
+
+def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
+
+    At the border the surface is continued linearly, so that planes are exact everywhere.
+
+    Args:
+        elevation_m: shape [B, H, W].
+        resolution_m: cell width.
+
+    Returns:
+        Two arrays of shape [B, H, W], metres a metre.
+    """
+    z = np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), mode="reflect", reflect_type="odd")
+    along_x = (z[:, :-2] + 2 * z[:, 1:-1] + z[:, 2:])[:, :, 2:] - (z[:, :-2] + 2 * z[:, 1:-1] + z[:, 2:])[:, :, :-2]
+    along_y = (z[:, :, :-2] + 2 * z[:, :, 1:-1] + z[:, :, 2:])[:, 2:] - (
+        z[:, :, :-2] + 2 * z[:, :, 1:-1] + z[:, :, 2:]
+    )[:, :-2]
+    return along_x / (8 * resolution_m), along_y / (8 * resolution_m)
+
+
+def slope_deg(elevation_m: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Inclination of the ground by Horn's method, degrees, shape [B, H, W]."""
+    return np.degrees(np.arctan(np.hypot(*horn_gradient(elevation_m, resolution_m))))

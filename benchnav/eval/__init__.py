@@ -1,0 +1,1 @@
+"""Evaluation suites: rollouts, metrics, reports and playback (paper, IV)."""

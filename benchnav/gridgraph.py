@@ -1,0 +1,81 @@
+"""The 8-connected graph over a map's cells, and exact shortest paths in it for a batch of maps.
+
+A batch of maps is one block-diagonal graph, so one compiled Dijkstra search serves them all.
+Letters in shapes: B maps, H×W cells; a cell's flat index is row·W + column.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+NO_CELL = -1
+
+
+@lru_cache(maxsize=8)
+def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lists the directed edges between 8-connected cells.
+
+    Returns:
+        Flat index of the source cells, of the target cells, and the length of each edge in cell
+        widths (1 or √2), each of shape [E]. The arrays are shared: do not write to them.
+    """
+    index = np.arange(height * width).reshape(height, width)
+    sources, targets, lengths = [], [], []
+    for step_y, step_x in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = index[: height - step_y, max(0, -step_x) : width - max(0, step_x)].ravel()
+        there = index[step_y:, max(0, step_x) : width + min(0, step_x)].ravel()
+        sources += [here, there]
+        targets += [there, here]
+        lengths += [np.full(2 * here.size, np.hypot(step_x, step_y))]
+    return np.concatenate(sources), np.concatenate(targets), np.concatenate(lengths)
+
+
+def cost_to_go(edge_costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the least cost from every cell to the nearest goal cell of its own map.
+
+    Args:
+        edge_costs: cost > 0 of each edge of `neighbour_pairs`, infinite where it may not be taken,
+            shape [B, E].
+        goals: goal cells, bool, shape [B, H, W].
+        shape: (H, W).
+
+    Returns:
+        Cost to go, infinite where no path leads to a goal, shape [B, H, W]; and the flat index of
+        the next cell on a shortest path, `NO_CELL` at goals and where there is none, int64, shape
+        [B, H·W].
+    """
+    batch, cells = len(edge_costs), shape[0] * shape[1]
+    source, target, _ = neighbour_pairs(*shape)
+    member, edge = np.nonzero(np.isfinite(edge_costs))
+    # Searching backward from the goals, so the edges are turned round.
+    graph = csr_array(
+        (edge_costs[member, edge], (member * cells + target[edge], member * cells + source[edge])),
+        shape=(batch * cells, batch * cells),
+    )
+    starts = np.flatnonzero(goals)
+    if starts.size == 0:
+        return np.full((batch, *shape), np.inf), np.full((batch, cells), NO_CELL)
+    cost, previous, _ = dijkstra(graph, indices=starts, min_only=True, return_predecessors=True)
+    offset = cells * np.arange(batch)[:, None]
+    following = previous.reshape(batch, cells).astype(np.int64)
+    return cost.reshape(batch, *shape), np.where(following >= 0, following - offset, NO_CELL)
+
+
+def travel_time_costs(traversability: np.ndarray, free: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Gives the time each edge takes at a commanded 1 m/s, each half at its own cell's speed.
+
+    Args:
+        traversability: share of the commanded speed, shape [B, H, W].
+        free: cells that may be entered, bool, shape [B, H, W].
+        resolution_m: cell width in metres.
+
+    Returns:
+        Seconds, infinite at an edge with an end that is not free, shape [B, E].
+    """
+    batch, height, width = traversability.shape
+    source, target, length = neighbour_pairs(height, width)
+    pace = np.full((batch, height * width), np.inf)
+    np.divide(1.0, traversability.reshape(batch, -1), out=pace, where=free.reshape(batch, -1))
+    return 0.5 * length * resolution_m * (pace[:, source] + pace[:, target])

@@ -1,0 +1,1 @@
+"""Traversability models: classifier, class-wise Gaussian processes, fusion (paper, III-B)."""

@@ -1,0 +1,1 @@
+"""Problems, planners and the simulation they are tested in (paper, III-C and IV-A)."""

@@ -1,0 +1,170 @@
+"""Terrain value types: the grid, what is true of the ground, and what a robot may see of it.
+
+Conventions: maps are indexed [row = y, column = x]; cell (i, j) is centred at
+((j + ½)·res, (i + ½)·res); a position belongs to the cell it lies in; outside the map is not free
+space. Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×W cells.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Size and resolution of a map.
+
+    Args:
+        height: rows, cells along y.
+        width: columns, cells along x.
+        resolution_m: edge length of a square cell in metres.
+    """
+
+    height: int
+    width: int
+    resolution_m: float
+
+    def __post_init__(self) -> None:
+        """Refuses empty grids and resolutions that are not positive."""
+        if self.height < 3 or self.width < 3:
+            raise ConfigError(f"Expected a grid of at least 3×3 cells, got {self.height}×{self.width}.")
+        if not 0 < self.resolution_m < float("inf"):
+            raise ConfigError(f"Expected `resolution_m` > 0, got {self.resolution_m}.")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.height, self.width
+
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Size of the map along x and y in metres."""
+        return self.width * self.resolution_m, self.height * self.resolution_m
+
+    def contains(self, x_m: Tensor, y_m: Tensor) -> Tensor:
+        """Tells which positions lie on the map, bool, shape of `x_m`."""
+        extent_x, extent_y = self.extent_m
+        return (x_m >= 0) & (x_m < extent_x) & (y_m >= 0) & (y_m < extent_y)
+
+    def cell_of(self, x_m: Tensor, y_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Finds the cell of each position; positions off the map give the nearest border cell.
+
+        Returns:
+            Row and column, int64, each of the shape of `x_m`.
+        """
+        row = (y_m / self.resolution_m).floor().long().clamp(0, self.height - 1)
+        column = (x_m / self.resolution_m).floor().long().clamp(0, self.width - 1)
+        return row, column
+
+    def centre_of(self, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+        """Gives the position (x, y) in metres of the centre of each cell."""
+        return (column + 0.5) * self.resolution_m, (row + 0.5) * self.resolution_m
+
+    def lookup(self, maps: Tensor, x_m: Tensor, y_m: Tensor, outside: float) -> Tensor:
+        """Reads each episode's map at positions.
+
+        Args:
+            maps: shape [B, H, W].
+            x_m: positions, shape [B, *S].
+            y_m: positions, shape [B, *S].
+            outside: the value off the map.
+
+        Returns:
+            Values, dtype of `maps`, shape [B, *S].
+        """
+        row, column = self.cell_of(x_m, y_m)
+        index = row * self.width + column
+        values = torch.gather(maps.flatten(1), 1, index.flatten(1)).reshape(x_m.shape)
+        return torch.where(self.contains(x_m, y_m), values, outside)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The paper's o: all that a traversability model may see.
+
+    Args:
+        rgb: top-down colour image, uint8, shape [B, 3, H, W].
+        elevation_m: shape [B, H, W].
+        slope_deg: inclination by Horn's method, shape [B, H, W].
+        grid: size and resolution.
+    """
+
+    rgb: Tensor
+    elevation_m: Tensor
+    slope_deg: Tensor
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        """Checks that the layers fit the grid and one another."""
+        batch = self.rgb.shape[0]
+        _check_shapes(self.grid, batch, elevation_m=self.elevation_m, slope_deg=self.slope_deg)
+        if self.rgb.dtype != torch.uint8 or self.rgb.shape != (batch, 3, *self.grid.shape):
+            raise ConfigError(
+                f"Expected `rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
+                f"got {self.rgb.dtype} of shape {list(self.rgb.shape)}."
+            )
+
+    def to(self, device: torch.device | str) -> "Observation":
+        """Copies the layers to `device`."""
+        return Observation(
+            self.rgb.to(device), self.elevation_m.to(device), self.slope_deg.to(device), self.grid
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Terrain:
+    """The ground as it is. Only the simulation and the `oracle` model are given this.
+
+    Args:
+        rgb: uint8, shape [B, 3, H, W].
+        class_id: index into the dataset's class table, shape [B, H, W].
+        elevation_m: shape [B, H, W].
+        slope_deg: shape [B, H, W].
+        traversability_mean: latent traversability f_c(ψ), in [0, 1], shape [B, H, W]. Because λ is
+            clipped, E[λ] differs from it near 0 and 1.
+        traversability_std: σ_c of the latent traversability, shape [B, H, W].
+        traversability: the realised λ = clip(f_c(ψ) + ε, 0, 1), shape [B, H, W].
+        grid: size and resolution.
+    """
+
+    rgb: Tensor
+    class_id: Tensor
+    elevation_m: Tensor
+    slope_deg: Tensor
+    traversability_mean: Tensor
+    traversability_std: Tensor
+    traversability: Tensor
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        """Checks that the layers fit the grid and one another."""
+        _check_shapes(
+            self.grid,
+            self.rgb.shape[0],
+            class_id=self.class_id,
+            elevation_m=self.elevation_m,
+            slope_deg=self.slope_deg,
+            traversability_mean=self.traversability_mean,
+            traversability_std=self.traversability_std,
+            traversability=self.traversability,
+        )
+
+    def __len__(self) -> int:
+        """Number of maps B."""
+        return self.rgb.shape[0]
+
+    def observe(self) -> Observation:
+        """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""
+        return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid)
+
+
+def _check_shapes(grid: Grid, batch: int, **layers: Tensor) -> None:
+    for name, layer in layers.items():
+        if layer.shape != (batch, *grid.shape):
+            raise ConfigError(
+                f"Expected `{name}` of shape [{batch}, {grid.height}, {grid.width}], "
+                f"got {list(layer.shape)}. Pass a batch of maps on one grid."
+            )
