@@ -63,22 +63,34 @@ class Grid:
         """Gives the position (x, y) in metres of the centre of each cell."""
         return (column + 0.5) * self.resolution_m, (row + 0.5) * self.resolution_m
 
-    def lookup(self, maps: Tensor, x_m: Tensor, y_m: Tensor, outside: float) -> Tensor:
-        """Reads each episode's map at positions.
+    def pad(self, maps: Tensor, outside: float) -> Tensor:
+        """Frames maps with one cell of the value that holds off the map, for `lookup`.
 
         Args:
             maps: shape [B, H, W].
-            x_m: positions, shape [B, *S].
-            y_m: positions, shape [B, *S].
             outside: the value off the map.
 
         Returns:
-            Values, dtype of `maps`, shape [B, *S].
+            Shape [B, (H + 2)·(W + 2)].
         """
-        row, column = self.cell_of(x_m, y_m)
-        index = row * self.width + column
-        values = torch.gather(maps.flatten(1), 1, index.flatten(1)).reshape(x_m.shape)
-        return torch.where(self.contains(x_m, y_m), values, outside)
+        return torch.nn.functional.pad(maps, (1, 1, 1, 1), value=outside).flatten(1)
+
+    def lookup(self, padded: Tensor, x_m: Tensor, y_m: Tensor) -> Tensor:
+        """Reads each member's map at positions; one that is not a number reads as off the map.
+
+        Args:
+            padded: maps from `pad`, shape [B, (H + 2)·(W + 2)].
+            x_m: positions, shape [B, *S].
+            y_m: positions, shape [B, *S].
+
+        Returns:
+            Values, dtype of `padded`, shape [B, *S].
+        """
+        scale = 1 / self.resolution_m
+        row = (y_m * scale + 1).clamp(0, self.height + 1).nan_to_num(0).long()
+        column = (x_m * scale + 1).clamp(0, self.width + 1).nan_to_num(0).long()
+        index = row * (self.width + 2) + column
+        return torch.gather(padded, 1, index.reshape(len(padded), -1)).reshape(x_m.shape)
 
 
 @dataclass(frozen=True)

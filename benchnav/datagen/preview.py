@@ -26,7 +26,7 @@ def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], pa
     """
     maps = dataset.read(split, indices)
     rows = len(indices)
-    figure = Figure(figsize=(13.2, 2.75 * rows + 0.45), layout="constrained")
+    figure = Figure(figsize=(13.2, 2.15 * rows + 0.45), layout="constrained")
     panels = figure.subplots(rows, 5, squeeze=False)
     for row, index in enumerate(indices):
         entry = {name: values[row] for name, values in maps.items()}

@@ -166,15 +166,17 @@ class Recipe:
     def environment_classes(self, environment: int) -> np.ndarray:
         """The classes an environment shows: consecutive deals from one pack, so all are used equally.
 
-        The pack is the class table taken with a stride of 3 (or the next stride that visits every
-        class), so that an environment shows some neighbours in colour and some that are far apart.
+        The pack is the class table taken with a stride, so that an environment shows classes of some
+        distance in colour; each time the deals come full circle the stride changes.
 
         Returns:
             Class indices, distinct, shape [len(occupancy)].
         """
         count, shown = len(self.classes), len(self.occupancy)
-        stride = next((s for s in (3, 1) if np.gcd(s, count) == 1), 1)
-        return (environment * shown * stride + stride * np.arange(shown)) % count
+        strides = [s for s in (3, 1, *range(2, count)) if np.gcd(s, count) == 1]
+        first = environment * shown
+        stride = strides[first // int(np.lcm(shown, count)) % len(strides)]
+        return stride * np.arange(first, first + shown) % count
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the recipe as plain data for JSON, fully resolved."""

@@ -1,0 +1,158 @@
+"""Model predictive path integral control (MPPI).
+
+Samples K action sequences about the current mean, rolls each out through F with predicted
+traversability, and averages them by their exponentiated cost. No global path. Source: Williams et
+al. (2017), "Information theoretic MPC for model-based reinforcement learning", algorithms 1 and 2;
+paper IV-A3. Letters in shapes: B episodes, K samples, T horizon steps, S state, A action dimensions.
+
+The samples' noise is shared by the episodes of a batch: it is drawn once a step, as a pure function
+of the plan state's seed and step.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.planning.planner import Plan
+from benchnav.planning.problem import Problem
+
+
+@dataclass(frozen=True, kw_only=True)
+class MPPIConfig:
+    """Settings of MPPI; the defaults are the paper's.
+
+    Args:
+        horizon: steps T.
+        samples: action sequences K.
+        noise_speed: standard deviation of the sampled linear velocities, m/s.
+        noise_turn_rate: standard deviation of the sampled angular velocities, rad/s.
+        temperature: scale of cost below which samples count alike.
+        control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the
+            current mean itself as the base distribution (α = 1 in the source).
+        drawn_samples: best samples that `Plan` carries for playback, besides the mean's path; 0
+            leaves both out.
+    """
+
+    horizon: int = 50
+    samples: int = 5000
+    noise_speed: float = 0.5
+    noise_turn_rate: float = 0.5
+    temperature: float = 0.5
+    control_cost: float = 0.0
+    drawn_samples: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses settings that sample nothing."""
+        for name in ("horizon", "samples", "noise_speed", "noise_turn_rate", "temperature"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {getattr(self, name)}.")
+        if not 0 <= self.drawn_samples <= self.samples:
+            raise ConfigError(f"Expected `drawn_samples` in 0–{self.samples} for MPPI, got {self.drawn_samples}.")
+
+
+@dataclass(frozen=True)
+class MPPIState:
+    """What MPPI carries from step to step.
+
+    Args:
+        problem: what is being solved.
+        mean: mean action sequence, shape [B, T, A].
+        seed: root of the noise.
+        step: steps planned so far.
+    """
+
+    problem: Problem
+    mean: Tensor
+    seed: int
+    step: int
+
+
+class MPPI:
+    """MPPI as a planner.
+
+    Args:
+        config: settings.
+    """
+
+    def __init__(self, config: MPPIConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config = config or MPPIConfig()
+
+    def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
+        """Starts from a standing robot; see `Planner`."""
+        seed = int(torch.randint(2**62, (), generator=generator))
+        mean = problem.start.new_zeros(len(problem), self.config.horizon, len(problem.dynamics.action_low))
+        return MPPIState(problem, mean, seed, 0)
+
+    def plan(self, state: Tensor, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
+        """Solves one step; see `Planner`."""
+        problem, config = plan_state.problem, self.config
+        low, high = (state.new_tensor(b) for b in (problem.dynamics.action_low, problem.dynamics.action_high))
+        scale = state.new_tensor((config.noise_speed, config.noise_turn_rate))
+        noise = self._noise(plan_state, state) * scale[:, None]
+        actions = torch.clamp(plan_state.mean[..., None] + noise, low[:, None], high[:, None])
+        cost = rollout_cost(problem, state, actions)
+        if config.control_cost:
+            weighted = plan_state.mean / scale**2
+            cost = cost + config.control_cost * torch.einsum("bta,tak->bk", weighted, noise)
+        weights = torch.softmax(-cost / config.temperature, dim=1)
+        mean = torch.einsum("btak,bk->bta", actions, weights)
+        shifted = torch.cat((mean[:, 1:], mean[:, -1:]), dim=1)
+        drawn = self._drawn(problem, state, mean, actions, weights)
+        return mean[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), drawn
+
+    def _noise(self, plan_state: MPPIState, like: Tensor) -> Tensor:
+        """Standard normal noise of one step, shape [T, A, K]."""
+        generator = torch.Generator(device=like.device).manual_seed(plan_state.seed + plan_state.step)
+        shape = (*plan_state.mean.shape[1:], self.config.samples)
+        return torch.randn(shape, generator=generator, device=like.device, dtype=like.dtype)
+
+    def _drawn(self, problem: Problem, state: Tensor, mean: Tensor, actions: Tensor, weights: Tensor) -> Plan:
+        count = self.config.drawn_samples
+        if not count:
+            return Plan.empty(len(problem), state.device)
+        best = weights.topk(count, dim=1).indices[:, None, None, :].expand(-1, *actions.shape[1:3], -1)
+        paths = rollout_path(problem, state, torch.cat((mean[..., None], actions.gather(3, best)), dim=3))
+        return Plan.empty(len(problem), state.device, path=paths[:, 0], samples=paths[:, 1:])
+
+
+def rollout_cost(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
+    """Sums J along action sequences.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        actions: shape [B, T, A, K].
+
+    Returns:
+        Cost of each sequence, shape [B, K].
+    """
+    states = state[:, None].expand(-1, actions.shape[-1], -1)
+    target = problem.goal_m[:, None]
+    cost = state.new_zeros(states.shape[:2])
+    for action in actions.movedim(-1, 2).unbind(1):
+        traversability = problem.traversability_at(states)
+        cost = cost + problem.objective.stage(states, action, traversability, target)
+        states = problem.dynamics(states, action, traversability)
+    return cost + problem.objective.terminal(states, problem.traversability_at(states), target)
+
+
+def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
+    """Positions along action sequences, the first included.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        actions: shape [B, T, A, K].
+
+    Returns:
+        Shape [B, K, T + 1, 2].
+    """
+    states = state[:, None].expand(-1, actions.shape[-1], -1)
+    positions = [states[..., :2]]
+    for action in actions.movedim(-1, 2).unbind(1):
+        states = problem.dynamics(states, action, problem.traversability_at(states))
+        positions.append(states[..., :2])
+    return torch.stack(positions, dim=2)
