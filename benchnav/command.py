@@ -7,7 +7,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, get_type_hints
 
 from benchnav.errors import BenchnavError
@@ -21,13 +21,17 @@ class Command:
         function: does the work; its type hints and docstring become flags and help. It returns the
             exit status, or None for success.
         positionals: names of its parameters that are given by place rather than by flag.
+        settings: a dataclass whose fields become flags; one of it is the function's first argument.
     """
 
     function: Callable[..., int | None]
     positionals: tuple[str, ...] = ()
+    settings: type | None = None
 
 
-def run(program: str, description: str, commands: dict[str, Command], argv: Sequence[str] | None = None) -> int:
+def run(
+    program: str, description: str, commands: dict[str, Command], argv: Sequence[str] | None = None
+) -> int:
     """Parses a command line and runs the subcommand it names.
 
     Args:
@@ -51,17 +55,27 @@ def run(program: str, description: str, commands: dict[str, Command], argv: Sequ
         child.add_argument("--config", action="config", help="Path of a YAML file with these settings.")
         hints = get_type_hints(command.function)
         for positional in command.positionals:
-            child.add_argument(positional, type=hints[positional], help=_argument_help(command.function, positional))
-        child.add_function_arguments(command.function, as_group=False, skip=set(command.positionals))
+            child.add_argument(
+                positional, type=hints[positional], help=_argument_help(command.function, positional)
+            )
+        skip = set(command.positionals)
+        if command.settings:
+            child.add_class_arguments(command.settings, as_group=False)
+            skip.add(next(iter(hints)))
+        child.add_function_arguments(command.function, as_group=False, skip=skip)
         subcommands.add_subcommand(name, child, help=_summary(command.function))
     if not argv:
         parser.print_help()
         return 2
     try:
         parsed = parser.instantiate_classes(parser.parse_args(argv))
+        command = commands[parsed.command]
         arguments = dict(vars(parsed[parsed.command]))
         arguments.pop("config", None)
-        return commands[parsed.command].function(**arguments) or 0
+        if command.settings is None:
+            return command.function(**arguments) or 0
+        settings = command.settings(**{f.name: arguments.pop(f.name) for f in fields(command.settings)})
+        return command.function(settings, **arguments) or 0
     except (ArgumentError, BenchnavError) as error:
         print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

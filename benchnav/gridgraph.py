@@ -32,7 +32,9 @@ def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np
     return np.concatenate(sources), np.concatenate(targets), np.concatenate(lengths)
 
 
-def cost_to_go(edge_costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def cost_to_go(
+    edge_costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Finds the least cost from every cell to the nearest goal cell of its own map.
 
     Args:

@@ -40,7 +40,9 @@ def create(
         unknown = [name for name in splits if name not in chosen.splits]
         if unknown:
             raise ConfigError(f"Expected `splits` among {sorted(chosen.splits)}, got {unknown}.")
-        chosen = replace(chosen, splits={name: chosen.splits[name] for name in chosen.splits if name in splits})
+        chosen = replace(
+            chosen, splits={name: chosen.splits[name] for name in chosen.splits if name in splits}
+        )
     path = Path(out or f"datasets/{chosen.id}.h5")
     show_progress(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite), "maps")
     print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")

@@ -34,7 +34,11 @@ def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: fl
 
 
 def place_craters(
-    key: int, indices: np.ndarray, extent_m: tuple[float, float], count: np.ndarray, radius_m: tuple[float, float]
+    key: int,
+    indices: np.ndarray,
+    extent_m: tuple[float, float],
+    count: np.ndarray,
+    radius_m: tuple[float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws centres and radii of craters whose rims do not overlap, by sequential rejection.
 
@@ -64,7 +68,11 @@ def place_craters(
 
 
 def crater_elevation(
-    centres_m: np.ndarray, radii_m: np.ndarray, shape: tuple[int, int], resolution_m: float, depth_ratio: float
+    centres_m: np.ndarray,
+    radii_m: np.ndarray,
+    shape: tuple[int, int],
+    resolution_m: float,
+    depth_ratio: float,
 ) -> np.ndarray:
     """Raises rims and sinks parabolic bowls.
 
@@ -108,7 +116,9 @@ def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndar
         Two arrays of shape [B, H, W], metres a metre.
     """
     z = np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), mode="reflect", reflect_type="odd")
-    along_x = (z[:, :-2] + 2 * z[:, 1:-1] + z[:, 2:])[:, :, 2:] - (z[:, :-2] + 2 * z[:, 1:-1] + z[:, 2:])[:, :, :-2]
+    along_x = (z[:, :-2] + 2 * z[:, 1:-1] + z[:, 2:])[:, :, 2:] - (z[:, :-2] + 2 * z[:, 1:-1] + z[:, 2:])[
+        :, :, :-2
+    ]
     along_y = (z[:, :, :-2] + 2 * z[:, :, 1:-1] + z[:, :, 2:])[:, 2:] - (
         z[:, :, :-2] + 2 * z[:, :, 1:-1] + z[:, :, 2:]
     )[:, :-2]

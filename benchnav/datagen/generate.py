@@ -59,7 +59,9 @@ def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
 
 def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
     """E[λ] of the clipped Gaussian N(mean, std), shape of `mean`, [B, H, W]."""
-    means, stds = (torch.from_numpy(np.ascontiguousarray(a, dtype=np.float64)).unsqueeze(1) for a in (mean, std))
+    means, stds = (
+        torch.from_numpy(np.ascontiguousarray(a, dtype=np.float64)).unsqueeze(1) for a in (mean, std)
+    )
     return TraversabilityMixture(torch.ones_like(means), means, stds).mean().numpy()
 
 
@@ -75,7 +77,8 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     expected = expected_traversability(mean, latent.latent_std(maps["class_id"], recipe.classes))
     costs = gridgraph.travel_time_costs(expected, expected > recipe.stuck_threshold, recipe.resolution_m)
     (start_column, start_row), (goal_column, goal_row) = (
-        (int(value / recipe.resolution_m) for value in position) for position in (recipe.start_m, recipe.goal_m)
+        (int(value / recipe.resolution_m) for value in position)
+        for position in (recipe.start_m, recipe.goal_m)
     )
     goals = np.zeros(expected.shape, dtype=bool)
     goals[:, goal_row, goal_column] = True
@@ -97,7 +100,9 @@ def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> M
     mean = latent.latent_mean(class_id, slope, recipe.classes)
     noise = latent.latent_std(class_id, recipe.classes) * rng.normal(key("traversability"), indices, shape)
     direction = rng.uniform(key("light"), indices, (2,))
-    light = appearance.light_direction(2 * np.pi * direction[:, 0], _within(scenario.light_height, direction[:, 1]))
+    light = appearance.light_direction(
+        2 * np.pi * direction[:, 0], _within(scenario.light_height, direction[:, 1])
+    )
     brightness = appearance.shade(height, recipe.resolution_m, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     return {
@@ -125,7 +130,9 @@ def _class_map(
     return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(bands.shape)
 
 
-def _elevation(recipe: Recipe, scenario: Scenario, key: Callable[[str], int], indices: np.ndarray) -> np.ndarray:
+def _elevation(
+    recipe: Recipe, scenario: Scenario, key: Callable[[str], int], indices: np.ndarray
+) -> np.ndarray:
     draws = rng.uniform(key("relief"), indices, (2,))
     ground = elevation.fractal(key("elevation"), indices, recipe.grid.shape, scenario.roughness)
     ground = ground * _within(scenario.relief_m, draws[:, 0])[:, None, None]

@@ -46,7 +46,11 @@ def perlin(key: int, indices: np.ndarray, shape: tuple[int, int], period: float)
 
 
 def fractal_perlin(
-    seed: int, names: tuple[rng.Name, ...], indices: np.ndarray, shape: tuple[int, int], periods: Sequence[float]
+    seed: int,
+    names: tuple[rng.Name, ...],
+    indices: np.ndarray,
+    shape: tuple[int, int],
+    periods: Sequence[float],
 ) -> np.ndarray:
     """Sums octaves of Perlin noise, each weighted by its period, so that large shapes dominate.
 

@@ -39,7 +39,9 @@ def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], pa
     figure.savefig(path, dpi=130)
 
 
-def _draw_row(figure: Figure, panels: Sequence[Axes], dataset: TerrainDataset, entry: dict[str, np.ndarray]) -> None:
+def _draw_row(
+    figure: Figure, panels: Sequence[Axes], dataset: TerrainDataset, entry: dict[str, np.ndarray]
+) -> None:
     width, height = dataset.grid.extent_m
     extent = (0, width, 0, height)
     classes = dataset.recipe.classes
@@ -67,7 +69,9 @@ def _draw_row(figure: Figure, panels: Sequence[Axes], dataset: TerrainDataset, e
 
     image = panels[3].imshow(entry["slope_deg"], origin="lower", extent=extent, cmap="magma", vmin=0, vmax=30)
     figure.colorbar(image, ax=panels[3], fraction=0.046, extend="max")
-    image = panels[4].imshow(entry["traversability"], origin="lower", extent=extent, cmap="RdYlGn", vmin=0, vmax=1)
+    image = panels[4].imshow(
+        entry["traversability"], origin="lower", extent=extent, cmap="RdYlGn", vmin=0, vmax=1
+    )
     figure.colorbar(image, ax=panels[4], fraction=0.046)
     for panel in panels:
         panel.plot(*entry["start_m"], "o", color="red", mec="white", ms=6)

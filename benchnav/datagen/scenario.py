@@ -73,7 +73,9 @@ def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
             return tuple(between(a, b) for a, b in zip(low, high, strict=True))
         return low + severity * (high - low)
 
-    return replace(base, **{f.name: between(getattr(base, f.name), getattr(full, f.name)) for f in fields(base)})
+    return replace(
+        base, **{f.name: between(getattr(base, f.name), getattr(full, f.name)) for f in fields(base)}
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +95,9 @@ class Split:
     def __post_init__(self) -> None:
         """Refuses empty splits."""
         if self.maps < 1:
-            raise ConfigError(f"Expected `maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead.")
+            raise ConfigError(
+                f"Expected `maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +142,12 @@ class Recipe:
         for name in ("start_m", "goal_m"):
             x, y = getattr(self, name)
             if not (0 <= x < extent_x and 0 <= y < extent_y):
-                raise ConfigError(f"Expected `{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y}).")
-        if not np.isclose(sum(self.occupancy), 1, atol=1e-6) or not all(0 < share <= 1 for share in self.occupancy):
+                raise ConfigError(
+                    f"Expected `{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y})."
+                )
+        if not np.isclose(sum(self.occupancy), 1, atol=1e-6) or not all(
+            0 < share <= 1 for share in self.occupancy
+        ):
             raise ConfigError(f"Expected `occupancy` as shares > 0 summing to 1, got {list(self.occupancy)}.")
         if len(self.occupancy) > len(self.classes):
             raise ConfigError(
@@ -226,7 +234,9 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
         data["classes"] = presets["classes"]
     scenarios = data.get("scenarios", {name: {"preset": name} for name in presets["scenarios"]})
     if isinstance(scenarios, dict):
-        data["scenarios"] = {name: _resolve(entry, presets["scenarios"], name) for name, entry in scenarios.items()}
+        data["scenarios"] = {
+            name: _resolve(entry, presets["scenarios"], name) for name, entry in scenarios.items()
+        }
     try:
         return _parse(Recipe, data)
     except ConfigError as error:
@@ -238,9 +248,13 @@ def _resolve(entry: Any, presets: dict[str, Any], name: str) -> Any:
         return entry
     preset, severity = entry["preset"], entry.get("severity", 1.0)
     if preset not in presets:
-        raise ConfigError(f"Expected `preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}.")
+        raise ConfigError(
+            f"Expected `preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}."
+        )
     if not isinstance(severity, int | float) or not np.isfinite(severity):
-        raise ConfigError(f"Expected `severity` of scenario {name!r} to be a finite number, got {severity!r}.")
+        raise ConfigError(
+            f"Expected `severity` of scenario {name!r} to be a finite number, got {severity!r}."
+        )
     base, full = (_parse(Scenario, presets[key]) for key in ("std", preset))
     changes = {key: value for key, value in entry.items() if key not in ("preset", "severity")}
     return {**_plain(asdict(blend(base, full, severity))), **changes}

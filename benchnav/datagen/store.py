@@ -49,7 +49,9 @@ def create(
         ConfigError: the recipe cannot be met.
     """
     if path.exists() and not overwrite:
-        raise DatasetError(f"Expected `out` to be a new file, but {path} exists. Pass --overwrite true to replace it.")
+        raise DatasetError(
+            f"Expected `out` to be a new file, but {path} exists. Pass --overwrite true to replace it."
+        )
     blocks = [
         (split, start, min(start + block_maps, spec.maps))
         for split, spec in recipe.splits.items()
@@ -70,7 +72,9 @@ def create(
             os.replace(partial, path)
             shutil.rmtree(folder)
     except OSError as error:
-        raise DatasetError(f"Could not write {path}: {error.strerror or error}. Nothing was left under its name.") from error
+        raise DatasetError(
+            f"Could not write {path}: {error.strerror or error}. Nothing was left under its name."
+        ) from error
 
 
 class TerrainDataset:
@@ -93,13 +97,19 @@ class TerrainDataset:
             )
         with self._open() as file:
             if schema.MANIFEST not in file:
-                raise DatasetError(f"Expected a {schema.FORMAT} file with a manifest, got {self.path} without one.")
+                raise DatasetError(
+                    f"Expected a {schema.FORMAT} file with a manifest, got {self.path} without one."
+                )
             try:
                 self.manifest: dict[str, Any] = json.loads(file[schema.MANIFEST][()])
             except (OSError, ValueError) as error:
-                raise DatasetError(f"The manifest of {self.path} is damaged: {error}. Make the file again.") from error
+                raise DatasetError(
+                    f"The manifest of {self.path} is damaged: {error}. Make the file again."
+                ) from error
         if self.manifest.get("format") != schema.FORMAT:
-            raise DatasetError(f"Expected format {schema.FORMAT!r} in {self.path}, got {self.manifest.get('format')!r}.")
+            raise DatasetError(
+                f"Expected format {schema.FORMAT!r} in {self.path}, got {self.manifest.get('format')!r}."
+            )
         major, minor = (int(part) for part in self.manifest["format_version"].split("."))
         if (major, minor) > schema.FORMAT_VERSION:
             raise DatasetError(
@@ -132,7 +142,9 @@ class TerrainDataset:
         """One digest for the file's splits, as `split:digest` joined in the manifest's order."""
         return ",".join(f"{name}:{split['digest']}" for name, split in self.splits.items())
 
-    def read(self, split: str, indices: Sequence[int] | None = None, fields: Iterable[str] | None = None) -> Maps:
+    def read(
+        self, split: str, indices: Sequence[int] | None = None, fields: Iterable[str] | None = None
+    ) -> Maps:
         """Reads stored arrays.
 
         Args:
@@ -147,10 +159,14 @@ class TerrainDataset:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
         if split not in self.splits:
-            raise DatasetError(f"Expected a split of {self.path}, one of {sorted(self.splits)}, got {split!r}.")
+            raise DatasetError(
+                f"Expected a split of {self.path}, one of {sorted(self.splits)}, got {split!r}."
+            )
         size = self.splits[split]["maps"]
         if indices is not None and len(indices) and not (0 <= min(indices) and max(indices) < size):
-            raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {list(indices)}.")
+            raise DatasetError(
+                f"Expected map indices in 0–{size - 1} of split {split!r}, got {list(indices)}."
+            )
         chosen = slice(None) if indices is None else list(indices)
         with self._open() as file:
             arrays = {}
@@ -230,7 +246,9 @@ def _workspace(path: Path, made_of: dict[str, Any]) -> Iterator[Path]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise DatasetError(f"Another run is writing {path}. Wait for it, or choose another `out`.") from error
+            raise DatasetError(
+                f"Another run is writing {path}. Wait for it, or choose another `out`."
+            ) from error
         stamp, text = folder / "made_of.json", json.dumps(made_of, sort_keys=True)
         if not stamp.exists() or stamp.read_text() != text:
             for block in folder.glob("*.npz"):

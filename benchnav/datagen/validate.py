@@ -35,7 +35,9 @@ def find_faults(path: str | Path) -> list[str]:
                 faults += _range_faults(dataset, split, indices, block)
                 digest.update(block)
         if readable and digest.hexdigest() != entry["digest"]:
-            faults.append(f"{split}: content digest is {digest.hexdigest()}, the manifest says {entry['digest']}")
+            faults.append(
+                f"{split}: content digest is {digest.hexdigest()}, the manifest says {entry['digest']}"
+            )
     return faults
 
 
@@ -57,7 +59,9 @@ def _map_fault(dataset: TerrainDataset, split: str, index: int, name: str) -> st
     return ""
 
 
-def _range_faults(dataset: TerrainDataset, split: str, indices: range, block: dict[str, np.ndarray]) -> list[str]:
+def _range_faults(
+    dataset: TerrainDataset, split: str, indices: range, block: dict[str, np.ndarray]
+) -> list[str]:
     faults = []
     for name, field in schema.FIELDS.items():
         values = block[name]

@@ -75,7 +75,9 @@ class AStarDWA:
         problem, field = plan_state.problem, plan_state.field
         reference = self._reference(problem, field, state)
         waypoint = self._waypoint(problem, state, reference)
-        velocity, trajectories, best = choose_velocity(problem, state, plan_state.velocity, waypoint, self.config)
+        velocity, trajectories, best = choose_velocity(
+            problem, state, plan_state.velocity, waypoint, self.config
+        )
         row, column = problem.grid.cell_of(state[:, 0], state[:, 1])
         cost = field.cost.flatten(1).gather(1, (row * problem.grid.width + column)[:, None])[:, 0]
         plan = Plan.empty(

@@ -49,7 +49,9 @@ class MPPIConfig:
             if not getattr(self, name) > 0:
                 raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {getattr(self, name)}.")
         if not 0 <= self.drawn_samples <= self.samples:
-            raise ConfigError(f"Expected `drawn_samples` in 0–{self.samples} for MPPI, got {self.drawn_samples}.")
+            raise ConfigError(
+                f"Expected `drawn_samples` in 0–{self.samples} for MPPI, got {self.drawn_samples}."
+            )
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,9 @@ def register(name: str, factory: Factory) -> None:
 
 def planner_names() -> list[str]:
     """Names that `make_planner` knows."""
-    return sorted({*_BUILT_IN, *_FACTORIES, *(point.name for point in entry_points(group="benchnav.planners"))})
+    return sorted(
+        {*_BUILT_IN, *_FACTORIES, *(point.name for point in entry_points(group="benchnav.planners"))}
+    )
 
 
 def make_planner(name: str, options: Mapping[str, Any] | None = None) -> Planner[Any]:
@@ -135,7 +137,9 @@ def make_planner(name: str, options: Mapping[str, Any] | None = None) -> Planner
         return getattr(module, planner_name)(_configure(name, getattr(module, config_name), options))
     for point in entry_points(group="benchnav.planners", name=name):
         return point.load()(options)
-    raise ConfigError(f"Expected a planner among {', '.join(planner_names())}, got {name!r}.{_hint(name, planner_names())}")
+    raise ConfigError(
+        f"Expected a planner among {', '.join(planner_names())}, got {name!r}.{_hint(name, planner_names())}"
+    )
 
 
 def _configure(name: str, config: type, options: Mapping[str, Any]) -> Any:
@@ -149,7 +153,9 @@ def _configure(name: str, config: type, options: Mapping[str, Any]) -> Any:
         default = known[option].default
         wanted = (int, float) if isinstance(default, float) else type(default)
         if not isinstance(value, wanted) or isinstance(value, bool) != isinstance(default, bool):
-            raise ConfigError(f"Expected option {option!r} of planner {name!r} like {default!r}, got {value!r}.")
+            raise ConfigError(
+                f"Expected option {option!r} of planner {name!r} like {default!r}, got {value!r}."
+            )
     return config(**options)
 
 

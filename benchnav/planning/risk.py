@@ -31,7 +31,9 @@ class RiskSetting:
         if self.name not in NAMES:
             raise ConfigError(f"Expected a risk setting among {', '.join(NAMES)}, got {self.name!r}.")
         if not 0 <= self.level < 1:
-            raise ConfigError(f"Expected the level of risk setting {self.name!r} in [0, 1), got {self.level}.")
+            raise ConfigError(
+                f"Expected the level of risk setting {self.name!r} in [0, 1), got {self.level}."
+            )
 
     @classmethod
     def parse(cls, text: str) -> "RiskSetting":

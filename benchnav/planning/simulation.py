@@ -54,7 +54,8 @@ class SimulationConfig:
             raise ConfigError(f"Expected `noise` 'resampled' or 'frozen', got {self.noise!r}.")
         if not self.goal_radius_m > 0 or not self.time_budget_s > 0:
             raise ConfigError(
-                f"Expected `goal_radius_m` and `time_budget_s` > 0, got {self.goal_radius_m} and {self.time_budget_s}."
+                f"Expected `goal_radius_m` and `time_budget_s` > 0, "
+                f"got {self.goal_radius_m} and {self.time_budget_s}."
             )
 
 
@@ -65,12 +66,12 @@ class SimulationState:
     Args:
         state: robot states, shape [B, S].
         outcome: `Outcome` of each, int64, shape [B].
-        step: steps taken.
+        step: steps taken by each, int64, shape [B].
     """
 
     state: Tensor
     outcome: Tensor
-    step: int
+    step: Tensor
 
     @property
     def running(self) -> Tensor:
@@ -116,7 +117,8 @@ class Simulation:
 
     def init(self, start: Tensor) -> SimulationState:
         """Puts the robots at their initial states, shape [B, S]."""
-        return SimulationState(start.clone(), torch.zeros(len(start), dtype=torch.int64, device=start.device), 0)
+        zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)
+        return SimulationState(start.clone(), zero, zero)
 
     def step(self, now: SimulationState, action: Tensor) -> tuple[SimulationState, Tensor]:
         """Advances the running episodes by one step; ended ones stay as they are.
@@ -129,18 +131,19 @@ class Simulation:
             Where they stand next, and the λ that each robot met, shape [B].
         """
         x, y = now.state[:, 0], now.state[:, 1]
-        noise = self._noise[:, min(now.step, self.steps - 1)]
+        noise = self._noise.gather(1, now.step.clamp(max=self.steps - 1)[:, None])[:, 0]
         traversability = self._grid.lookup(self._mean, x, y) + self._grid.lookup(self._std, x, y) * noise
         traversability = traversability.clamp(0, 1)
         low, high = (action.new_tensor(b) for b in (self.dynamics.action_low, self.dynamics.action_high))
         moved = self.dynamics(now.state, action.clamp(low, high), traversability)
         state = torch.where(now.running[:, None], moved, now.state)
+        step = now.step + now.running
         arrived = torch.linalg.vector_norm(state[:, :2] - self._goal_m, dim=1) < self.config.goal_radius_m
         inside = self._grid.contains(state[:, 0], state[:, 1])
-        ended = torch.where(inside, Outcome.TIMEOUT if now.step + 1 >= self.steps else Outcome.RUNNING, Outcome.OUT_OF_BOUNDS)
-        ended = torch.where(arrived, Outcome.SUCCESS, ended)
-        outcome = torch.where(now.running, ended, now.outcome)
-        return SimulationState(state, outcome, now.step + 1), traversability
+        outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
+        outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
+        outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
+        return SimulationState(state, torch.where(now.running, outcome, now.outcome), step), traversability
 
 
 def fail(now: SimulationState, failed: Tensor) -> SimulationState:
