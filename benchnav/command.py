@@ -58,7 +58,7 @@ def run(
             child.add_argument(
                 positional, type=hints[positional], help=_argument_help(command.function, positional)
             )
-        skip = set(command.positionals)
+        skip: set[str | int] = set(command.positionals)
         if command.settings:
             child.add_class_arguments(command.settings, as_group=False)
             skip.add(next(iter(hints)))
@@ -98,8 +98,14 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
 
     console = Console(stderr=True)
     if console.is_terminal:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-        from rich.progress import TimeRemainingColumn
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
 
         columns: list[Any] = [TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
         with Progress(*columns, TimeRemainingColumn(), console=console) as bar:

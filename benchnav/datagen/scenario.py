@@ -202,7 +202,8 @@ def load_recipe(source: str | Path) -> Recipe:
         path = Path(source)
     if not path.is_file():
         raise ConfigError(
-            f"Expected a shipped recipe ({', '.join(shipped_recipes())}) or the path of a YAML file, got {str(source)!r}."
+            f"Expected a shipped recipe ({', '.join(shipped_recipes())}) or the path of a YAML file, "
+            f"got {str(source)!r}."
         )
     try:
         data = yaml.safe_load(path.read_text())

@@ -163,7 +163,7 @@ class TerrainDataset:
                 f"Expected a split of {self.path}, one of {sorted(self.splits)}, got {split!r}."
             )
         size = self.splits[split]["maps"]
-        if indices is not None and len(indices) and not (0 <= min(indices) and max(indices) < size):
+        if indices is not None and len(indices) and not (min(indices) >= 0 and max(indices) < size):
             raise DatasetError(
                 f"Expected map indices in 0–{size - 1} of split {split!r}, got {list(indices)}."
             )

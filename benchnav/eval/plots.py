@@ -66,7 +66,8 @@ def save_trajectories(snapshots: list[Snapshot], path: Path) -> None:
         panels[1, column].set_xlabel("x [m]")
     for panel in panels[:, 0]:
         panel.set_ylabel("y [m]")
-    assert image is not None and lines is not None
+    assert image is not None
+    assert lines is not None
     figure.colorbar(lines, ax=panels[0], fraction=0.03, label="traversability met along the path")
     figure.colorbar(
         image, ax=panels[1], fraction=0.03, label="traversability given to the planner (hatched: stuck)"

@@ -59,7 +59,9 @@ def run_episodes(
         What happened.
     """
     now = simulation.init(problem.start)
-    states, actions, met = [now.state], [], []
+    states = [now.state]
+    actions: list[Tensor] = []
+    met: list[Tensor] = []
     began = time.perf_counter()
     plan_state = planner.init(problem, generator)
     planning_s = time.perf_counter() - began

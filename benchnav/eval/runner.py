@@ -13,7 +13,6 @@ import platform
 import shlex
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -104,7 +103,7 @@ def load_run(folder: Path) -> tuple[Suite, dict[str, Any]]:
         raise ConfigError(
             f"Expected a run folder with run.json, got {folder}. Make one with `benchnav-eval run`."
         ) from error
-    settings = {name: tuple(v) if isinstance(v, list) else v for name, v in about["suite"].items()}
+    settings: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in about["suite"].items()}
     return Suite(**settings), about
 
 

@@ -1,7 +1,7 @@
-"""The Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised, over the Simulation.
+"""The Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised.
 
-NumPy at the boundary. Observations hold what a robot may know: where it is, its goal, and the
-paper's Observation of the map; never the truth.
+Both are shells over the Simulation, with NumPy at the boundary. Observations hold what a robot may
+know: where it is, its goal, and the paper's Observation of the map; never the truth.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ _TERRAIN_LAYERS = (
 Observations = dict[str, np.ndarray]
 
 
-class OffRoadEnv(gymnasium.Env[Observations, np.ndarray]):
+class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     """Drive to the goal over terrain of uncertain traversability.
 
     ## Action space
@@ -112,7 +112,7 @@ class OffRoadEnv(gymnasium.Env[Observations, np.ndarray]):
         return {**info, "outcome": Outcome(info["outcome"]).name.lower()}
 
 
-class OffRoadVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
+class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """Many `OffRoadEnv` stepped as one batch, with next-step autoreset.
 
     Sub-environment i seeded with s is the single environment seeded with s + i. `info` holds arrays;
@@ -206,7 +206,7 @@ class _Batch:
         """Starts new episodes in the chosen sub-environments, bool, shape [B]."""
         if instance is not None and not 0 <= instance < len(self._maps):
             raise ConfigError(f"Expected option `instance` in 0–{len(self._maps) - 1}, got {instance}.")
-        for i in np.flatnonzero(chosen):
+        for i in np.flatnonzero(chosen).tolist():
             # Both are drawn always, so that naming the map changes nothing else.
             drawn = generators[i].integers(len(self._maps))
             self._instance[i] = drawn if instance is None else instance

@@ -15,8 +15,15 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.planning.compilation import compiled, worth_compiling
+from benchnav.planning.dynamics import Dynamics
+from benchnav.planning.objective import Objective
 from benchnav.planning.planner import Plan
 from benchnav.planning.problem import Problem
+from benchnav.terrain import Grid
+
+# A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
+_CHUNK_STEPS = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,18 +98,18 @@ class MPPI:
     def plan(self, state: Tensor, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `Planner`."""
         problem, config = plan_state.problem, self.config
-        low, high = (state.new_tensor(b) for b in (problem.dynamics.action_low, problem.dynamics.action_high))
         scale = state.new_tensor((config.noise_speed, config.noise_turn_rate))
         noise = self._noise(plan_state, state) * scale[:, None]
-        actions = torch.clamp(plan_state.mean[..., None] + noise, low[:, None], high[:, None])
-        cost = rollout_cost(problem, state, actions)
+        cost = rollout_cost(problem, state, plan_state.mean, noise)
         if config.control_cost:
             weighted = plan_state.mean / scale**2
             cost = cost + config.control_cost * torch.einsum("bta,tak->bk", weighted, noise)
         weights = torch.softmax(-cost / config.temperature, dim=1)
-        mean = torch.einsum("btak,bk->bta", actions, weights)
+        large = worth_compiling(cost.numel(), cost.device)
+        average = _average_compiled if large else _average
+        mean = average(plan_state.mean, noise, weights, *_bounds(problem, state))
         shifted = torch.cat((mean[:, 1:], mean[:, -1:]), dim=1)
-        drawn = self._drawn(problem, state, mean, actions, weights)
+        drawn = self._drawn(problem, state, mean, plan_state.mean, noise, weights)
         return mean[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), drawn
 
     def _noise(self, plan_state: MPPIState, like: Tensor) -> Tensor:
@@ -111,33 +118,43 @@ class MPPI:
         shape = (*plan_state.mean.shape[1:], self.config.samples)
         return torch.randn(shape, generator=generator, device=like.device, dtype=like.dtype)
 
-    def _drawn(self, problem: Problem, state: Tensor, mean: Tensor, actions: Tensor, weights: Tensor) -> Plan:
+    def _drawn(
+        self, problem: Problem, state: Tensor, mean: Tensor, earlier: Tensor, noise: Tensor, weights: Tensor
+    ) -> Plan:
         count = self.config.drawn_samples
         if not count:
             return Plan.empty(len(problem), state.device)
-        best = weights.topk(count, dim=1).indices[:, None, None, :].expand(-1, *actions.shape[1:3], -1)
-        paths = rollout_path(problem, state, torch.cat((mean[..., None], actions.gather(3, best)), dim=3))
+        best = noise[..., weights.topk(count, dim=1).indices].movedim(2, 0)
+        samples = _perturb(earlier[..., None], best, *_bounds(problem, state))
+        paths = rollout_path(problem, state, torch.cat((mean[..., None], samples), dim=3))
         return Plan.empty(len(problem), state.device, path=paths[:, 0], samples=paths[:, 1:])
 
 
-def rollout_cost(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
-    """Sums J along action sequences.
+def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor) -> Tensor:
+    """Sums J along sampled action sequences.
 
     Args:
         problem: B problems.
         state: initial states, shape [B, S].
-        actions: shape [B, T, A, K].
+        mean: mean action sequences, shape [B, T, A].
+        noise: added to every mean and clipped to the action bounds, shape [T, A, K].
 
     Returns:
         Cost of each sequence, shape [B, K].
     """
-    states = state[:, None].expand(-1, actions.shape[-1], -1)
-    target = problem.goal_m[:, None]
+    samples = noise.shape[2]
+    # State dimensions outermost in memory, so that each is contiguous in samples.
+    states = state.T[:, :, None].expand(-1, -1, samples).contiguous().movedim(0, -1)
+    target = problem.goal_m[:, None].contiguous()
     cost = state.new_zeros(states.shape[:2])
-    for action in actions.movedim(-1, 2).unbind(1):
-        traversability = problem.traversability_at(states)
-        cost = cost + problem.objective.stage(states, action, traversability, target)
-        states = problem.dynamics(states, action, traversability)
+    advance = _advance_compiled if worth_compiling(cost.numel(), cost.device) else _advance
+    bounds = _bounds(problem, state)
+    for first in range(0, mean.shape[1], _CHUNK_STEPS):
+        chunk = slice(first, first + _CHUNK_STEPS)
+        states, cost = advance(
+            states, cost, mean[:, chunk].contiguous(), noise[chunk].contiguous(), *bounds,
+            problem.padded_traversability, target, problem.grid, problem.dynamics, problem.objective,
+        )  # fmt: skip
     return cost + problem.objective.terminal(states, problem.traversability_at(states), target)
 
 
@@ -158,3 +175,34 @@ def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
         states = problem.dynamics(states, action, problem.traversability_at(states))
         positions.append(states[..., :2])
     return torch.stack(positions, dim=2)
+
+
+def _advance(
+    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
+    padded: Tensor, target: Tensor, grid: Grid, dynamics: Dynamics, objective: Objective,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Rolls samples out over a chunk of the horizon, adding up their costs."""
+    for step in range(mean.shape[1]):
+        action = _perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
+        traversability = grid.lookup(padded, states[..., 0], states[..., 1])
+        cost = cost + objective.stage(states, action, traversability, target)
+        states = dynamics(states, action, traversability)
+    return states.movedim(-1, 0).contiguous().movedim(0, -1), cost
+
+
+def _average(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Averages the sampled action sequences by their weights [B, K], shape [B, T, A]."""
+    return (_perturb(mean[..., None], noise, low, high) * weights[:, None, None]).sum(-1)
+
+
+def _perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Samples actions: mean plus noise within the bounds, control dimension next to last."""
+    return torch.clamp(mean + noise, low[:, None], high[:, None])
+
+
+def _bounds(problem: Problem, like: Tensor) -> tuple[Tensor, Tensor]:
+    return like.new_tensor(problem.dynamics.action_low), like.new_tensor(problem.dynamics.action_high)
+
+
+_advance_compiled = compiled(_advance)
+_average_compiled = compiled(_average)
