@@ -35,6 +35,8 @@ def episode_table(
         steps = int(episodes.steps[b])
         outcome = Outcome(int(episodes.outcome[b]))
         met = episodes.traversability[b, :steps].double().numpy()
+        # Compared in the tensor's own precision, as the planners do.
+        stuck = episodes.traversability[b, :steps] <= problem.stuck_threshold
         track = episodes.states[b, : steps + 1, :2].double().numpy()
         turn = episodes.actions[b, :steps, 1].double().numpy()
         success = outcome is Outcome.SUCCESS
@@ -53,7 +55,7 @@ def episode_table(
                 "reference_time_s": float(reference_time_s[b]),
                 "time_ratio": end_time_s / float(reference_time_s[b]) if success else np.nan,
                 "path_length_m": float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum()),
-                "stuck_share": float((met <= problem.stuck_threshold).mean()) if steps else np.nan,
+                "stuck_share": float(stuck.double().mean()) if steps else np.nan,
                 "roughness": float(np.abs(np.diff(turn)).mean()) if steps > 1 else 0.0,
             }
         )

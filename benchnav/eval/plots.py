@@ -8,6 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 SNAPSHOT_STEP = 250
 
@@ -24,7 +25,7 @@ class Snapshot:
         predicted: λ̂, shape [H, W].
         extent_m: size of the map along x and y.
         goal_m: (x, y).
-        stuck_threshold: cells at or under it are hatched.
+        stuck_threshold: cells at or under it are drawn dark.
         time_s: when the plan was made.
         track: driven positions to the end, shape [N + 1, 2].
         traversability: λ met, shape [N].
@@ -57,9 +58,7 @@ def save_trajectories(snapshots: list[Snapshot], path: Path) -> None:
             snapshot.predicted, origin="lower", extent=extent, cmap="RdYlGn", vmin=0, vmax=1
         )
         blocked = np.where(snapshot.predicted <= snapshot.stuck_threshold, 1.0, np.nan)
-        panels[1, column].contourf(
-            blocked, levels=[0.5, 1.5], hatches=["xxx"], colors="none", extent=extent, origin="lower"
-        )
+        panels[1, column].imshow(blocked, origin="lower", extent=extent, cmap="gray_r", vmin=0, vmax=1.2)
         for panel in panels[:, column]:
             lines = _draw_snapshot(panel, snapshot)
         panels[0, column].set_title(f"{snapshot.title}, t = {snapshot.time_s:g} s", fontsize=11)
@@ -68,9 +67,10 @@ def save_trajectories(snapshots: list[Snapshot], path: Path) -> None:
         panel.set_ylabel("y [m]")
     assert image is not None
     assert lines is not None
+    figure.legend(handles=_legend(snapshots), loc="outside lower center", ncols=4, frameon=False)
     figure.colorbar(lines, ax=panels[0], fraction=0.03, label="traversability met along the path")
     figure.colorbar(
-        image, ax=panels[1], fraction=0.03, label="traversability given to the planner (hatched: stuck)"
+        image, ax=panels[1], fraction=0.03, label="traversability given to the planner (dark: stuck)"
     )
     _save(figure, path)
 
@@ -127,6 +127,22 @@ def _draw_snapshot(panel: Axes, snapshot: Snapshot) -> LineCollection:
     return lines
 
 
+def _legend(snapshots: list[Snapshot]) -> list[Line2D]:
+    drawn = {name for snapshot in snapshots for name, line in snapshot.plan.items() if line.size}
+    marks = [
+        Line2D([], [], marker="o", color="red", mec="white", ms=9, ls="none", label="start"),
+        Line2D([], [], marker="X", color="magenta", mec="white", ms=11, ls="none", label="goal"),
+        Line2D([], [], marker="o", color="limegreen", mec="black", ms=8, ls="none", label="robot"),
+    ]
+    lines = {
+        "path": Line2D([], [], color="navy", lw=2.2, label="planned"),
+        "reference": Line2D([], [], color="blue", ls="--", lw=1.2, label="reference path"),
+        "samples": Line2D([], [], color="lightskyblue", lw=1.5, label="samples"),
+        "tree": Line2D([], [], color="black", ls="--", lw=0.7, label="tree"),
+    }
+    return marks + [line for name, line in lines.items() if name in drawn]
+
+
 def _strips(lines: np.ndarray) -> list[np.ndarray]:
     return [line[np.isfinite(line).all(axis=1)] for line in lines]
 
@@ -134,5 +150,5 @@ def _strips(lines: np.ndarray) -> list[np.ndarray]:
 def _save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}")
-    figure.savefig(partial, dpi=120, format=path.suffix[1:])
+    figure.savefig(partial, dpi=120, format=path.suffix[1:], bbox_inches="tight")
     partial.replace(path)

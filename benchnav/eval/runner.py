@@ -30,7 +30,7 @@ from benchnav.eval.metrics import episode_table, step_table
 from benchnav.eval.playback import PLAN_EVERY, PlanSketch, Recording, write_recording
 from benchnav.eval.rollout import Episodes, run_episodes
 from benchnav.eval.suite import Suite, Unit, containing, units
-from benchnav.models.predictor import load_model, predict
+from benchnav.models.predictor import Model, Oracle, load_model, predict
 from benchnav.planning.dynamics import Unicycle
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planner import Plan, make_planner
@@ -55,9 +55,10 @@ def run_suite(suite: Suite, folder: Path, jobs: int = 1) -> Iterator[tuple[int, 
     """
     dataset = TerrainDataset(find_dataset(suite.data))
     check(suite, dataset)
+    model = load_model(suite.model)
     _begin(suite, dataset, folder)
     _make_folders(folder)
-    predict_maps(suite, dataset, folder)
+    predict_maps(suite, model, dataset, folder)
     every = list(units(suite, sizes(suite, dataset)))
     missing = [unit for unit in every if not (folder / "units" / f"{unit.name}.json").exists()]
     done = len(every) - len(missing)
@@ -73,7 +74,7 @@ def check(suite: Suite, dataset: TerrainDataset) -> None:
     """Refuses a suite that names what is not there, before anything runs."""
     for risk in suite.risks:
         RiskSetting.parse(risk)
-    for planner in suite.planners:
+    for planner in {*suite.planners, *suite.planner_options}:
         options = {**suite.planner_options.get(planner, {}), **suite.recording_options.get(planner, {})}
         make_planner(planner, options)
     absent = [name for name in suite.scenarios if f"test/{name}" not in dataset.splits]
@@ -161,7 +162,6 @@ def record_episode(suite: Suite, folder: Path, planner: str, risk: str, scenario
     if path.exists():
         return path
     torch.set_num_threads(1)
-    predict_maps(suite, dataset, folder)
     problem, episodes, sketches = _simulate(suite, unit, dataset, folder)
     known = read_table(folder, "steps.parquet").query(
         "planner == @planner and risk == @risk and scenario == @scenario and instance == @instance"
@@ -181,13 +181,11 @@ def recording_name(unit: Unit, member: int) -> str:
     return f"{unit.planner}+{unit.risk.replace(':', '_')}+{unit.scenario}+{unit.instances[member]:05d}"
 
 
-def predict_maps(suite: Suite, dataset: TerrainDataset, folder: Path) -> None:
+def predict_maps(suite: Suite, model: Model | Oracle, dataset: TerrainDataset, folder: Path) -> None:
     """Predicts λ̂ once for each scenario and risk setting, into `maps/SCENARIO.npz`."""
-    todo = [name for name in suite.scenarios if not _map_path(folder, name).exists()]
-    if not todo:
-        return
-    model = load_model(suite.model)
-    for scenario in todo:
+    for scenario in suite.scenarios:
+        if _map_path(folder, scenario).exists():
+            continue
         count = min(suite.instances or sizes(suite, dataset)[scenario], sizes(suite, dataset)[scenario])
         mixture = predict(model, dataset.terrain(f"test/{scenario}", range(count)))
         maps = {risk: RiskSetting.parse(risk).apply(mixture).numpy() for risk in suite.risks}

@@ -58,11 +58,6 @@ class Suite:
             raise ConfigError(
                 f"Expected `instances` and `recorded` ≥ 0, got {self.instances} and {self.recorded}."
             )
-        unknown = sorted(set(self.planner_options) - set(self.planners))
-        if unknown:
-            raise ConfigError(
-                f"Expected `planner_options` for planners among {list(self.planners)}, got {unknown}."
-            )
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the suite as plain data for JSON."""

@@ -1,0 +1,137 @@
+import math
+from functools import lru_cache
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+
+DRAWS = 10**6
+
+
+def random_mixture(components: int = 4, cells: int = 6, seed: int = 0) -> TraversabilityMixture:
+    generator = torch.Generator().manual_seed(seed)
+    shape = (2, components, 1, cells)
+    weights = torch.rand(shape, generator=generator, dtype=torch.float64)
+    means = 1.4 * torch.rand(shape, generator=generator, dtype=torch.float64) - 0.2
+    stds = 0.02 + 0.3 * torch.rand(shape, generator=generator, dtype=torch.float64)
+    return TraversabilityMixture(weights / weights.sum(1, keepdim=True), means, stds)
+
+
+def single(mean: float, std: float, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
+    one = torch.ones(1, 1, 1, dtype=dtype)
+    return TraversabilityMixture(one, mean * one, std * one)
+
+
+@lru_cache
+def monte_carlo() -> torch.Tensor:
+    return random_mixture().sample(DRAWS, torch.Generator().manual_seed(1)).sort(dim=0).values
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.99])
+def test_risk_measures_match_monte_carlo(level: float) -> None:
+    mixture = random_mixture()
+    draws = monte_carlo()
+    assert draws.shape == (DRAWS, 2, 1, 6)
+    torch.testing.assert_close(mixture.mean(), draws.mean(0), atol=2e-3, rtol=0)
+    tail = max(1, round((1 - level) * DRAWS))
+    torch.testing.assert_close(mixture.cvar(level), draws[:tail].mean(0), atol=4e-3, rtol=0)
+    if level > 0:
+        reached = (draws <= mixture.var(level) + 1e-9).double().mean(0)
+        atom = (draws <= mixture.var(level) - 1e-9).double().mean(0)
+        assert ((atom <= 1 - level + 3e-3) & (reached >= 1 - level - 3e-3)).all()
+
+
+@pytest.mark.parametrize("mean", [-0.3, 0.0, 0.2, 0.7, 1.0, 1.4])
+@pytest.mark.parametrize("std", [0.01, 0.15, 2.0])
+@pytest.mark.parametrize("level", [0.0, 0.3, 0.9, 0.999])
+def test_single_gaussian_matches_quadrature_of_its_quantiles(mean: float, std: float, level: float) -> None:
+    # clip(F⁻¹(u), 0, 1) integrated in u by scipy: neither our root finding nor our closed forms.
+    from scipy.integrate import quad
+
+    def quantile(u: float) -> float:
+        return float(min(max(stats.norm.ppf(u, mean, std), 0), 1))
+
+    tail = 1 - level
+    kinks = [float(stats.norm.cdf((edge - mean) / std)) for edge in (0, 1)]
+    inside = sorted(k for k in kinks if 0 < k < tail)
+    expected = quad(quantile, 0, tail, points=inside or None, limit=200)[0] / tail
+    mixture = single(mean, std)
+    assert mixture.cvar(level).item() == pytest.approx(expected, abs=2e-6)
+    assert mixture.var(level).item() == pytest.approx(1.0 if level == 0 else quantile(tail), abs=1e-7)
+
+
+def test_unclipped_gaussian_has_the_textbook_cvar() -> None:
+    z = stats.norm.ppf(0.1)
+    expected = 0.5 - 0.02 * stats.norm.pdf(z) / 0.1
+    assert single(0.5, 0.02).cvar(0.9).item() == pytest.approx(expected, abs=1e-9)
+
+
+@given(
+    weights=st.lists(st.floats(0, 1), min_size=3, max_size=3).filter(lambda w: sum(w) > 1e-3),
+    means=st.lists(st.floats(-1, 2), min_size=3, max_size=3),
+    stds=st.lists(st.floats(0, 1), min_size=3, max_size=3),
+    levels=st.tuples(st.floats(0, 1 - 1e-12), st.floats(0, 1 - 1e-12)),
+)
+@settings(max_examples=300, deadline=None)
+def test_risk_measures_are_ordered_finite_and_in_range(weights, means, stds, levels) -> None:
+    total = sum(weights)
+    shaped = [
+        torch.tensor(values, dtype=torch.float64)[:, None, None]
+        for values in ([w / total for w in weights], means, stds)
+    ]
+    mixture = TraversabilityMixture(*shaped)
+    low, high = sorted(levels)
+    for measure in (mixture.cvar, mixture.var):
+        careless, careful = measure(low), measure(high)
+        assert careful.isfinite().all()
+        assert (careful <= careless + 1e-6).all()
+        assert ((careful >= 0) & (careless <= 1)).all()
+    assert (mixture.cvar(high) <= mixture.var(high) + 1e-6).all()
+    assert (mixture.cvar(high) <= mixture.mean() + 1e-6).all()
+
+
+def test_float32_keeps_its_dtype_and_agrees_with_float64() -> None:
+    exact = random_mixture()
+    short = TraversabilityMixture(exact.weights.float(), exact.means.float(), exact.stds.float())
+    assert short.cvar(0.9).dtype == torch.float32
+    torch.testing.assert_close(short.cvar(0.9).double(), exact.cvar(0.9), atol=1e-5, rtol=0)
+
+
+def test_log_prob_integrates_to_one_with_its_atoms() -> None:
+    mixture = random_mixture(cells=1)
+    grid = torch.linspace(0, 1, 20001, dtype=torch.float64)[1:-1]
+    density = torch.stack([mixture.log_prob(torch.full((2, 1, 1), x)).exp() for x in grid.tolist()[::4]])
+    inside = density.mean(0)
+    atoms = sum(mixture.log_prob(torch.full((2, 1, 1), edge)).exp() for edge in (0.0, 1.0))
+    torch.testing.assert_close(inside + atoms, torch.ones(2, 1, 1, dtype=torch.float64), atol=2e-3, rtol=0)
+    assert (mixture.log_prob(torch.full((2, 1, 1), 1.2)) == -math.inf).all()
+
+
+def test_cdf_has_the_atoms_of_clipping() -> None:
+    mixture = single(0.9, 0.2)
+    assert mixture.cdf(-1e-9).item() == 0
+    assert mixture.cdf(0.0).item() == pytest.approx(stats.norm.cdf(-4.5))
+    assert mixture.cdf(0.9).item() == pytest.approx(0.5)
+    assert mixture.cdf(1.0).item() == 1
+
+
+def test_most_likely_keeps_the_heaviest_component() -> None:
+    mixture = random_mixture()
+    kept = mixture.most_likely()
+    best = mixture.weights.argmax(1)
+    assert kept.means.shape == (2, 1, 1, 6)
+    assert kept.means[1, 0, 0, 3] == mixture.means[1, best[1, 0, 3], 0, 3]
+
+
+def test_bad_arguments_are_refused() -> None:
+    mixture = single(0.5, 0.1)
+    for level in (-0.1, 1.0, math.nan):
+        with pytest.raises(ConfigError, match="level"):
+            mixture.cvar(level)
+    with pytest.raises(ConfigError, match="one shape"):
+        TraversabilityMixture(torch.ones(1, 2, 3), torch.ones(1, 2, 3), torch.ones(1, 2, 4))
