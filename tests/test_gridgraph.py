@@ -11,7 +11,9 @@ def networkx_costs(costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int])
     graph.add_nodes_from(range(shape[0] * shape[1]))
     keep = np.isfinite(costs)
     # Turned round, as a search from the goals.
-    graph.add_weighted_edges_from(zip(target[keep].tolist(), source[keep].tolist(), costs[keep].tolist(), strict=True))
+    graph.add_weighted_edges_from(
+        zip(target[keep].tolist(), source[keep].tolist(), costs[keep].tolist(), strict=True)
+    )
     if not goals.any():
         return {}
     return networkx.multi_source_dijkstra_path_length(graph, set(np.flatnonzero(goals).tolist()))

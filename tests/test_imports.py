@@ -41,5 +41,7 @@ def test_imports_go_one_way(path: Path) -> None:
 
 
 def test_no_drawers_without_a_label() -> None:
-    names = {path.stem for path in PACKAGE.rglob("*.py")} | {path.name for path in PACKAGE.rglob("*") if path.is_dir()}
+    names = {path.stem for path in PACKAGE.rglob("*.py")} | {
+        path.name for path in PACKAGE.rglob("*") if path.is_dir()
+    }
     assert not names & {"utils", "util", "common", "helpers", "misc"}

@@ -22,7 +22,10 @@ def test_elements_and_streams_share_no_words() -> None:
 
 
 def test_names_are_not_confused_by_joining() -> None:
-    keys = {rng.stream_key(0, *names) for names in (("ab", "c"), ("a", "bc"), ("abc",), ("a", "b", "c"), ("1",), (1,))}
+    keys = {
+        rng.stream_key(0, *names)
+        for names in (("ab", "c"), ("a", "bc"), ("abc",), ("a", "b", "c"), ("1",), (1,))
+    }
     assert len(keys) == 6
     assert rng.stream_key(0, "a") != rng.stream_key(1, "a")
 

@@ -9,7 +9,9 @@ from tests import factories
 
 
 @given(st.integers(3, 20), st.integers(3, 20), st.floats(0.1, 3), st.data())
-def test_a_position_lies_in_the_cell_it_is_looked_up_in(height: int, width: int, resolution: float, data) -> None:
+def test_a_position_lies_in_the_cell_it_is_looked_up_in(
+    height: int, width: int, resolution: float, data
+) -> None:
     grid = Grid(height, width, resolution)
     x = torch.tensor([data.draw(st.floats(0.001, 0.999)) * width * resolution], dtype=torch.float64)
     y = torch.tensor([data.draw(st.floats(0.001, 0.999)) * height * resolution], dtype=torch.float64)

@@ -30,7 +30,7 @@ from benchnav.eval.metrics import episode_table, step_table
 from benchnav.eval.playback import PLAN_EVERY, PlanSketch, Recording, write_recording
 from benchnav.eval.rollout import Episodes, run_episodes
 from benchnav.eval.suite import Suite, Unit, containing, units
-from benchnav.models.predictor import Model, Oracle, load_model, predict
+from benchnav.models.predictor import Model, Oracle, find_checkpoint, load_model, model_names, predict
 from benchnav.planning.dynamics import Unicycle
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planner import Plan, make_planner
@@ -104,7 +104,9 @@ def load_run(folder: Path) -> tuple[Suite, dict[str, Any]]:
         raise ConfigError(
             f"Expected a run folder with run.json, got {folder}. Make one with `benchnav-eval run`."
         ) from error
-    settings: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in about["suite"].items()}
+    settings: dict[str, Any] = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in about["suite"].items()
+    }
     return Suite(**settings), about
 
 
@@ -314,9 +316,9 @@ def _make_folders(folder: Path) -> None:
 
 
 def _model_digest(source: str) -> dict[str, Any]:
-    folder = Path(source)
-    if not folder.is_dir():
+    if source in model_names():
         return {"name": source}
+    folder = find_checkpoint(source)
     files = sorted(path for path in folder.iterdir() if path.suffix in (".json", ".safetensors"))
     return {"name": source, "files": {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in files}}
 

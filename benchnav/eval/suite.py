@@ -18,7 +18,8 @@ class Suite:
 
     Args:
         data: Path or id of a dataset with splits test/SCENARIO.
-        model: Folder of a checkpoint, or name of a registered model; `oracle` knows the truth.
+        model: Checkpoint, by folder or by name in `checkpoints/`, or name of a registered model; `oracle`
+            knows the truth.
         planners: Planners by name.
         risks: Risk settings, `name` or `name:level`.
         scenarios: Test splits by scenario.
@@ -34,7 +35,7 @@ class Suite:
     """
 
     data: str = "paper-v1"
-    model: str = "checkpoints/paper-v1"
+    model: str = "paper-v1"
     planners: tuple[str, ...] = ("astar_dwa", "cl_rrt", "mppi")
     risks: tuple[str, ...] = ("cvar", "var", "mean", "single-class")
     scenarios: tuple[str, ...] = ("std", "hg", "hs")

@@ -30,20 +30,24 @@ def test_perlin_noise_is_smooth_and_zero_at_its_lattice() -> None:
 
 
 def test_shading_is_lamberts_law() -> None:
-    y, x = np.mgrid[:5, :5] * 0.5
+    _, x = np.mgrid[:5, :5] * 0.5
     slope = np.tan(np.radians(20))
     plane = (slope * x)[None]
     light = appearance.light_direction(np.array([np.pi]), np.array([np.cos(np.radians(20))]))
     # Light along the plane's normal: full brightness. Overhead: cos 20°. Behind: ambient alone.
     np.testing.assert_allclose(appearance.shade(plane, 0.5, light, 0.1), 1)
     overhead = np.array([[0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(appearance.shade(plane, 0.5, overhead, 0.1), 0.1 + 0.9 * np.cos(np.radians(20)))
+    np.testing.assert_allclose(
+        appearance.shade(plane, 0.5, overhead, 0.1), 0.1 + 0.9 * np.cos(np.radians(20))
+    )
     grazing = np.array([[1.0, 0.0, 0.0]])
     np.testing.assert_allclose(appearance.shade(plane, 0.5, grazing, 0.1), 0.1)
 
 
 def test_paint_scales_the_class_colour() -> None:
-    image = appearance.paint(np.array([[[0, 1]]]), np.array([[200.0, 100, 50], [0, 10, 255]]), np.array([[[0.5, 1.0]]]))
+    image = appearance.paint(
+        np.array([[[0, 1]]]), np.array([[200.0, 100, 50], [0, 10, 255]]), np.array([[[0.5, 1.0]]])
+    )
     assert image[0, :, 0].T.tolist() == [[100, 50, 25], [0, 10, 255]]
 
 

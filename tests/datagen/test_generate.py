@@ -47,7 +47,10 @@ def test_environments_use_every_class_alike_and_splits_differ() -> None:
 def test_realised_traversability_is_the_clipped_latent_one() -> None:
     maps = generate(PAPER, "train", np.arange(100))
     slope = maps["slope_deg"].astype(np.float64)
-    mean, std = latent_mean(maps["class_id"], slope, PAPER.classes), latent_std(maps["class_id"], PAPER.classes)
+    mean, std = (
+        latent_mean(maps["class_id"], slope, PAPER.classes),
+        latent_std(maps["class_id"], PAPER.classes),
+    )
     inside = (mean > 0.35) & (mean < 0.5)
     score = (maps["traversability"][inside] - mean[inside]) / std[inside]
     assert abs(score.mean()) < 0.03
@@ -61,7 +64,10 @@ def test_solvable_instances_have_the_reference_time_of_networkx() -> None:
     recipe = tiny_recipe(test_hg=4)
     maps = generate(recipe, "test/hg", np.arange(4))
     slope = maps["slope_deg"].astype(np.float64)
-    means, stds = latent_mean(maps["class_id"], slope, recipe.classes), latent_std(maps["class_id"], recipe.classes)
+    means, stds = (
+        latent_mean(maps["class_id"], slope, recipe.classes),
+        latent_std(maps["class_id"], recipe.classes),
+    )
     import torch
 
     shaped = [torch.from_numpy(a)[:, None] for a in (np.ones_like(means), means, stds)]

@@ -55,7 +55,8 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     about = json.loads((folder / "run.json").read_text())
     assert about["versions"]["torch"] == torch.__version__.split("+")[0]
     assert len(about["dataset"]["splits"]["test/std"]["digest"]) == 64
-    for name in ("summary.md", "summary.csv", "summary.tex", "timing.csv", "figures/trajectories.png", "figures/success.png"):
+    figures = ("figures/trajectories.png", "figures/success.png")
+    for name in ("summary.md", "summary.csv", "summary.tex", "timing.csv", *figures):
         assert (folder / name).stat().st_size > 100
     assert len(pd.read_csv(folder / "summary.csv")) == 12
     assert not list(folder.rglob("*partial*"))
@@ -65,7 +66,9 @@ def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]
     _, folder = finished
     recordings = sorted((folder / "playback").glob("*.rrd"))
     assert len(recordings) == 3
-    subprocess.run(["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=_path())
+    subprocess.run(
+        ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=_path()
+    )
     steps = pd.read_parquet(folder / "steps.parquet")
     for path in recordings:
         planner, risk, scenario, instance = path.stem.split("+")
@@ -128,7 +131,9 @@ def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, 
 
 
 def test_every_setting_meets_the_same_luck(dataset_path: Path, tmp_path: Path) -> None:
-    suite = suite_on(dataset_path, planners=("astar_dwa", "mppi"), risks=("mean",), scenarios=("std",), recorded=0)
+    suite = suite_on(
+        dataset_path, planners=("astar_dwa", "mppi"), risks=("mean",), scenarios=("std",), recorded=0
+    )
     finish(suite, tmp_path / "run")
     steps = pd.read_parquet(tmp_path / "run" / "steps.parquet").query("step == 0 and instance == 1")
     # At the start both stand on the same cell: the λ they meet must be the same draw.
@@ -160,7 +165,12 @@ def test_models_see_observations_and_planners_the_prediction(
     predictor.register_model("spy", lambda *_, **__: Spy())
     planners.register("watched", lambda options: Watched())
     suite = suite_on(
-        dataset_path, model="spy", planners=("watched",), risks=("mean",), scenarios=("std",), planner_options={}
+        dataset_path,
+        model="spy",
+        planners=("watched",),
+        risks=("mean",),
+        scenarios=("std",),
+        planner_options={},
     )
     finish(suite, tmp_path / "run")
     assert seen

@@ -27,7 +27,9 @@ def test_it_brakes_before_a_wall() -> None:
     walled = torch.full((1, 16, 16), 0.9)
     walled[:, :, 8:] = 0.1
     problem = factories.problem(walled, start=(3.4, 4.0), goal=(7.0, 4.0))
-    velocity, _, _ = choose_velocity(problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m, CONFIG)
+    velocity, _, _ = choose_velocity(
+        problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m, CONFIG
+    )
     assert velocity[0, 0] < 0.26
 
 

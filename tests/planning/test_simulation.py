@@ -14,7 +14,9 @@ KEY = rng.stream_key(0, "luck")
 AHEAD = torch.tensor([[1.0, 0.0]])
 
 
-def simulation(mean: torch.Tensor, goal: tuple[float, float], std: float = 0.1, **config: object) -> Simulation:
+def simulation(
+    mean: torch.Tensor, goal: tuple[float, float], std: float = 0.1, **config: object
+) -> Simulation:
     goals = torch.tensor([goal] * len(mean))
     settings = SimulationConfig(**config)  # type: ignore[arg-type]
     return Simulation(factories.terrain(mean, std), Unicycle(), goals, KEY, range(len(mean)), settings)

@@ -1,0 +1,76 @@
+"""Small terrains and datasets for the tests of the models."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from benchnav.datagen.scenario import load_recipe
+from benchnav.datagen.store import TerrainDataset, create
+from benchnav.models.data import PixelTable
+from benchnav.models.slope_table import SlopeTable, table_slopes
+from benchnav.terrain import Grid, Terrain
+
+NAMES = ("a", "b", "c")
+
+
+def make_dataset(path: Path, **maps: int) -> TerrainDataset:
+    """Makes a dataset of the recipe tiny-v1 with fewer maps; splits not named are left out."""
+    recipe = load_recipe("tiny-v1")
+    counts = {name.replace("_", "/"): count for name, count in maps.items()}
+    splits = {name: replace(recipe.splits[name], maps=count) for name, count in counts.items()}
+    for _ in create(replace(recipe, splits=splits), path):
+        pass
+    return TerrainDataset(path)
+
+
+def make_terrain(batch: int = 2, size: int = 16, classes: int = 3, seed: int = 0) -> Terrain:
+    """Makes terrain whose layers are random and whose traversability follows its mean and std."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (batch, size, size)
+    mean = torch.rand(shape, generator=generator)
+    std = 0.1 + 0.1 * torch.rand(shape, generator=generator)
+    return Terrain(
+        rgb=torch.randint(0, 256, (batch, 3, size, size), generator=generator, dtype=torch.uint8),
+        class_id=torch.randint(0, classes, shape, generator=generator),
+        elevation_m=torch.rand(shape, generator=generator),
+        slope_deg=30 * torch.rand(shape, generator=generator),
+        traversability_mean=mean,
+        traversability_std=std,
+        traversability=(mean + std * torch.randn(shape, generator=generator)).clamp(0, 1),
+        grid=Grid(size, size, 0.5),
+    )
+
+
+def linear_table() -> SlopeTable:
+    """Three classes with means 1 − ψ/90, 0.5 and ψ/90 and standard deviations 0.1, 0.2 and 0.3."""
+    slopes = table_slopes().float()
+    noise = torch.tensor([0.1, 0.2, 0.3])
+    mean = torch.stack([1 - slopes / 90, torch.full_like(slopes, 0.5), slopes / 90])
+    return SlopeTable(mean=mean, std=noise[:, None].expand_as(mean).contiguous(), noise_std=noise)
+
+
+NOISE = torch.tensor([0.10, 0.15, 0.20])
+
+
+def latent(slope_deg: torch.Tensor) -> torch.Tensor:
+    """The true latent functions of three classes; the first is near 1, where half is clipped."""
+    return torch.stack(
+        [
+            1 - 5e-4 * slope_deg**1.5,
+            0.95 - 3e-3 * slope_deg**1.6,
+            (0.9 - 8e-3 * slope_deg**1.5).clamp(min=0),
+        ]
+    )
+
+
+def make_table(points: int, seed: int = 0, steepest_deg: float = 25) -> PixelTable:
+    """Draws observations of the three classes at random slopes."""
+    generator = torch.Generator().manual_seed(seed)
+    slope = steepest_deg * torch.rand(points, generator=generator)
+    noise = NOISE[:, None] * torch.randn(3, points, generator=generator)
+    return PixelTable(
+        slope_deg=slope.expand(3, -1).contiguous(),
+        traversability=(latent(slope) + noise).clamp(0, 1),
+        count=torch.full((3,), points),
+    )

@@ -1,0 +1,146 @@
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchnav.errors import CheckpointError
+from benchnav.models import checkpoint as module
+from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
+from benchnav.models.classifier import TerrainClassifier
+from benchnav.models.predictor import FusedModel, load_model, predict
+
+from .support import make_terrain
+
+
+@pytest.fixture
+def folder(checkpoint_path: Path, tmp_path: Path) -> Path:
+    """A copy of the checkpoint, to be spoilt."""
+    return Path(shutil.copytree(checkpoint_path, tmp_path / "copy"))
+
+
+def edit(folder: Path, **changes: object) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, **changes}))
+
+
+def test_a_round_trip_gives_equal_predictions(folder: Path, tmp_path: Path) -> None:
+    there = load_checkpoint(folder)
+    save_checkpoint(tmp_path / "again", there, half_precision=False)
+    terrain = make_terrain(classes=10)
+    before, after = (predict(load_model(path), terrain) for path in (folder, tmp_path / "again"))
+    for name in ("weights", "means", "stds"):
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    again = load_checkpoint(tmp_path / "again")
+    assert again.class_names == there.class_names
+    assert again.dataset_digest == there.dataset_digest
+    assert again.part("classifier").metrics == there.part("classifier").metrics
+
+
+def test_half_precision_is_small_and_close(folder: Path, tmp_path: Path) -> None:
+    part = load_checkpoint(folder).part("classifier")
+    sharp = {
+        name: value + 1e-5 if value.is_floating_point() else value for name, value in part.tensors.items()
+    }
+    exact = load_checkpoint(folder).with_part("classifier", replace(part, tensors=sharp))
+    for name, half in (("half", True), ("full", False)):
+        save_checkpoint(tmp_path / name, exact, half_precision=half)
+    sizes = {n: (tmp_path / n / "classifier.safetensors").stat().st_size for n in ("half", "full")}
+    assert sizes["half"] < 0.51 * sizes["full"]
+    assert sizes["half"] < 30e6
+    terrain = make_terrain(classes=10)
+    half, full = (predict(load_model(tmp_path / name), terrain).weights for name in ("half", "full"))
+    assert half.dtype == torch.float32
+    torch.testing.assert_close(half, full, rtol=0, atol=0.02)
+    assert not torch.equal(half, full)
+    classifier = load_model(tmp_path / "half").classifier  # type: ignore[union-attr]
+    assert all(p.dtype == torch.float32 for p in classifier.parameters())
+
+
+def test_a_folder_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"Expected a checkpoint folder with config\.json"):
+        load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["classifier", "gp"])
+def test_missing_tensors_are_refused(folder: Path, name: str) -> None:
+    (folder / f"{name}.safetensors").unlink()
+    with pytest.raises(CheckpointError, match=f"{name}.safetensors"):
+        load_checkpoint(folder)
+
+
+@pytest.mark.parametrize("name", ["classifier", "gp"])
+@pytest.mark.parametrize("damage", ["flip", "cut"])
+def test_damaged_tensors_are_refused(folder: Path, name: str, damage: str) -> None:
+    path = folder / f"{name}.safetensors"
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content if damage == "flip" else content[:-200])
+    with pytest.raises(CheckpointError, match="is damaged"):
+        load_checkpoint(folder)
+
+
+def test_a_damaged_config_is_refused(folder: Path) -> None:
+    text = (folder / "config.json").read_text()
+    for spoilt in (text[:-30], "[]", "{}", '{"format": "benchnav-checkpoint", "format_version": "1.0"}'):
+        (folder / "config.json").write_text(spoilt)
+        with pytest.raises(CheckpointError, match="is damaged"):
+            load_checkpoint(folder)
+
+
+def test_a_newer_format_is_refused(folder: Path) -> None:
+    edit(folder, format_version="1.1")
+    with pytest.raises(CheckpointError, match="pip install --upgrade benchnav"):
+        load_checkpoint(folder)
+
+
+def test_a_foreign_format_is_refused(folder: Path) -> None:
+    edit(folder, format="other")
+    with pytest.raises(CheckpointError, match="'other'"):
+        load_checkpoint(folder)
+
+
+def test_tensors_that_do_not_fit_their_settings_are_refused(folder: Path) -> None:
+    there = load_checkpoint(folder)
+    part = there.part("classifier")
+    for config in (
+        {**part.config, "encoder": "resnet34"},
+        {**part.config, "wings": 2},
+        {"max_epochs": "many"},
+    ):
+        with pytest.raises(CheckpointError, match="Train the model again"):
+            FusedModel.from_checkpoint(there.with_part("classifier", replace(part, config=config)))
+    fewer = replace(there, class_names=there.class_names[:3])
+    with pytest.raises(CheckpointError, match="fit the checkpoint"):
+        FusedModel.from_checkpoint(fewer)
+
+
+def test_no_weights_are_downloaded_for_a_pretrained_checkpoint(folder: Path) -> None:
+    part = load_checkpoint(folder).part("classifier")
+    model = TerrainClassifier.from_tensors({**part.config, "pretrained": True}, 10, part.tensors)
+    assert model.config.pretrained is False
+
+
+def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = load_checkpoint(folder)
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "_write_bytes", killed)
+    with pytest.raises(KeyboardInterrupt):
+        save_checkpoint(folder, replace(there, dataset_id="new"))
+    monkeypatch.undo()
+    assert load_checkpoint(folder).dataset_id == there.dataset_id
+    assert os.listdir(folder.parent) == [folder.name]
+
+
+def test_a_save_never_replaces_what_is_no_checkpoint(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "notes.txt").write_text("keep")
+    with pytest.raises(CheckpointError, match="something else"):
+        save_checkpoint(tmp_path / "precious", load_checkpoint(folder))
+    assert (tmp_path / "precious" / "notes.txt").read_text() == "keep"

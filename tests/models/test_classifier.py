@@ -1,0 +1,106 @@
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from benchnav.datagen.store import TerrainDataset
+from benchnav.errors import ConfigError
+from benchnav.models.classifier import TerrainClassifier
+from benchnav.models.config import ClassifierConfig
+from benchnav.models.training import KeepBest, fit_classifier
+
+MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
+
+
+def build(seed: int = 0, **settings: object) -> TerrainClassifier:
+    return TerrainClassifier(ClassifierConfig(**settings), 4, MEAN, STD, seed).eval()  # type: ignore[arg-type]
+
+
+def image(height: int, width: int, batch: int = 1) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(5)
+    return torch.randint(0, 256, (batch, 3, height, width), generator=generator, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (33, 20), (32, 64)])
+def test_maps_of_any_size_are_classified(shape: tuple[int, int]) -> None:
+    with torch.no_grad():
+        logits = build()(image(*shape))
+    assert logits.shape == (1, 4, *shape)
+    assert bool(logits.isfinite().all())
+
+
+def test_colours_are_normalised_by_the_training_maps() -> None:
+    model = build()
+    seen: list[torch.Tensor] = []
+    model.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    rgb = image(32, 32)
+    with torch.no_grad():
+        model(rgb)
+    expected = (rgb.float() - MEAN.view(3, 1, 1)) / STD.view(3, 1, 1)
+    torch.testing.assert_close(seen[0], expected)
+
+
+def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
+    before = torch.random.get_rng_state()
+    first, second, other = (next(build(seed).network.parameters()) for seed in (0, 0, 1))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_another_architecture_and_encoder_fit() -> None:
+    with torch.no_grad():
+        assert build(architecture="fpn", encoder="resnet34")(image(32, 32)).shape == (1, 4, 32, 32)
+
+
+@pytest.mark.parametrize(("name", "value"), [("architecture", "unett"), ("encoder", "resnet19")])
+def test_an_unknown_network_is_refused(name: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=value):
+        build(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("learning_rate", 0.0), ("batch_size", 1), ("max_epochs", 0), ("weight_decay", -1.0)]
+)
+def test_settings_that_cannot_train_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=name):
+        ClassifierConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_training_is_reproducible_and_learns(
+    dataset: TerrainDataset, capfd: pytest.CaptureFixture[str], tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = ClassifierConfig(max_epochs=4, batch_size=5)
+    first, metrics = fit_classifier(config, dataset, seed=3, precision="32-true", device="cpu")
+    lines = capfd.readouterr().err.strip().splitlines()
+    second, _ = fit_classifier(config, dataset, seed=3, precision="32-true", device="cpu")
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
+    assert metrics["valid_accuracy"] > 0.15
+    assert [line.split(",")[0] for line in lines] == [f"classifier: epoch {n}/4" for n in (1, 2, 3, 4)]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_best_epoch_is_kept() -> None:
+    model, best = torch.nn.Linear(1, 1), KeepBest()
+    for epoch, loss in enumerate((2.0, 1.0, 3.0, float("nan"))):
+        torch.nn.init.constant_(model.weight, epoch)
+        trainer = SimpleNamespace(callback_metrics={"valid_loss": torch.tensor(loss)}, current_epoch=epoch)
+        best.on_validation_epoch_end(trainer, model)  # type: ignore[arg-type]
+    best.on_fit_end(trainer, model)  # type: ignore[arg-type]
+    assert model.weight.item() == 1
+    assert best.metrics == {"valid_loss": 1.0, "epoch": 2}
+
+
+def test_training_stops_when_validation_no_longer_gains(
+    dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = ClassifierConfig(max_epochs=30, batch_size=5, patience=1, learning_rate=0.3)
+    fit_classifier(config, dataset, seed=0, precision="32-true", device="cpu")
+    assert len(capfd.readouterr().err.strip().splitlines()) < 20
+
+
+def test_a_loss_that_is_no_number_is_one_error() -> None:
+    with pytest.raises(ConfigError, match="learning_rate"):
+        KeepBest().on_fit_end(SimpleNamespace(), torch.nn.Linear(1, 1))  # type: ignore[arg-type]

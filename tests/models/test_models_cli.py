@@ -1,0 +1,133 @@
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchnav.datagen.store import TerrainDataset
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.cli import main
+
+from .support import make_dataset
+
+QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5", "--gp.batch_size", "32", "--gp.max_points", "100"]
+QUICK_CLASSIFIER = ["--classifier.max_epochs", "1", "--classifier.batch_size", "5", "--precision", "32-true"]
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["benchnav-train", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def refuses(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Runs a command that must end with status 2 and one line; returns the line."""
+    capfd.readouterr()
+    assert call(monkeypatch, *arguments) == 2
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("benchnav-train: error: ")
+    return lines[0]
+
+
+def test_halves_are_trained_into_one_checkpoint(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    where = ["--data", dataset.path, "--out", "new/mine"]
+    assert call(monkeypatch, "gp", *where, *QUICK_GP, "--seed", 7) == 0
+    assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER) == 0
+    out, err = capfd.readouterr()
+    assert "validation RMSE of the latent mean" in out
+    assert "validation accuracy" in out
+    assert "wrote new/mine with classifier and gp" in out
+    assert [line.split(":")[0] for line in err.strip().splitlines()] == ["gps", "classifier"], err
+    there = load_checkpoint("new/mine")
+    assert set(there.parts) == {"classifier", "gp"}
+    assert there.part("gp").seed == 7
+    assert there.part("gp").config["max_points"] == 100
+    assert 0 < there.part("classifier").metrics["valid_accuracy"] < 1
+    assert there.dataset_id == "tiny-v1"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new"]
+
+    again = refuses(monkeypatch, capfd, "gp", *where, *QUICK_GP)
+    assert "--overwrite true" in again
+    assert (
+        call(monkeypatch, "gp", *where, *QUICK_GP, "--overwrite", "true", "--gp.likelihood", "gaussian") == 0
+    )
+    after = load_checkpoint("new/mine")
+    assert after.part("gp").config["likelihood"] == "gaussian"
+    assert after.part("classifier").metrics == there.part("classifier").metrics
+
+
+def test_a_half_of_other_maps_is_refused(
+    checkpoint_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(checkpoint_path, tmp_path / "copy")
+    (copy / "classifier.safetensors").unlink()
+    config = json.loads((copy / "config.json").read_text())
+    del config["parts"]["classifier"]
+    (copy / "config.json").write_text(json.dumps(config))
+    other = make_dataset(tmp_path / "other.h5", train=3, valid=1)
+    where = ["--data", other.path, "--out", copy]
+    message = refuses(monkeypatch, capfd, "classifier", *where, *QUICK_CLASSIFIER)
+    assert "other maps" in message
+
+
+def test_evaluate_prints_a_table_and_writes_json(
+    checkpoint_path: Path,
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    report = tmp_path / "report.json"
+    assert call(monkeypatch, "evaluate", checkpoint_path, "--data", dataset.path, "--json", report) == 0
+    out = capfd.readouterr().out
+    assert "test/std" in out
+    assert "mIoU" in out
+    found = json.loads(report.read_text())
+    assert list(found["splits"]) == ["test/std", "test/hs"]
+    assert found["dataset"]["digest"] == dataset.digest
+    assert set(found["splits"]["test/hs"]) == {
+        "maps", "accuracy", "miou", "ece", "rmse_observed", "rmse_expected", "nll", "crps", "coverage", "tail_rate",
+    }  # fmt: skip
+    assert call(monkeypatch, "evaluate", "oracle", "--data", dataset.path, "--splits", "[valid]") == 0
+    assert "valid" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["evaluate", "oracel", "--data", "DATA"], "Did you mean 'oracle'"),
+        (["evaluate", "oracle", "--data", "nothing.h5"], "nothing.h5"),
+        (["evaluate", "oracle", "--data", "DATA", "--splits", "[test/hg]"], "test/hg"),
+        (["evaluate", "oracle", "--data", "DATA", "--json", "no/such/folder.json"], "no/such"),
+        (["all", "--data", "DATA"], "out"),
+        (["all", "--data", "DATA", "--out", "x", "--classifier.max_epochs", "0"], "max_epochs"),
+        (["all", "--data", "DATA", "--out", "x", "--gp.likelihood", "cauchy"], "likelihood"),
+        (["classifier", "--data", "DATA", "--out", "x", "--classifier.encoder", "resnet19"], "resnet19"),
+        (["gp", "--data", "TEST", "--out", "x"], "train and valid"),
+        (["gp", "--data", "DATA", "--out", "."], "something else"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(
+    arguments: list[str],
+    expected: str,
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = {"DATA": dataset.path}
+    if "TEST" in arguments:
+        paths["TEST"] = make_dataset(tmp_path / "test.h5", test_std=1).path
+    message = refuses(monkeypatch, capfd, *(paths.get(item, item) for item in arguments))
+    assert expected in message
+    assert not (tmp_path / "x").exists()
