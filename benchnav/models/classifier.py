@@ -5,7 +5,6 @@ ResNet-18 encoder of paper III-B. Sources: Ronneberger et al. (2015), "U-Net"; H
 "Deep residual learning". Letters in shapes: B maps, H×W cells, C classes.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import lightning
@@ -17,55 +16,10 @@ from torchmetrics import MetricCollection
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from benchnav.errors import ConfigError
+from benchnav.models.config import ClassifierConfig
 
 _WARM_UP_SHARE = 0.15
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClassifierConfig:
-    """What the classifier is and how it is trained.
-
-    Args:
-        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
-        encoder: one of its encoders, for example resnet18.
-        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
-        learning_rate: highest rate of the one-cycle schedule.
-        weight_decay: of AdamW.
-        batch_size: most maps a batch.
-        max_epochs: length of the schedule.
-        patience: epochs without a better validation loss after which training stops.
-    """
-
-    architecture: str = "unet"
-    encoder: str = "resnet18"
-    pretrained: bool = False
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-3
-    batch_size: int = 16
-    max_epochs: int = 30
-    patience: int = 8
-
-    def __post_init__(self) -> None:
-        """Refuses names that are not there and numbers that cannot train."""
-        if self.architecture not in smp.MODEL_ARCHITECTURES_MAPPING:
-            raise ConfigError(
-                f"Expected `architecture` among {', '.join(smp.MODEL_ARCHITECTURES_MAPPING)}, "
-                f"got {self.architecture!r}."
-            )
-        if self.encoder not in smp.encoders.get_encoder_names() and not self.encoder.startswith("tu-"):
-            raise ConfigError(
-                f"Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, got {self.encoder!r}."
-            )
-        if not (0 < self.learning_rate < 1 and 0 <= self.weight_decay < 1):
-            raise ConfigError(
-                "Expected `learning_rate` in (0, 1) and `weight_decay` in [0, 1), "
-                f"got {self.learning_rate} and {self.weight_decay}."
-            )
-        if self.batch_size < 2 or self.max_epochs < 1 or self.patience < 1:
-            raise ConfigError(
-                "Expected `batch_size` ≥ 2, `max_epochs` ≥ 1 and `patience` ≥ 1, "
-                f"got {self.batch_size}, {self.max_epochs} and {self.patience}."
-            )
+_STRIDE = 32  # the coarsest of any encoder: sides must be multiples of it
 
 
 class TerrainClassifier(lightning.LightningModule):
@@ -83,7 +37,12 @@ class TerrainClassifier(lightning.LightningModule):
     colour_std: Tensor
 
     def __init__(
-        self, config: ClassifierConfig, class_count: int, colour_mean: Tensor, colour_std: Tensor, seed: int = 0
+        self,
+        config: ClassifierConfig,
+        class_count: int,
+        colour_mean: Tensor,
+        colour_std: Tensor,
+        seed: int = 0,
     ) -> None:
         """Builds the network with fresh weights."""
         super().__init__()
@@ -95,17 +54,31 @@ class TerrainClassifier(lightning.LightningModule):
         self.metrics = self.configure_metrics()
 
     def configure_network(self, seed: int) -> nn.Module:
-        """Builds the network; leaves PyTorch's global generator as it was."""
+        """Builds the network; leaves PyTorch's global generator as it was.
+
+        Raises:
+            ConfigError: there is no such architecture or encoder.
+        """
+        architectures, encoder = smp.MODEL_ARCHITECTURES_MAPPING, self.config.encoder
+        if self.config.architecture not in architectures:
+            raise ConfigError(
+                f"Expected `architecture` among {', '.join(architectures)}, got {self.config.architecture!r}."
+            )
+        if encoder not in smp.encoders.get_encoder_names() and not encoder.startswith("tu-"):
+            raise ConfigError(
+                "Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, "
+                f"got {encoder!r}."
+            )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = smp.create_model(
                 self.config.architecture,
-                encoder_name=self.config.encoder,
+                encoder_name=encoder,
                 encoder_weights="imagenet" if self.config.pretrained else None,
                 in_channels=3,
                 classes=self.class_count,
             )
-        return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return network.to(memory_format=torch.channels_last)
 
     def configure_losses(self) -> nn.Module:
         """The training loss: cross-entropy, a proper score, so that probabilities are calibrated."""
@@ -142,9 +115,8 @@ class TerrainClassifier(lightning.LightningModule):
             Shape [B, C, H, W].
         """
         height, width = rgb.shape[-2:]
-        stride = self.network.encoder.output_stride
         image = (rgb.to(self.colour_mean.dtype) - self.colour_mean) / self.colour_std
-        image = nn.functional.pad(image, (0, -width % stride, 0, -height % stride), mode="replicate")
+        image = nn.functional.pad(image, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
         logits = self.network(image.contiguous(memory_format=torch.channels_last))
         return logits[..., :height, :width]
 
@@ -160,19 +132,16 @@ class TerrainClassifier(lightning.LightningModule):
         self.log("valid_loss", loss, on_epoch=True, batch_size=len(logits))
         self.log_dict(dict(self.metrics.items()), on_epoch=True, batch_size=len(logits))
 
-    def to_tensors(self) -> dict[str, Tensor]:
-        """Gives weights and buffers by name, for a checkpoint."""
-        wanted = ("network.", "colour_")
-        return {name: value for name, value in self.state_dict().items() if name.startswith(wanted)}
-
     @classmethod
-    def from_tensors(cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]) -> "TerrainClassifier":
+    def from_tensors(
+        cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]
+    ) -> "TerrainClassifier":
         """Rebuilds a trained classifier, downloading nothing.
 
         Args:
             config: fields of `ClassifierConfig`.
             class_count: C.
-            tensors: from `to_tensors`.
+            tensors: a state dict.
 
         Raises:
             ConfigError: the settings are not those of a classifier.
@@ -183,8 +152,5 @@ class TerrainClassifier(lightning.LightningModule):
         except TypeError as error:
             raise ConfigError(f"Expected the settings of a classifier, got {sorted(config)}.") from error
         model = cls(settings, class_count, torch.zeros(3), torch.ones(3))
-        missing = [name for name in model.to_tensors() if name not in tensors]
-        if missing:
-            raise RuntimeError(f"{len(missing)} tensors are missing, among them {missing[0]}")
-        model.load_state_dict(tensors, strict=False)
+        model.load_state_dict(tensors)
         return model.eval()

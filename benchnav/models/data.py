@@ -20,8 +20,8 @@ from benchnav.errors import ConfigError, DatasetError
 
 TRAIN, VALID = "train", "valid"
 
-_SYMMETRIES = 8  # of the square: four rotations, each as it is or mirrored
-_KEEPING_SHAPE = (0, 2, 4, 6)  # those that keep a map's height its height
+_SYMMETRIES = tuple(range(8))  # of the square: four rotations, each as it is or mirrored
+_SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
 
 MapKey = tuple[Tensor, Tensor]
 Batch = dict[str, Tensor]
@@ -81,7 +81,9 @@ class MapSampler(Sampler[MapKey]):
         shuffle: whether to change the order each epoch.
     """
 
-    def __init__(self, maps: int, batch_size: int, seed: int, symmetries: tuple[int, ...], shuffle: bool) -> None:
+    def __init__(
+        self, maps: int, batch_size: int, seed: int, symmetries: tuple[int, ...], shuffle: bool
+    ) -> None:
         """Starts at epoch 0."""
         self.maps, self.batch_size, self.seed = maps, batch_size, seed
         self.symmetries, self.shuffle = symmetries, shuffle
@@ -135,7 +137,9 @@ class MapData(lightning.LightningDataModule):
 
     def colour_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
-        counts = torch.stack([channel.flatten().bincount(minlength=256) for channel in self.train.rgb.unbind(1)])
+        counts = torch.stack(
+            [channel.flatten().bincount(minlength=256) for channel in self.train.rgb.unbind(1)]
+        )
         share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
         mean = (share * level).sum(1)
         variance = (share * level**2).sum(1) - mean**2
@@ -144,7 +148,7 @@ class MapData(lightning.LightningDataModule):
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
         square = self.train.rgb.shape[-1] == self.train.rgb.shape[-2]
-        symmetries = tuple(range(_SYMMETRIES)) if square else (*(2 * k for k in (0, 2)), 1, 5)
+        symmetries = _SYMMETRIES if square else _SYMMETRIES_OF_RECTANGLE
         return _load(self.train, MapSampler(len(self.train), self.batch_size, self.seed, symmetries, True))
 
     def val_dataloader(self) -> DataLoader[Batch]:
@@ -214,8 +218,9 @@ def read_pixels(dataset: TerrainDataset, split: str, max_points: int = 10_000, s
     """
     names = ("class_id", "slope_deg", "traversability")
     maps = dataset.read(split, fields=names)
-    columns = (torch.from_numpy(maps[name]) for name in names)
-    return PixelTable.group(*columns, len(dataset.recipe.classes), max_points, seed)
+    class_id, slope_deg, traversability = (torch.from_numpy(maps[name]) for name in names)
+    classes = len(dataset.recipe.classes)
+    return PixelTable.group(class_id, slope_deg, traversability, classes, max_points, seed)
 
 
 def _read_maps(dataset: TerrainDataset, split: str) -> MapDataset:

@@ -1,0 +1,228 @@
+"""Checkpoints: a trained model as a folder of data that runs no code when it is read.
+
+`config.json` says what the model is and what it was trained on; each part, `classifier` or `gp`, has
+its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`. A checkpoint is written to a
+folder beside its own and renamed, so that its name never holds half of one.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import safetensors.torch
+import torch
+from torch import Tensor
+
+import benchnav
+from benchnav.errors import CheckpointError
+
+FORMAT = "benchnav-checkpoint"
+FORMAT_VERSION = (1, 0)
+CONFIG = "config.json"
+CLASSIFIER, GP = "classifier", "gp"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """One trained half of a model.
+
+    Args:
+        config: settings it is rebuilt from, plain data.
+        tensors: weights and tables by name.
+        seed: root seed of its training.
+        metrics: what was measured after training.
+    """
+
+    config: dict[str, Any]
+    tensors: dict[str, Tensor]
+    seed: int
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """A trained model.
+
+    Args:
+        class_names: names of the C classes, in the order of their ids.
+        dataset_id: name of the dataset it was trained on.
+        dataset_digest: content digest of what it was trained on.
+        parts: its halves by name, `classifier`, `gp` or both.
+        package_version: version of benchnav that trained it.
+    """
+
+    class_names: tuple[str, ...]
+    dataset_id: str
+    dataset_digest: str
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    package_version: str = benchnav.__version__
+
+    def part(self, name: str) -> Part:
+        """Gives a half.
+
+        Raises:
+            CheckpointError: it has not been trained.
+        """
+        if name not in self.parts:
+            raise CheckpointError(
+                f"Expected a checkpoint with a {name!r} half, got one with {sorted(self.parts)}. "
+                f"Train it with `benchnav-train {name}` into the same folder."
+            )
+        return self.parts[name]
+
+    def with_part(self, name: str, part: Part) -> "Checkpoint":
+        """Gives a copy in which one half is replaced."""
+        return replace(self, parts={**self.parts, name: part})
+
+
+def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, half_precision: bool = True) -> None:
+    """Writes a checkpoint, replacing one that is there.
+
+    Args:
+        folder: its name.
+        checkpoint: what to write.
+        half_precision: store the classifier's kernels as float16; they are read as float32.
+
+    Raises:
+        CheckpointError: it cannot be written, or the name is that of something else.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (folder / CONFIG).is_file():
+        raise CheckpointError(
+            f"Expected `out` to be a new folder or a checkpoint, got {folder}, which is something else. "
+            "Choose another `out`."
+        )
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        workplace = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            _write(workplace / "new", checkpoint, half_precision)
+            if folder.exists():
+                os.replace(folder, workplace / "old")
+            os.replace(workplace / "new", folder)
+        finally:
+            shutil.rmtree(workplace)
+    except OSError as error:
+        raise CheckpointError(
+            f"Could not write checkpoint {folder}: {error.strerror or error}. Choose another `out`."
+        ) from error
+
+
+def load_checkpoint(folder: str | Path) -> Checkpoint:
+    """Reads a checkpoint; tensors are on the CPU, and those stored as float16 are float32.
+
+    Raises:
+        CheckpointError: it is missing, damaged, or of a newer format.
+    """
+    folder = Path(folder)
+    config = _read_config(folder)
+    try:
+        parts = {
+            name: Part(
+                config=dict(entry["config"]),
+                tensors=_read_tensors(folder / f"{name}.safetensors", entry["sha256"]),
+                seed=int(entry["seed"]),
+                metrics=dict(entry["metrics"]),
+            )
+            for name, entry in config["parts"].items()
+        }
+        if config["class_count"] != len(config["class_names"]):
+            raise ValueError("class_count is not the number of class_names")
+        return Checkpoint(
+            class_names=tuple(config["class_names"]),
+            dataset_id=config["dataset"]["id"],
+            dataset_digest=config["dataset"]["digest"],
+            parts=parts,
+            package_version=config["package_version"],
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
+
+
+def _write(folder: Path, checkpoint: Checkpoint, half_precision: bool) -> None:
+    folder.mkdir()
+    parts = {}
+    for name, part in checkpoint.parts.items():
+        half = half_precision and name == CLASSIFIER
+        tensors = {key: _stored(value, half) for key, value in part.tensors.items()}
+        content = safetensors.torch.save(tensors)
+        _write_bytes(folder / f"{name}.safetensors", content)
+        parts[name] = {
+            "config": part.config,
+            "seed": part.seed,
+            "metrics": part.metrics,
+            "sha256": hashlib.sha256(content).hexdigest(),
+        }
+    config = {
+        "format": FORMAT,
+        "format_version": ".".join(map(str, FORMAT_VERSION)),
+        "package_version": checkpoint.package_version,
+        "dataset": {"id": checkpoint.dataset_id, "digest": checkpoint.dataset_digest},
+        "class_count": len(checkpoint.class_names),
+        "class_names": list(checkpoint.class_names),
+        "parts": parts,
+    }
+    _write_bytes(folder / CONFIG, (json.dumps(config, indent=1) + "\n").encode())
+
+
+def _write_bytes(path: Path, content: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _stored(value: Tensor, half: bool) -> Tensor:
+    # Kernels alone: running variances and biases are few, and may leave float16's range.
+    value = value.detach().cpu().contiguous()
+    return value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    path = folder / CONFIG
+    if not path.is_file():
+        raise CheckpointError(
+            f"Expected a checkpoint folder with {CONFIG}, got {folder} without one. "
+            f"Make one with `benchnav-train all --out {folder}`."
+        )
+    try:
+        config = json.loads(path.read_text())
+        kind, version = config["format"], tuple(int(part) for part in config["format_version"].split("."))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise _damaged(path, f"{type(error).__name__} {error}") from error
+    if kind != FORMAT:
+        raise CheckpointError(
+            f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav checkpoint."
+        )
+    if version > FORMAT_VERSION:
+        raise CheckpointError(
+            f"Expected format version at most {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
+            f"{config['format_version']}. Read it with a newer benchnav: pip install --upgrade benchnav."
+        )
+    return config
+
+
+def _read_tensors(path: Path, digest: str) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise CheckpointError(
+            f"Expected {path.name} in checkpoint {path.parent}, got none. Copy it again whole."
+        )
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise _damaged(path, "its SHA-256 is not the one in config.json")
+    try:
+        tensors = safetensors.torch.load(content)
+    except safetensors.SafetensorError as error:
+        raise _damaged(path, str(error)) from error
+    return {name: value.float() if value.dtype == torch.float16 else value for name, value in tensors.items()}
+
+
+def _damaged(path: Path, why: str) -> CheckpointError:
+    return CheckpointError(f"{path} is damaged: {why}. Copy the checkpoint again whole, or train it again.")

@@ -1,0 +1,87 @@
+"""Settings of the two learned halves of a model; light to import, so that commands start fast."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from benchnav.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassifierConfig:
+    """What the classifier is and how it is trained.
+
+    Args:
+        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
+        encoder: one of its encoders, for example resnet18.
+        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
+        learning_rate: highest rate of the one-cycle schedule.
+        weight_decay: of AdamW.
+        batch_size: most maps a batch.
+        max_epochs: length of the schedule.
+        patience: epochs without a better validation loss after which training stops.
+    """
+
+    architecture: str = "unet"
+    encoder: str = "resnet18"
+    pretrained: bool = False
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-3
+    batch_size: int = 16
+    max_epochs: int = 40
+    patience: int = 10
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that cannot train."""
+        _check_rate("learning_rate", self.learning_rate)
+        if not 0 <= self.weight_decay < 1:
+            raise ConfigError(f"Expected `weight_decay` in [0, 1), got {self.weight_decay}.")
+        _check_least(
+            batch_size=(self.batch_size, 2), max_epochs=(self.max_epochs, 1), patience=(self.patience, 1)
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatentGPConfig:
+    """What the class-wise GPs are and how they are trained.
+
+    Args:
+        likelihood: censored, which fits observations clipped to [0, 1], or gaussian.
+        inducing_points: how many, evenly over the slopes of the training data.
+        epochs: equal parts of training, after each of which progress is shown.
+        epoch_steps: steps of Adam an epoch.
+        batch_size: cells a class and step, drawn with replacement.
+        learning_rate: at the start; falls to 0 along a cosine.
+        max_points: most cells of a class to learn from.
+    """
+
+    likelihood: Literal["censored", "gaussian"] = "censored"
+    inducing_points: int = 16
+    epochs: int = 10
+    epoch_steps: int = 60
+    batch_size: int = 1024
+    learning_rate: float = 0.05
+    max_points: int = 10_000
+
+    def __post_init__(self) -> None:
+        """Refuses settings that cannot train."""
+        if self.likelihood not in ("censored", "gaussian"):
+            raise ConfigError(f"Expected `likelihood` censored or gaussian, got {self.likelihood!r}.")
+        _check_rate("learning_rate", self.learning_rate)
+        _check_least(
+            inducing_points=(self.inducing_points, 2),
+            epochs=(self.epochs, 1),
+            epoch_steps=(self.epoch_steps, 1),
+            batch_size=(self.batch_size, 1),
+            max_points=(self.max_points, 1),
+        )
+
+
+def _check_rate(name: str, value: float) -> None:
+    if not 0 < value < 1:
+        raise ConfigError(f"Expected `{name}` in (0, 1), got {value}.")
+
+
+def _check_least(**limits: tuple[int, int]) -> None:
+    for name, (value, least) in limits.items():
+        if value < least:
+            raise ConfigError(f"Expected `{name}` ≥ {least}, got {value}.")
