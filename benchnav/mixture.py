@@ -177,7 +177,7 @@ class TraversabilityMixture:
             root = moved
             if done:
                 break
-        return torch.where(at_zero, 0.0, torch.where(at_one, 1.0, root))
+        return torch.where(at_one, 1.0, torch.where(at_zero, 0.0, root))
 
 
 def _density(z: Tensor) -> Tensor:
