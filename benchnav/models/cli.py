@@ -96,7 +96,9 @@ def train_all(
         overwrite: Replace a checkpoint that is there.
     """
     dataset, checkpoint = _start(data, out, {"classifier", "gp"}, overwrite)
-    checkpoint = checkpoint.with_part("gp", _fit_gp(gp, dataset, seed, device))
+    if not _is_done(checkpoint, gp, seed):
+        checkpoint = checkpoint.with_part("gp", _fit_gp(gp, dataset, seed, device))
+        _save(out, checkpoint, half_precision)
     checkpoint = checkpoint.with_part(
         "classifier", _fit_classifier(classifier, dataset, seed, precision, device)
     )
@@ -168,13 +170,20 @@ def _start(data: str, out: str, names: set[str], overwrite: bool) -> "tuple[Terr
             f"Expected checkpoint {out} to be of the maps of {dataset.path}, got one of other maps, of "
             f"dataset {there.dataset_id}. Choose another `out`, or pass --overwrite true to replace it."
         )
-    if names & set(there.parts):
+    # GPs alone are what an interrupted training of both halves leaves, to be gone on from.
+    if (names & set(there.parts)) - ({"gp"} if len(names) > 1 else set()):
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(sorted(names))}, got {out} with "
             f"{' and '.join(sorted(there.parts))}. Choose another `out`, or pass --overwrite true to "
             "replace it."
         )
     return dataset, there
+
+
+def _is_done(checkpoint: "Checkpoint", gp: LatentGPConfig, seed: int) -> bool:
+    """Tells whether an interrupted training of both halves has left its GPs there."""
+    part = checkpoint.parts.get("gp")
+    return part is not None and part.seed == seed and asdict(gp).items() <= part.config.items()
 
 
 def _fit_classifier(

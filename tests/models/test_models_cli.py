@@ -131,3 +131,17 @@ def test_bad_input_is_refused_in_one_line(
     message = refuses(monkeypatch, capfd, *(paths.get(item, item) for item in arguments))
     assert expected in message
     assert not (tmp_path / "x").exists()
+
+
+def test_an_interrupted_training_goes_on_from_its_gps(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--data", dataset.path, "--out", tmp_path / "c"]
+    assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
+    kept = (tmp_path / "c" / "gp.safetensors").read_bytes()
+    capfd.readouterr()
+    assert call(monkeypatch, "all", *where, *QUICK_GP, *QUICK_CLASSIFIER) == 0
+    assert "gps:" not in capfd.readouterr().err
+    assert (tmp_path / "c" / "gp.safetensors").read_bytes() == kept
+    assert set(load_checkpoint(tmp_path / "c").parts) == {"classifier", "gp"}
+    assert "--overwrite true" in refuses(monkeypatch, capfd, "all", *where)

@@ -54,7 +54,7 @@ def begin(problem: Problem, config: CLRRTConfig = SMALL, seed: int = 0) -> tuple
 def drive(
     problem: Problem, steps: int, config: CLRRTConfig = SMALL, seed: int = 0, truth: Tensor | None = None
 ) -> tuple[Tensor, Tensor, list[Plan]]:
-    """States [N + 1, B, S], actions [N, B, A] and plans, until all have arrived or one has failed."""
+    """States [N + 1, B, S], actions [N, B, A] and plans, until all have arrived or failed."""
     planner, plan_state = begin(problem, config, seed)
     ground = GRID.pad(problem.traversability if truth is None else truth, outside=0.0)
     state = problem.start
@@ -65,7 +65,7 @@ def drive(
         plans.append(plan)
         state = problem.dynamics(state, action, GRID.lookup(ground, state[:, 0], state[:, 1]))
         states.append(state)
-        if bool(arrived(problem, state).all() | (plan.status == PlanStatus.FAILED).any()):
+        if bool((arrived(problem, state) | (plan.status == PlanStatus.FAILED)).all()):
             break
     return torch.stack(states), torch.stack(actions), plans
 
@@ -151,6 +151,15 @@ def test_closed_wall_is_a_partial_plan_and_then_a_failure() -> None:
     assert without[-SMALL.most_failures - 1 :] == [False] + SMALL.most_failures * [True]
 
 
+def test_closed_wall_is_not_breached_where_the_ground_is_other_than_predicted() -> None:
+    problem = make_problem(walled_map().repeat(20, 1, 1))
+    noise = torch.rand(problem.traversability.shape, generator=torch.Generator().manual_seed(0))
+    truth = (problem.traversability + 0.4 * (noise - 0.5)).clamp(0.1, 1)
+    states, _, plans = drive(problem, 600, truth=truth)
+    assert (plans[-1].status == PlanStatus.FAILED).all()
+    assert states[..., 0].max() < 8.0
+
+
 def test_way_to_the_goal_takes_the_place_of_a_partial_path_at_once() -> None:
     problem = make_problem(walled_map(gap=slice(24, 26)))
     config = CLRRTConfig(expansions=75)
@@ -184,6 +193,23 @@ def test_failure_is_final_and_leaves_the_other_episodes_alone() -> None:
     assert arrived(problem, state).tolist() == [False, True]
     _, _, plan = planner.plan(torch.tensor([[3.0, 12.0, 0.0], [3.0, 12.0, 0.0]]), plan_state)
     assert plan.status.tolist() == [PlanStatus.FAILED, PlanStatus.OK]  # wherever it is put
+
+
+def test_partial_path_is_not_changed_while_the_robot_stands_on_ground_that_is_not_free() -> None:
+    # From there a way out may lead through the very wall that the path stops at.
+    maps = open_map(8)
+    maps[:, 15, 6:10] = 0.1  # from y = 7.5 m, beside the start
+    problem = make_problem(maps)
+    planner, plan_state = begin(problem, CLRRTConfig(expansions=25))
+    _, plan_state, first = planner.plan(problem.start, plan_state)
+    beside = problem.start + torch.tensor([0.3, -0.3, 0.0])
+    assert (problem.traversability_at(beside) <= problem.stuck_threshold).all()
+    assert (first.status == PlanStatus.PARTIAL).all()
+    for _ in range(SMALL.most_failures - 2):
+        _, plan_state, plan = planner.plan(beside, plan_state)
+        assert plan.path is first.path
+    _, later, plan = planner.plan(problem.start, plan_state)
+    assert (later.failures != plan_state.failures).all()
 
 
 @pytest.mark.parametrize("beneath", [0.2, 0.0])
