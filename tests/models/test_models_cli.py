@@ -134,7 +134,10 @@ def test_bad_input_is_refused_in_one_line(
 
 
 def test_an_interrupted_training_goes_on_from_its_gps(
-    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     where = ["--data", dataset.path, "--out", tmp_path / "c"]
     assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
