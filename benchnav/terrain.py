@@ -5,7 +5,7 @@ Conventions: maps are indexed [row = y, column = x]; cell (i, j) is centred at
 space. Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×W cells.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -119,12 +119,6 @@ class Observation:
                 f"got {self.rgb.dtype} of shape {list(self.rgb.shape)}."
             )
 
-    def to(self, device: torch.device | str) -> "Observation":
-        """Copies the layers to `device`."""
-        return Observation(
-            self.rgb.to(device), self.elevation_m.to(device), self.slope_deg.to(device), self.grid
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class Terrain:
@@ -167,6 +161,11 @@ class Terrain:
     def __len__(self) -> int:
         """Number of maps B."""
         return self.rgb.shape[0]
+
+    def select(self, members: Tensor) -> "Terrain":
+        """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
+        layers = {f.name: getattr(self, f.name)[members] for f in fields(self) if f.name != "grid"}
+        return Terrain(**layers, grid=self.grid)
 
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""

@@ -104,7 +104,7 @@ def _latex(rows: list[tuple[str, ...]]) -> str:
 
 
 def _snapshots(folder: Path, suite: Suite) -> list[plots.Snapshot]:
-    """The first recorded episode of each planner, at t = 25 s or when it ended."""
+    """The first recorded episode of each planner, at the time of the snapshot or when it ended."""
     dataset = TerrainDataset(find_dataset(suite.data))
     recorded = [unit for unit in units(suite, sizes(suite, dataset)) if unit.recorded]
     steps = read_table(folder, "steps.parquet") if recorded else pd.DataFrame()

@@ -333,7 +333,7 @@ def _merge(every: list[Unit], folder: Path) -> None:
 
 
 def _write_sketches(path: Path, plans: list[PlanSketch]) -> None:
-    """Keeps the plan nearest before t = 25 s, which the trajectory figure shows."""
+    """Keeps the plan nearest before the snapshot, which the trajectory figure shows."""
     from benchnav.eval.plots import SNAPSHOT_STEP
 
     shown = [plan for plan in plans if plan.step <= SNAPSHOT_STEP][-1]

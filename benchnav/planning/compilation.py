@@ -5,6 +5,7 @@ a C++ compiler at run time; without one the same code runs eagerly, and one line
 own switch `TORCH_COMPILE_DISABLE=1` turns it off.
 """
 
+import logging
 import warnings
 from collections.abc import Callable
 from functools import wraps
@@ -32,6 +33,8 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     Args:
         function: takes and returns tensors; it must not change its arguments.
     """
+    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
+    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     fused = torch.compile(function, dynamic=False)
 
     @wraps(function)

@@ -22,15 +22,10 @@ from benchnav.errors import ConfigError
 from benchnav.planning.dynamics import Dynamics, Unicycle
 from benchnav.planning.problem import heading_to
 from benchnav.planning.simulation import Outcome, Simulation, SimulationConfig, SimulationState
-from benchnav.terrain import Terrain
 
 SUCCESS_REWARD = 10.0
 OUT_OF_BOUNDS_REWARD = -10.0
 TIME_REWARD_PER_S = -0.1
-
-_TERRAIN_LAYERS = (
-    "rgb", "class_id", "elevation_m", "slope_deg", "traversability_mean", "traversability_std", "traversability",
-)  # fmt: skip
 
 Observations = dict[str, np.ndarray]
 
@@ -212,9 +207,8 @@ class _Batch:
             self._instance[i] = drawn if instance is None else instance
             self._luck[i] = generators[i].integers(2**48)
         start = heading_to(self._start[self._instance], self._goal[self._instance])
-        layers = {name: getattr(self._maps, name)[self._instance] for name in _TERRAIN_LAYERS}
         self._simulation = Simulation(
-            Terrain(**layers, grid=self._maps.grid),
+            self._maps.select(torch.from_numpy(self._instance)),
             self._dynamics,
             self._goal[self._instance],
             rng.stream_key(0, "environment"),
