@@ -87,8 +87,10 @@ class Grid:
             Values, dtype of `padded`, shape [B, *S].
         """
         scale = 1 / self.resolution_m
-        row = (y_m * scale + 1).clamp(0, self.height + 1).nan_to_num(0).long()
-        column = (x_m * scale + 1).clamp(0, self.width + 1).nan_to_num(0).long()
+        row, column = y_m * scale + 1, x_m * scale + 1
+        # Not `clamp(0, …)`: a comparison with what is not a number is false, so that it gives 0.
+        row = torch.where(row > 0, row, 0).clamp(max=self.height + 1).long()
+        column = torch.where(column > 0, column, 0).clamp(max=self.width + 1).long()
         index = row * (self.width + 2) + column
         return torch.gather(padded, 1, index.reshape(len(padded), -1)).reshape(x_m.shape)
 
