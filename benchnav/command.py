@@ -79,12 +79,18 @@ def run(
     except (ArgumentError, BenchnavError) as error:
         print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
-        return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 0
+    except OSError as error:
+        print(
+            f"{program}: error: could not use {error.filename or 'a file'}: {error.strerror or error}",
+            file=sys.stderr,
+        )
+        return 2
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
+        return 130
 
 
 def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:

@@ -162,6 +162,8 @@ class TraversabilityMixture:
         weights, means, stds = self._parameters()
         low = torch.zeros_like(weights.select(-3, 0))
         high = torch.ones_like(low)
+        if tail >= 1:
+            return high
         at_zero = self._uncensored_cdf(low) >= tail
         at_one = self._uncensored_cdf(high) <= tail
         root = 0.5 * (low + high)

@@ -86,8 +86,7 @@ class Grid:
         Returns:
             Values, dtype of `padded`, shape [B, *S].
         """
-        scale = 1 / self.resolution_m
-        row, column = y_m * scale + 1, x_m * scale + 1
+        row, column = (y_m / self.resolution_m).floor() + 1, (x_m / self.resolution_m).floor() + 1
         # Not `clamp(0, …)`: a comparison with what is not a number is false, so that it gives 0.
         row = torch.where(row > 0, row, 0).clamp(max=self.height + 1).long()
         column = torch.where(column > 0, column, 0).clamp(max=self.width + 1).long()

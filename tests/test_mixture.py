@@ -95,6 +95,13 @@ def test_risk_measures_are_ordered_finite_and_in_range(weights, means, stds, lev
     assert (mixture.cvar(high) <= mixture.mean() + 1e-6).all()
 
 
+def test_var_at_level_0_is_the_supremum_whatever_the_weights_sum_to() -> None:
+    weights = torch.softmax(torch.randn(50, 6, 1, 1, generator=torch.Generator().manual_seed(0)), dim=1)
+    mixture = TraversabilityMixture(weights, torch.full_like(weights, 0.2), torch.full_like(weights, 0.01))
+    assert (mixture.var(0.0) == 1).all()
+    torch.testing.assert_close(mixture.mean(), torch.full((50, 1, 1), 0.2), atol=1e-6, rtol=0)
+
+
 def test_float32_keeps_its_dtype_and_agrees_with_float64() -> None:
     exact = random_mixture()
     short = TraversabilityMixture(exact.weights.float(), exact.means.float(), exact.stds.float())

@@ -135,6 +135,8 @@ def preview(file: str, split: str = "test/std", maps: list[int] | None = None, o
     path = Path(out or f"preview-{split.replace('/', '-')}.png")
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
         raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
+    if maps == []:
+        raise ConfigError("Expected `maps` with at least one index, got none.")
     dataset = TerrainDataset(find_dataset(file))
     path.parent.mkdir(parents=True, exist_ok=True)
     save_preview(dataset, split, sorted(set(maps if maps is not None else [0, 1, 2])), path)

@@ -39,6 +39,7 @@ def place_craters(
     extent_m: tuple[float, float],
     count: np.ndarray,
     radius_m: tuple[float, float],
+    most: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws centres and radii of craters whose rims do not overlap, by sequential rejection.
 
@@ -48,11 +49,12 @@ def place_craters(
         extent_m: size of the map along x and y.
         count: craters asked for in each map, shape [B]; a map too crowded for them gets fewer.
         radius_m: smallest and largest radius of a rim.
+        most: most craters of any map of the stream; fixes how many numbers a map draws.
 
     Returns:
         Centres (x, y) in metres, shape [B, N, 2], and radii, shape [B, N]; radius 0 means no crater.
     """
-    tries = 12 * int(count.max(initial=0))
+    tries = 12 * most
     draws = rng.uniform(key, indices, (max(tries, 1), 3))
     centres = draws[..., :2] * np.asarray(extent_m)
     # Small craters are the more frequent: uniform in log radius.

@@ -139,7 +139,7 @@ def _elevation(
     low, high = (round(value) for value in scenario.crater_count)
     count = low + np.floor((high - low + 1) * draws[:, 1])
     centres, radii = elevation.place_craters(
-        key("craters"), indices, recipe.grid.extent_m, count, scenario.crater_radius_m
+        key("craters"), indices, recipe.grid.extent_m, count, scenario.crater_radius_m, high
     )
     return ground + elevation.crater_elevation(
         centres, radii, recipe.grid.shape, recipe.resolution_m, scenario.crater_depth_ratio

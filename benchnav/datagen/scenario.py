@@ -6,6 +6,8 @@ A scenario's `severity` s moves every number of it from `std` (s = 0) to the pre
 beyond.
 """
 
+import re
+from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -157,6 +159,15 @@ class Recipe:
             raise ConfigError(f"Expected `environments` ≥ 1, got {self.environments}.")
         if not self.class_periods_m or not all(0 < period < np.inf for period in self.class_periods_m):
             raise ConfigError(f"Expected `class_periods_m` > 0, got {list(self.class_periods_m)}.")
+        if len(self.classes) > 256:
+            raise ConfigError(f"Expected at most 256 classes, got {len(self.classes)}.")
+        for kind, names in (
+            ("id", [self.id]),
+            ("split name", [p for n in self.splits for p in n.split("/")]),
+        ):
+            for name in names:
+                if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name == "manifest":
+                    raise ConfigError(f"Expected {kind} of letters, digits, '.', '_' and '-', got {name!r}.")
         if not self.splits:
             raise ConfigError("Expected at least one split in `splits`, got none.")
         for name, split in self.splits.items():
@@ -248,7 +259,7 @@ def _resolve(entry: Any, presets: dict[str, Any], name: str) -> Any:
     if not isinstance(entry, dict) or "preset" not in entry:
         return entry
     preset, severity = entry["preset"], entry.get("severity", 1.0)
-    if preset not in presets:
+    if not isinstance(preset, str) or preset not in presets:
         raise ConfigError(
             f"Expected `preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}."
         )
@@ -268,7 +279,7 @@ def _parse(kind: type, data: Any) -> Any:
     parser = ArgumentParser(exit_on_error=False)
     parser.add_argument("--value", type=kind, required=True)
     try:
-        return parser.instantiate_classes(parser.parse_object({"value": data})).value
+        return parser.instantiate_classes(parser.parse_object({"value": deepcopy(data)})).value
     except (ArgumentError, TypeError, ValueError) as error:
         raise ConfigError(" ".join(str(error).split())) from error
 

@@ -5,9 +5,7 @@ from the blocks it finished. The target's name never holds a partial file. Reade
 each call, so they may be passed to other processes.
 """
 
-import fcntl
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from benchnav.datagen import latent, schema
 from benchnav.datagen.generate import Maps, generate
 from benchnav.datagen.scenario import Recipe, recipe_from_dict
 from benchnav.errors import DatasetError
+from benchnav.files import replacing, sole_writer, write_text
 from benchnav.terrain import Grid, Terrain
 
 BLOCK_MAPS = 100
@@ -60,17 +59,16 @@ def create(
     total = sum(stop - start for _, start, stop in blocks)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _workspace(path, {"recipe": recipe.to_dict(), "block_maps": block_maps}) as folder:
+        with _workspace(path, _made_of(recipe, block_maps)) as folder:
             missing = [block for block in blocks if not _block_path(folder, *block).exists()]
             done = total - sum(stop - start for _, start, stop in missing)
             workers = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
             for made in workers(joblib.delayed(_make_block)(recipe, folder, *block) for block in missing):
                 done += made
                 yield done, total
-            partial = folder / "dataset.h5"
-            _assemble(recipe, folder, blocks, partial)
-            os.replace(partial, path)
-            shutil.rmtree(folder)
+            with replacing(path) as partial:
+                _assemble(recipe, folder, blocks, partial)
+            shutil.rmtree(folder, ignore_errors=True)
     except OSError as error:
         raise DatasetError(
             f"Could not write {path}: {error.strerror or error}. Nothing was left under its name."
@@ -102,19 +100,23 @@ class TerrainDataset:
                 )
             try:
                 self.manifest: dict[str, Any] = json.loads(file[schema.MANIFEST][()])
-            except (OSError, ValueError) as error:
+                kind = self.manifest["format"]
+                major, minor = (int(part) for part in self.manifest["format_version"].split("."))
+                missing = {"id", "seed", "generator", "recipe", "splits"} - set(self.manifest)
+            except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
                 raise DatasetError(
-                    f"The manifest of {self.path} is damaged: {error}. Make the file again."
+                    f"The manifest of {self.path} is damaged: {error!r}. Make the file again."
                 ) from error
-        if self.manifest.get("format") != schema.FORMAT:
-            raise DatasetError(
-                f"Expected format {schema.FORMAT!r} in {self.path}, got {self.manifest.get('format')!r}."
-            )
-        major, minor = (int(part) for part in self.manifest["format_version"].split("."))
+        if kind != schema.FORMAT:
+            raise DatasetError(f"Expected format {schema.FORMAT!r} in {self.path}, got {kind!r}.")
         if (major, minor) > schema.FORMAT_VERSION:
             raise DatasetError(
                 f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {self.path}, "
                 f"got {major}.{minor}. Read it with a newer benchnav: pip install --upgrade benchnav."
+            )
+        if missing:
+            raise DatasetError(
+                f"The manifest of {self.path} lacks {', '.join(sorted(missing))}. Make the file again."
             )
 
     @property
@@ -149,7 +151,7 @@ class TerrainDataset:
 
         Args:
             split: name of a split.
-            indices: which maps, ascending; None for all.
+            indices: which maps, in any order; None for all.
             fields: which fields of `schema.FIELDS`; None for all.
 
         Returns:
@@ -167,12 +169,15 @@ class TerrainDataset:
             raise DatasetError(
                 f"Expected map indices in 0–{size - 1} of split {split!r}, got {list(indices)}."
             )
-        chosen = slice(None) if indices is None else list(indices)
+        # HDF5 reads ascending indices, each once; the asked order is made afterwards.
+        chosen, order = (
+            (slice(None), slice(None)) if indices is None else np.unique(indices, return_inverse=True)
+        )
         with self._open() as file:
             arrays = {}
             for name in fields or schema.FIELDS:
                 try:
-                    arrays[name] = file[split][name][chosen]
+                    arrays[name] = file[split][name][chosen][order]
                 except (KeyError, OSError) as error:
                     raise DatasetError(
                         f"Field {name!r} of split {split!r} in {self.path} is damaged: {error}. "
@@ -223,13 +228,14 @@ def find_dataset(source: str | Path) -> Path:
     )
 
 
+def _made_of(recipe: Recipe, block_maps: int) -> dict[str, Any]:
+    return {"recipe": recipe.to_dict(), "block_maps": block_maps, "version": benchnav.__version__}
+
+
 def _make_block(recipe: Recipe, folder: Path, split: str, start: int, stop: int) -> int:
     maps = generate(recipe, split, np.arange(start, stop))
-    target = _block_path(folder, split, start, stop)
-    partial = target.with_suffix(f".{os.getpid()}")
-    with open(partial, "wb") as file:
+    with replacing(_block_path(folder, split, start, stop)) as partial, open(partial, "wb") as file:
         np.savez(file, **maps)  # type: ignore[arg-type]
-    os.replace(partial, target)
     return stop - start
 
 
@@ -242,18 +248,12 @@ def _workspace(path: Path, made_of: dict[str, Any]) -> Iterator[Path]:
     """Holds the folder of finished blocks, one run at a time; blocks of another recipe are dropped."""
     folder = path.parent / f".{path.name}.partial"
     folder.mkdir(exist_ok=True)
-    with open(folder / "lock", "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DatasetError(
-                f"Another run is writing {path}. Wait for it, or choose another `out`."
-            ) from error
+    with sole_writer(folder, str(path)):
         stamp, text = folder / "made_of.json", json.dumps(made_of, sort_keys=True)
         if not stamp.exists() or stamp.read_text() != text:
             for block in folder.glob("*.npz"):
                 block.unlink()
-            stamp.write_text(text)
+            write_text(stamp, text)
         yield folder
 
 
@@ -284,8 +284,6 @@ def _assemble(recipe: Recipe, folder: Path, blocks: list[tuple[str, int, int]], 
             "recipe": recipe.to_dict(),
         }
         file[schema.MANIFEST] = json.dumps(manifest, indent=1)
-    with open(target, "rb") as written:
-        os.fsync(written.fileno())
 
 
 def _new_array(group: h5py.Group, name: str, field: schema.Field, maps: int, grid: Grid) -> None:

@@ -20,13 +20,15 @@ def run_command(suite: Suite, out: str = "runs/latest", jobs: int = 1, overwrite
     import shutil
 
     from benchnav.command import show_progress
+    from benchnav.datagen.store import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
     from benchnav.eval.report import write_report
-    from benchnav.eval.runner import load_run, run_suite
+    from benchnav.eval.runner import check, load_run, run_suite
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
     folder = Path(out)
+    check(suite, TerrainDataset(find_dataset(suite.data)))
     if overwrite and folder.exists():
         load_run(folder)  # Only what is a run folder may be dropped.
         dropped = folder.with_name(f".{folder.name}.{os.getpid()}.dropped")

@@ -5,7 +5,6 @@ driven so far coloured by the λ met, what the planner was thinking, and time se
 that arranges them. Letters in shapes: N steps, H×W cells, M samples, E edges.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from benchnav.files import replacing
 from benchnav.terrain import Grid
 
 APPLICATION = "benchnav"
@@ -87,20 +87,19 @@ def write_recording(recording: Recording, path: Path) -> None:
     """
     import rerun as rr
 
-    partial = path.with_suffix(f".{os.getpid()}.partial")
     stream = rr.RecordingStream(APPLICATION, recording_id=recording.title)
-    stream.save(partial, default_blueprint=_blueprint())
-    try:
-        stream.send_recording_name(recording.title)
-        _log_terrain(stream, recording)
-        _log_robot(stream, recording)
-        _log_driven(stream, recording)
-        for plan in recording.plans:
-            _log_plan(stream, recording, plan)
-        stream.flush()
-    finally:
-        stream.disconnect()
-    os.replace(partial, path)
+    with replacing(path) as partial:
+        stream.save(partial, default_blueprint=_blueprint())
+        try:
+            stream.send_recording_name(recording.title)
+            _log_terrain(stream, recording)
+            _log_robot(stream, recording)
+            _log_driven(stream, recording)
+            for plan in recording.plans:
+                _log_plan(stream, recording, plan)
+            stream.flush()
+        finally:
+            stream.disconnect()
 
 
 def read_path(path: Path) -> tuple[np.ndarray, np.ndarray]:

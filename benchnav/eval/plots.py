@@ -10,6 +10,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchnav.files import replacing
+
 # Half-way for most episodes; the paper shows 25 s, when robots here have mostly arrived.
 SNAPSHOT_STEP = 150
 
@@ -149,7 +151,5 @@ def _strips(lines: np.ndarray) -> list[np.ndarray]:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}")
-    figure.savefig(partial, dpi=120, format=path.suffix[1:], bbox_inches="tight")
-    partial.replace(path)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=120, format=path.suffix[1:], bbox_inches="tight")

@@ -8,9 +8,10 @@ import pandas as pd
 
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.eval import plots
-from benchnav.eval.runner import load_run, read_map, read_table, recording_name, sizes
+from benchnav.eval.runner import load_run, read_map, read_table, sizes
 from benchnav.eval.statistics import summarise
 from benchnav.eval.suite import Suite, Unit, units
+from benchnav.files import write_text
 
 HEADINGS = (
     "scenario",
@@ -36,13 +37,14 @@ def write_report(folder: Path) -> pd.DataFrame:
     suite, about = load_run(folder)
     summary = summarise(read_table(folder, "episodes.parquet"))
     rows = table_rows(summary)
-    _replace(folder / "summary.csv", summary.to_csv(index=False, float_format="%.6g"))
-    _replace(folder / "summary.md", _markdown(rows, suite, about))
-    _replace(folder / "summary.tex", _latex(rows))
+    write_text(folder / "summary.csv", summary.to_csv(index=False, float_format="%.6g"))
+    write_text(folder / "summary.tex", _latex(rows))
     plots.save_success(summary, folder / "figures" / "success.png")
     snapshots = _snapshots(folder, suite)
     if snapshots:
         plots.save_trajectories(snapshots, folder / "figures" / "trajectories.png")
+    figures = ["success", "trajectories"] if snapshots else ["success"]
+    write_text(folder / "summary.md", _markdown(rows, suite, about, figures))
     return summary
 
 
@@ -69,7 +71,7 @@ def _spread(mean: float, std: float) -> str:
     return f"{mean:.1f}" if np.isnan(std) else f"{mean:.1f} ± {std:.1f}"
 
 
-def _markdown(rows: list[tuple[str, ...]], suite: Suite, about: dict[str, Any]) -> str:
+def _markdown(rows: list[tuple[str, ...]], suite: Suite, about: dict[str, Any], figures: list[str]) -> str:
     lines = [
         "# Run summary",
         "",
@@ -83,8 +85,8 @@ def _markdown(rows: list[tuple[str, ...]], suite: Suite, about: dict[str, Any]) 
         "|" + "---|" * len(HEADINGS),
     ]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
-    lines += ["", "![success](figures/success.png)", "", "![trajectories](figures/trajectories.png)", ""]
-    return "\n".join(lines)
+    lines += [text for name in figures for text in ("", f"![{name}](figures/{name}.png)")]
+    return "\n".join([*lines, ""])
 
 
 def _latex(rows: list[tuple[str, ...]]) -> str:
@@ -114,7 +116,7 @@ def _snapshots(folder: Path, suite: Suite) -> list[plots.Snapshot]:
 def _snapshot(
     folder: Path, suite: Suite, dataset: TerrainDataset, unit: Unit, steps: pd.DataFrame
 ) -> plots.Snapshot:
-    with np.load(folder / "units" / f"{recording_name(unit, 0)}.plans.npz") as stored:
+    with np.load(folder / "units" / f"{unit.episode_name(0)}.plans.npz") as stored:
         plan = dict(stored)
     step = int(plan.pop("step"))
     planner, risk, scenario, instance = unit.planner, unit.risk, unit.scenario, unit.instances[0]
@@ -135,9 +137,3 @@ def _snapshot(
         now=min(step, len(episode) - 1),
         plan=plan,
     )
-
-
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}")
-    partial.write_text(text)
-    partial.replace(path)

@@ -20,7 +20,7 @@ Watcher = Callable[[int, Plan], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Episodes:
-    """What happened in a batch of episodes. Beyond an episode's own `steps` its entries stand still.
+    """What happened in a batch of episodes. Beyond an episode's own `steps` its state stands still.
 
     Args:
         states: shape [B, N + 1, S].

@@ -22,7 +22,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-import benchnav
 from benchnav import rng
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
@@ -30,13 +29,14 @@ from benchnav.eval.metrics import episode_table, step_table
 from benchnav.eval.playback import PLAN_EVERY, PlanSketch, Recording, write_recording
 from benchnav.eval.rollout import Episodes, run_episodes
 from benchnav.eval.suite import Suite, Unit, containing, units
-from benchnav.models.predictor import Model, Oracle, find_checkpoint, load_model, model_names, predict
+from benchnav.files import replacing, sole_writer, write_text
+from benchnav.models.predictor import AnyModel, find_checkpoint, load_model, model_names, predict
 from benchnav.planning.dynamics import Unicycle
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planner import Plan, make_planner
 from benchnav.planning.problem import Problem, heading_to
 from benchnav.planning.risk import RiskSetting
-from benchnav.planning.simulation import Simulation, SimulationConfig
+from benchnav.planning.simulation import Simulation, SimulationConfig, steps_in
 
 PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch", "rerun-sdk")
 
@@ -53,11 +53,17 @@ def run_suite(suite: Suite, folder: Path, jobs: int = 1) -> Iterator[tuple[int, 
         ConfigError: the folder holds another run, or the suite cannot be run.
         DatasetError: the dataset lacks what the suite asks for.
     """
+    torch.set_num_threads(1)
     dataset = TerrainDataset(find_dataset(suite.data))
-    check(suite, dataset)
-    model = load_model(suite.model)
+    model = check(suite, dataset)
     _begin(suite, dataset, folder)
-    _make_folders(folder)
+    with sole_writer(folder, str(folder)):
+        yield from _run_units(suite, model, dataset, folder, jobs)
+
+
+def _run_units(
+    suite: Suite, model: AnyModel, dataset: TerrainDataset, folder: Path, jobs: int
+) -> Iterator[tuple[int, int]]:
     predict_maps(suite, model, dataset, folder)
     every = list(units(suite, sizes(suite, dataset)))
     missing = [unit for unit in every if not (folder / "units" / f"{unit.name}.json").exists()]
@@ -70,10 +76,15 @@ def run_suite(suite: Suite, folder: Path, jobs: int = 1) -> Iterator[tuple[int, 
     _merge(every, folder)
 
 
-def check(suite: Suite, dataset: TerrainDataset) -> None:
-    """Refuses a suite that names what is not there, before anything runs."""
-    for risk in suite.risks:
-        RiskSetting.parse(risk)
+def check(suite: Suite, dataset: TerrainDataset) -> AnyModel:
+    """Refuses a suite that names what is not there, before anything is run or dropped.
+
+    Returns:
+        The suite's model.
+    """
+    settings = [RiskSetting.parse(risk) for risk in suite.risks]
+    if len(set(settings)) != len(settings):
+        raise ConfigError(f"Expected `risks` that differ, got {list(suite.risks)}.")
     for planner in {*suite.planners, *suite.planner_options}:
         options = {**suite.planner_options.get(planner, {}), **suite.recording_options.get(planner, {})}
         make_planner(planner, options)
@@ -81,7 +92,11 @@ def check(suite: Suite, dataset: TerrainDataset) -> None:
     if absent:
         there = [name.removeprefix("test/") for name in dataset.splits if name.startswith("test/")]
         raise ConfigError(f"Expected `scenarios` among {there} of {dataset.path}, got {absent}.")
-    SimulationConfig(noise=suite.noise, time_budget_s=suite.time_budget_s)
+    few = {name: count for name, count in sizes(suite, dataset).items() if count < suite.instances}
+    if few:
+        raise ConfigError(f"Expected `instances` at most as in the data, {few}, got {suite.instances}.")
+    steps_in(SimulationConfig(noise=suite.noise, time_budget_s=suite.time_budget_s), Unicycle())
+    return load_model(suite.model)
 
 
 def sizes(suite: Suite, dataset: TerrainDataset) -> dict[str, int]:
@@ -100,14 +115,14 @@ def load_run(folder: Path) -> tuple[Suite, dict[str, Any]]:
     """
     try:
         about = json.loads((folder / "run.json").read_text())
-    except (OSError, ValueError) as error:
+        settings: dict[str, Any] = {
+            n: tuple(v) if isinstance(v, list) else v for n, v in about["suite"].items()
+        }
+        return Suite(**settings), about
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise ConfigError(
             f"Expected a run folder with run.json, got {folder}. Make one with `benchnav-eval run`."
         ) from error
-    settings: dict[str, Any] = {
-        name: tuple(v) if isinstance(v, list) else v for name, v in about["suite"].items()
-    }
-    return Suite(**settings), about
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
@@ -138,16 +153,16 @@ def run_unit(suite: Suite, unit: Unit, folder: Path) -> None:
     for member in range(unit.recorded):
         write_recording(
             _recording(unit, dataset, problem, episodes, member, sketches[member]),
-            folder / "playback" / f"{recording_name(unit, member)}.rrd",
+            folder / "playback" / f"{unit.episode_name(member)}.rrd",
         )
-        _write_sketches(place / f"{recording_name(unit, member)}.plans.npz", sketches[member])
+        _write_sketches(place / f"{unit.episode_name(member)}.plans.npz", sketches[member])
     steps = int(episodes.steps.max())
     timing = {
         "planner": unit.planner, "risk": unit.risk, "scenario": unit.scenario, "episodes": len(unit.instances),
         "steps": steps, "planning_s": episodes.planning_s,
         "planning_ms_per_step_and_episode": 1e3 * episodes.planning_s / max(steps, 1) / len(unit.instances),
     }  # fmt: skip
-    _write_text(place / f"{unit.name}.json", json.dumps(timing))
+    write_text(place / f"{unit.name}.json", json.dumps(timing))
 
 
 def record_episode(suite: Suite, folder: Path, planner: str, risk: str, scenario: str, instance: int) -> Path:
@@ -160,14 +175,14 @@ def record_episode(suite: Suite, folder: Path, planner: str, risk: str, scenario
     dataset = TerrainDataset(find_dataset(suite.data))
     unit = containing(suite, sizes(suite, dataset), planner, risk, scenario, instance)
     member = unit.instances.index(instance)
-    path = folder / "playback" / f"{recording_name(unit, member)}.rrd"
+    path = folder / "playback" / f"{unit.episode_name(member)}.rrd"
     if path.exists():
         return path
-    torch.set_num_threads(1)
-    problem, episodes, sketches = _simulate(suite, unit, dataset, folder)
     known = read_table(folder, "steps.parquet").query(
         "planner == @planner and risk == @risk and scenario == @scenario and instance == @instance"
     )
+    torch.set_num_threads(1)
+    problem, episodes, sketches = _simulate(suite, unit, dataset, folder)
     track = episodes.states[member, : int(episodes.steps[member]) + 1, :2].numpy()
     if not np.array_equal(known[["x_m", "y_m"]].to_numpy(np.float32), track):
         raise BenchnavError(
@@ -178,12 +193,7 @@ def record_episode(suite: Suite, folder: Path, planner: str, risk: str, scenario
     return path
 
 
-def recording_name(unit: Unit, member: int) -> str:
-    """Name of the recording of one of a unit's episodes."""
-    return f"{unit.planner}+{unit.risk.replace(':', '_')}+{unit.scenario}+{unit.instances[member]:05d}"
-
-
-def predict_maps(suite: Suite, model: Model | Oracle, dataset: TerrainDataset, folder: Path) -> None:
+def predict_maps(suite: Suite, model: AnyModel, dataset: TerrainDataset, folder: Path) -> None:
     """Predicts λ̂ once for each scenario and risk setting, into `maps/SCENARIO.npz`."""
     for scenario in suite.scenarios:
         if _map_path(folder, scenario).exists():
@@ -191,10 +201,8 @@ def predict_maps(suite: Suite, model: Model | Oracle, dataset: TerrainDataset, f
         count = min(suite.instances or sizes(suite, dataset)[scenario], sizes(suite, dataset)[scenario])
         mixture = predict(model, dataset.terrain(f"test/{scenario}", range(count)))
         maps = {risk: RiskSetting.parse(risk).apply(mixture).numpy() for risk in suite.risks}
-        partial = folder / "maps" / f"{scenario}.partial"
-        with open(partial, "wb") as file:
+        with replacing(_map_path(folder, scenario)) as partial, open(partial, "wb") as file:
             np.savez_compressed(file, **maps)  # type: ignore[arg-type]
-        os.replace(partial, _map_path(folder, scenario))
 
 
 def read_map(folder: Path, scenario: str, risk: str) -> np.ndarray:
@@ -204,7 +212,7 @@ def read_map(folder: Path, scenario: str, risk: str) -> np.ndarray:
 
 
 def _map_path(folder: Path, scenario: str) -> Path:
-    return folder / "maps" / f"{scenario}.npz"
+    return folder / "maps" / f"{scenario.replace('/', '_')}.npz"
 
 
 def _simulate(
@@ -244,7 +252,9 @@ def _simulate(
                 sketches[member].append(_sketch(step, plan, member))
 
     episodes = run_episodes(planner, problem, simulation, generator, watch if unit.recorded else None)
-    return problem, episodes, sketches
+    # What was planned after an episode's end is not part of it.
+    ends = episodes.steps.tolist()
+    return problem, episodes, [[p for p in plans if p.step < ends[m]] for m, plans in enumerate(sketches)]
 
 
 def _sketch(step: int, plan: Plan, member: int) -> PlanSketch:
@@ -263,7 +273,7 @@ def _recording(
     steps = int(episodes.steps[member])
     terrain = dataset.terrain(f"test/{unit.scenario}", [unit.instances[member]])
     return Recording(
-        title=recording_name(unit, member),
+        title=unit.episode_name(member),
         grid=problem.grid,
         rgb=terrain.rgb[0].numpy(),
         elevation_m=terrain.elevation_m[0].numpy(),
@@ -273,20 +283,20 @@ def _recording(
         states=episodes.states[member, : steps + 1].numpy(),
         actions=episodes.actions[member, :steps].numpy(),
         traversability=episodes.traversability[member, :steps].numpy(),
-        plans=[plan for plan in plans if plan.step < steps],
+        plans=plans,
     )
 
 
 def _begin(suite: Suite, dataset: TerrainDataset, folder: Path) -> None:
     """Writes `run.json`, or checks that it is of the same suite on the same data and model."""
+    tested = [f"test/{scenario}" for scenario in suite.scenarios]
     about = {
         "suite": suite.to_dict(),
-        "dataset": {"id": dataset.id, "splits": dataset.splits},
+        "dataset": {"id": dataset.id, "splits": {n: dataset.splits[n] for n in tested}},
         "model": _model_digest(suite.model),
         "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "benchnav": benchnav.__version__,
     }
     path = folder / "run.json"
     if path.exists():
@@ -302,17 +312,11 @@ def _begin(suite: Suite, dataset: TerrainDataset, folder: Path) -> None:
                 f"{' and '.join(differing)}. Choose another `out`, or pass --overwrite true."
             )
         return
-    if folder.exists() and any(folder.iterdir()):
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(
             f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_text(path, json.dumps(about, indent=1))
-
-
-def _make_folders(folder: Path) -> None:
-    for name in ("maps", "units", "playback"):
-        (folder / name).mkdir(exist_ok=True)
+    write_text(path, json.dumps(about, indent=1))
 
 
 def _model_digest(source: str) -> dict[str, Any]:
@@ -329,7 +333,7 @@ def _merge(every: list[Unit], folder: Path) -> None:
         tables = [pd.read_parquet(place / f"{unit.name}.{suffix}") for unit in every]
         _write(folder / name, pd.concat(tables, ignore_index=True))
     timing = pd.DataFrame([json.loads((place / f"{unit.name}.json").read_text()) for unit in every])
-    _write_text(folder / "timing.csv", timing.to_csv(index=False, float_format="%.4g"))
+    write_text(folder / "timing.csv", timing.to_csv(index=False, float_format="%.4g"))
 
 
 def _write_sketches(path: Path, plans: list[PlanSketch]) -> None:
@@ -337,26 +341,11 @@ def _write_sketches(path: Path, plans: list[PlanSketch]) -> None:
     from benchnav.eval.plots import SNAPSHOT_STEP
 
     shown = [plan for plan in plans if plan.step <= SNAPSHOT_STEP][-1]
-    partial = path.with_suffix(".partial")
-    with open(partial, "wb") as file:
-        np.savez_compressed(
-            file,
-            step=shown.step,
-            path=shown.path,
-            samples=shown.samples,
-            reference=shown.reference,
-            tree=shown.tree,
-        )
-    os.replace(partial, path)
+    layers = {name: getattr(shown, name) for name in ("path", "samples", "reference", "tree")}
+    with replacing(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, step=shown.step, **layers)
 
 
 def _write(path: Path, table: pd.DataFrame) -> None:
-    partial = path.with_name(f"{path.name}.partial")
-    table.to_parquet(partial, index=False)
-    os.replace(partial, path)
-
-
-def _write_text(path: Path, text: str) -> None:
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_text(text)
-    os.replace(partial, path)
+    with replacing(path) as partial:
+        table.to_parquet(partial, index=False)

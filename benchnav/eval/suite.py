@@ -86,7 +86,12 @@ class Unit:
     @property
     def name(self) -> str:
         """A name for files, unique in a suite."""
-        return f"{self.planner}+{self.risk.replace(':', '_')}+{self.scenario}+{self.instances[0]:05d}"
+        return self.episode_name(0)
+
+    def episode_name(self, member: int) -> str:
+        """A name for files of one of the unit's episodes."""
+        cell = f"{self.planner}+{self.risk}+{self.scenario}".replace(":", "_").replace("/", "_")
+        return f"{cell}+{self.instances[member]:05d}"
 
 
 def units(suite: Suite, sizes: dict[str, int]) -> Iterator[Unit]:

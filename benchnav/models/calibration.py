@@ -202,7 +202,9 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
         cells.append(_score_cells(mixture, terrain, generator))
         maps += len(terrain)
         if isinstance(model, ClassModel):
-            metrics = metrics if len(metrics) else _class_metrics(len(model.class_names))
+            metrics = (
+                metrics if len(metrics) else _class_metrics(len(model.class_names)).to(terrain.rgb.device)
+            )
             metrics.update(mixture.weights, terrain.class_id)
     error_observed, error_expected, nll, score, transformed = torch.cat(cells, dim=1)
     return Quality(
@@ -232,6 +234,7 @@ def measure_latent(table: SlopeTable, terrain: Terrain) -> dict[str, float]:
         `latent_rmse` to f_c(ψ), `noise_error` (largest relative error of a class's σ_c that occurs) and
         `nll` of λ as realised.
     """
+    table = table.to(terrain.class_id.device)
     own = terrain.class_id.unsqueeze(1)
     mean, std = (values.gather(1, own) for values in table.lookup(terrain.slope_deg))
     mixture = TraversabilityMixture(torch.ones_like(mean), mean, std)

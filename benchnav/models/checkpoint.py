@@ -106,7 +106,12 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, half_precision: 
             _write(workplace / "new", checkpoint, half_precision)
             if folder.exists():
                 os.replace(folder, workplace / "old")
-            os.replace(workplace / "new", folder)
+            try:
+                os.replace(workplace / "new", folder)
+            except OSError:
+                if (workplace / "old").exists():
+                    os.replace(workplace / "old", folder)
+                raise
         finally:
             shutil.rmtree(workplace)
     except OSError as error:

@@ -70,7 +70,7 @@ class TerrainClassifier(lightning.LightningModule):
                 f"got {encoder!r}."
             )
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)
             network = smp.create_model(
                 self.config.architecture,
                 encoder_name=encoder,

@@ -154,6 +154,7 @@ def _start(data: str, out: str, names: set[str], overwrite: bool) -> "tuple[Terr
         dataset_digest=",".join(f"{name}:{dataset.splits[name]['digest']}" for name in ("train", "valid")),
     )
     if not Path(out).exists():
+        Path(out).parent.mkdir(parents=True, exist_ok=True)  # now rather than after the training
         return dataset, fresh
     if not (Path(out) / "config.json").is_file():
         raise CheckpointError(

@@ -175,8 +175,9 @@ def _trainer(callbacks: list[Callback], folder: str, device: str, **settings: An
         raise ConfigError(f"Expected `device` among {', '.join(DEVICES)}, got {device!r}.")
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("Expected a CUDA device for `device` cuda, got none. Use cpu or auto.")
+    found = "cuda" if torch.cuda.is_available() else "cpu"  # float64 rules other devices out
     return lightning.Trainer(
-        accelerator="auto" if device == "auto" else device,
+        accelerator=found if device == "auto" else device,
         devices=1,
         callbacks=callbacks,
         default_root_dir=folder,

@@ -61,7 +61,7 @@ def edge_costs(problem: Problem, by_time: bool = False) -> np.ndarray:
 
 
 def search(problem: Problem, by_time: bool = False) -> CostToGo:
-    """Finds shortest paths to the free cells centred within the goal radius.
+    """Finds shortest paths to the free cells at the goal: its own, and those centred within its radius.
 
     Args:
         problem: B problems.
@@ -75,6 +75,9 @@ def search(problem: Problem, by_time: bool = False) -> CostToGo:
     x, y = grid.centre_of(rows, columns)
     goal = problem.goal_m.cpu()[:, :, None, None]
     near = torch.hypot(x - goal[:, 0], y - goal[:, 1]) < problem.goal_radius_m
+    # On coarse grids no centre may be that near; the goal's own cell always counts.
+    row, column = grid.cell_of(problem.goal_m.cpu()[:, 0], problem.goal_m.cpu()[:, 1])
+    near[torch.arange(len(problem)), row, column] = True
     goals = (near & problem.free.cpu()).numpy()
     cost, following = gridgraph.cost_to_go(edge_costs(problem, by_time), goals, grid.shape)
     stay = np.arange(following.shape[1])

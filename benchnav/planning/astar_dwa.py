@@ -66,8 +66,16 @@ class AStarDWA:
         self.config = config or AStarDWAConfig()
 
     def init(self, problem: Problem, generator: torch.Generator) -> AStarDWAState:
-        """Searches the maps; draws nothing. See `Planner`."""
-        standing = problem.start.new_zeros(len(problem), len(problem.dynamics.action_low))
+        """Searches the maps; draws nothing. See `Planner`.
+
+        Raises:
+            ConfigError: the robot's actions are not (v, ω).
+        """
+        if len(problem.dynamics.action_low) != 2:
+            raise ConfigError(
+                f"Expected dynamics with actions (v, ω) for A* + DWA, got {len(problem.dynamics.action_low)} actions."
+            )
+        standing = problem.start.new_zeros(len(problem), 2)
         return AStarDWAState(problem, astar.search(problem, self.config.by_time), standing)
 
     def plan(self, state: Tensor, plan_state: AStarDWAState) -> tuple[Tensor, AStarDWAState, Plan]:

@@ -6,7 +6,7 @@ own switch `TORCH_COMPILE_DISABLE=1` turns it off.
 """
 
 import logging
-import warnings
+import sys
 from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar
@@ -33,19 +33,23 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     Args:
         function: takes and returns tensors; it must not change its arguments.
     """
-    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
-    logging.getLogger("torch.utils.cpp_extension").setLevel(logging.ERROR)
     fused = torch.compile(function, dynamic=False)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if _state["available"]:
+            # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
+            notices = logging.getLogger("torch.utils.cpp_extension")
+            level = notices.level
+            notices.setLevel(logging.ERROR)
             try:
                 return fused(*args, **kwargs)
             except (torch._dynamo.exc.TorchDynamoException, torch._inductor.exc.InductorError) as error:
                 _state["available"] = False
                 reason = str(error).strip().splitlines()[0]
-                warnings.warn(f"benchnav runs uncompiled, several times slower: {reason}", stacklevel=2)
+                print(f"benchnav: running uncompiled, several times slower: {reason}", file=sys.stderr)
+            finally:
+                notices.setLevel(level)
         return function(*args, **kwargs)
 
     return call

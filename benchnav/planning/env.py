@@ -159,6 +159,8 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes one time step, or starts anew where the last one ended an episode."""
+        if not self._generators:
+            raise gymnasium.error.ResetNeeded("Call reset() before step().")
         again = self._ended
         if again.any():
             self._batch.reset(self._generators, again, None)

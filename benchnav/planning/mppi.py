@@ -9,6 +9,7 @@ The samples' noise is shared by the episodes of a batch: it is drawn once a step
 of the plan state's seed and step.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -33,32 +34,30 @@ class MPPIConfig:
     Args:
         horizon: steps T.
         samples: action sequences K.
-        noise_speed: standard deviation of the sampled linear velocities, m/s.
-        noise_turn_rate: standard deviation of the sampled angular velocities, rad/s.
+        noise: standard deviation of each sampled action, for (v, ω) in m/s and rad/s.
         temperature: scale of cost below which samples count alike.
         control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the
             current mean itself as the base distribution (α = 1 in the source).
-        drawn_samples: best samples that `Plan` carries for playback, besides the mean's path; 0
-            leaves both out.
+        drawn_samples: most of the best samples that `Plan` carries for playback, besides the mean's
+            path; 0 leaves both out.
     """
 
     horizon: int = 50
     samples: int = 5000
-    noise_speed: float = 0.5
-    noise_turn_rate: float = 0.5
+    noise: tuple[float, ...] = (0.5, 0.5)
     temperature: float = 0.5
     control_cost: float = 0.0
     drawn_samples: int = 0
 
     def __post_init__(self) -> None:
         """Refuses settings that sample nothing."""
-        for name in ("horizon", "samples", "noise_speed", "noise_turn_rate", "temperature"):
-            if not getattr(self, name) > 0:
+        for name in ("horizon", "samples", "temperature"):
+            if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {getattr(self, name)}.")
-        if not 0 <= self.drawn_samples <= self.samples:
-            raise ConfigError(
-                f"Expected `drawn_samples` in 0–{self.samples} for MPPI, got {self.drawn_samples}."
-            )
+        if not self.noise or not all(0 < scale < math.inf for scale in self.noise):
+            raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
+        if self.drawn_samples < 0:
+            raise ConfigError(f"Expected `drawn_samples` ≥ 0 for MPPI, got {self.drawn_samples}.")
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,15 @@ class MPPI:
         self.config = config or MPPIConfig()
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
-        """Starts from a standing robot; see `Planner`."""
+        """Starts from a standing robot; see `Planner`.
+
+        Raises:
+            ConfigError: the robot has another number of actions than there are noise scales.
+        """
+        if len(problem.dynamics.action_low) != len(self.config.noise):
+            raise ConfigError(
+                f"Expected `noise` of MPPI for {len(problem.dynamics.action_low)} actions, got {self.config.noise}."
+            )
         seed = int(torch.randint(2**62, (), generator=generator))
         mean = problem.start.new_zeros(len(problem), self.config.horizon, len(problem.dynamics.action_low))
         return MPPIState(problem, mean, seed, 0)
@@ -98,7 +105,7 @@ class MPPI:
     def plan(self, state: Tensor, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `Planner`."""
         problem, config = plan_state.problem, self.config
-        scale = state.new_tensor((config.noise_speed, config.noise_turn_rate))
+        scale = state.new_tensor(config.noise)
         noise = self._noise(plan_state, state) * scale[:, None]
         cost = rollout_cost(problem, state, plan_state.mean, noise)
         if config.control_cost:
@@ -121,7 +128,7 @@ class MPPI:
     def _drawn(
         self, problem: Problem, state: Tensor, mean: Tensor, earlier: Tensor, noise: Tensor, weights: Tensor
     ) -> Plan:
-        count = self.config.drawn_samples
+        count = min(self.config.drawn_samples, self.config.samples)
         if not count:
             return Plan.empty(len(problem), state.device)
         best = noise[..., weights.topk(count, dim=1).indices].movedim(2, 0)

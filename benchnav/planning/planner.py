@@ -144,6 +144,9 @@ def make_planner(name: str, options: Mapping[str, Any] | None = None) -> Planner
 
 def _configure(name: str, config: type, options: Mapping[str, Any]) -> Any:
     known = {field.name: field for field in fields(config)}
+    options = {
+        option: tuple(value) if isinstance(value, list) else value for option, value in options.items()
+    }
     for option, value in options.items():
         if option not in known:
             raise ConfigError(

@@ -67,11 +67,6 @@ class Problem:
         return self.dynamics.dt_s
 
     @property
-    def steps(self) -> int:
-        """Time steps in the time budget."""
-        return round(self.time_budget_s / self.dt_s)
-
-    @property
     def free(self) -> Tensor:
         """S_free, bool, shape [B, H, W]."""
         return self.traversability > self.stuck_threshold

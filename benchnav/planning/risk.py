@@ -54,10 +54,6 @@ class RiskSetting:
                 raise
             raise ConfigError(f"Expected risk setting `name:level` with a number, got {text!r}.") from error
 
-    def __str__(self) -> str:
-        """The setting as `parse` reads it; the default level is left out."""
-        return self.name if self.level == 0.9 else f"{self.name}:{self.level:g}"
-
     def apply(self, mixture: TraversabilityMixture) -> Tensor:
         """Infers the map λ̂ that a planner is given.
 

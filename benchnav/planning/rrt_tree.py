@@ -142,7 +142,7 @@ class Tree:
         self.ground = problem.grid.pad(problem.traversability.clamp(min=stuck), outside=-1.0)
         self.steps = max(1, round(config.edge_time_s / problem.dt_s))
         self.count = 2 + math.ceil((config.step_m + config.lookahead_m) / SPACING_M)
-        self.goal_lanes = round(config.goal_bias * config.expansions_per_round)
+        self.goal_lanes = math.ceil(config.goal_bias * config.expansions_per_round)
         self.filled = 1
 
         batch, size, drawn = len(root), 1 + config.expansions, 1 + math.ceil(config.step_m / _DRAWN_M)

@@ -52,11 +52,25 @@ class SimulationConfig:
         """Refuses settings under which no episode can run."""
         if self.noise not in ("resampled", "frozen"):
             raise ConfigError(f"Expected `noise` 'resampled' or 'frozen', got {self.noise!r}.")
-        if not self.goal_radius_m > 0 or not self.time_budget_s > 0:
+        if not 0 < self.goal_radius_m < np.inf or not 0 < self.time_budget_s < np.inf:
             raise ConfigError(
-                f"Expected `goal_radius_m` and `time_budget_s` > 0, "
+                f"Expected `goal_radius_m` and `time_budget_s` > 0 and finite, "
                 f"got {self.goal_radius_m} and {self.time_budget_s}."
             )
+
+
+def steps_in(config: SimulationConfig, dynamics: Dynamics) -> int:
+    """Number of time steps in the time budget.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    steps = round(config.time_budget_s / dynamics.dt_s)
+    if steps < 1:
+        raise ConfigError(
+            f"Expected `time_budget_s` of at least one time step of {dynamics.dt_s:g} s, got {config.time_budget_s}."
+        )
+    return steps
 
 
 @dataclass(frozen=True)
@@ -86,8 +100,8 @@ class Simulation:
         terrain: the true maps.
         dynamics: F, the same that planners are given.
         goal_m: goals, shape [B, 2].
-        noise_key: stream key of the noise; see `rng.stream_key`.
-        instances: element of that stream for each episode, B of them.
+        noise_key: root of the noise; see `rng.stream_key`.
+        instances: names each episode's stream under that root, B of them.
         config: settings.
     """
 
@@ -103,7 +117,7 @@ class Simulation:
         """Draws the luck of all steps."""
         self.config = config or SimulationConfig()
         self.dynamics = dynamics
-        self.steps = round(self.config.time_budget_s / dynamics.dt_s)
+        self.steps = steps_in(self.config, dynamics)
         self._grid = terrain.grid
         self._goal_m = goal_m
         if self.config.noise == "frozen":
@@ -112,8 +126,10 @@ class Simulation:
         else:
             self._mean = terrain.grid.pad(terrain.traversability_mean, outside=0.0)
             self._std = terrain.grid.pad(terrain.traversability_std, outside=0.0)
-        draws = rng.normal(noise_key, np.asarray(instances), (self.steps,))
-        self._noise = torch.from_numpy(draws).to(self._mean)
+        # A stream each, so that another time budget leaves the luck of the first steps as it is.
+        first = np.zeros(1, dtype=np.int64)
+        luck = [rng.normal(rng.stream_key(noise_key, int(i)), first, (self.steps,)) for i in instances]
+        self._noise = torch.from_numpy(np.concatenate(luck)).to(self._mean)
 
     def init(self, start: Tensor) -> SimulationState:
         """Puts the robots at their initial states, shape [B, S]."""

@@ -41,7 +41,7 @@ def test_fractal_spectrum_falls_with_the_asked_exponent() -> None:
 
 def test_craters_keep_apart_and_are_as_many_as_fit() -> None:
     count = np.repeat([0, 2, 4, 50], 10)
-    centres, radii = elevation.place_craters(rng.stream_key(0, "c"), INDICES, (32, 32), count, (2.0, 4.5))
+    centres, radii = elevation.place_craters(rng.stream_key(0, "c"), INDICES, (32, 32), count, (2.0, 4.5), 50)
     made = (radii > 0).sum(axis=1)
     assert (made <= count).all()
     assert (made[count <= 4] == count[count <= 4]).all()

@@ -23,6 +23,12 @@ def test_a_map_is_the_same_in_any_batch() -> None:
         np.testing.assert_array_equal(whole[name][[1, 2, 7]], part[name])
 
 
+def test_a_map_with_craters_is_the_same_alone() -> None:
+    whole = generate(PAPER, "test/hg", np.arange(20))
+    for i in range(20):
+        np.testing.assert_array_equal(generate(PAPER, "test/hg", np.array([i]))["rgb"][0], whole["rgb"][i])
+
+
 def test_std_terrain_has_the_figures_it_is_known_by() -> None:
     maps = generate(PAPER, "train", np.arange(300))
     relief = np.ptp(maps["elevation_m"], axis=(1, 2))

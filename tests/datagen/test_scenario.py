@@ -42,6 +42,10 @@ def test_severity_moves_from_std_to_the_preset() -> None:
         ({"height": "tall"}, "height"),
         ({"resolution_m": 0}, "resolution_m"),
         ({"environments": 0}, "environments"),
+        ({"id": "../x"}, "id"),
+        ({"splits": {"test+std": {"scenario": "std", "maps": 1}}}, "split name"),
+        ({"splits": {"manifest": {"scenario": "std", "maps": 1}}}, "split name"),
+        ({"scenarios": {"std": {"preset": ["std"]}}}, "preset"),
     ],
 )
 def test_bad_recipes_give_one_line_that_names_the_key(change: dict, expected: str) -> None:

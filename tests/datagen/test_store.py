@@ -15,7 +15,7 @@ from benchnav.datagen import schema
 from benchnav.datagen.generate import generate
 from benchnav.datagen.store import TerrainDataset, create, find_dataset
 from benchnav.datagen.validate import find_faults
-from benchnav.errors import DatasetError
+from benchnav.errors import BenchnavError, DatasetError
 from tests.factories import tiny_dataset, tiny_recipe
 
 
@@ -37,8 +37,9 @@ def test_digest_does_not_depend_on_workers_or_blocks(tmp_path: Path) -> None:
 
 def test_what_is_read_is_what_was_generated(dataset_path: Path) -> None:
     dataset = TerrainDataset(dataset_path)
-    recipe = tiny_recipe()
+    recipe, manifest = tiny_recipe(), json.dumps(dataset.manifest)
     assert dataset.recipe == recipe
+    assert json.dumps(dataset.manifest) == manifest
     for split in dataset.splits:
         made = generate(recipe, split, np.arange(2))
         read = dataset.read(split, [0, 1])
@@ -102,7 +103,7 @@ def test_two_runs_on_one_file_refuse_each_other(tmp_path: Path) -> None:
     path = tmp_path / "d.h5"
     first = create(tiny_recipe(), path, block_maps=4)
     next(first)
-    with pytest.raises(DatasetError, match="Another run"):
+    with pytest.raises(BenchnavError, match="Another run"):
         next(create(tiny_recipe(), path, block_maps=4))
     first.close()
 

@@ -39,6 +39,9 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert evaluate(monkeypatch, "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
     other = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--seed", "1")
     assert evaluate(monkeypatch, *other) == 2
+    # A suite that cannot be run drops nothing.
+    assert evaluate(monkeypatch, *other, "--overwrite", "true", "--instances", "99") == 2
+    assert (out / "episodes.parquet").exists()
     assert evaluate(monkeypatch, *other, "--overwrite", "true") == 0
 
 
@@ -60,6 +63,8 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monk
         ("run", "--jobs", "0"),
         ("run", "--planers", "[mppi]"),
         ("run", "--config", "no-such.yaml"),
+        ("run", "--out", "/proc/none/run", "--model", "oracle"),
+        ("run", "--out", "/dev/null", "--model", "oracle"),
         ("report", "no-such"),
         ("replay", "no-such"),
         ("fly",),

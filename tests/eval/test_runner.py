@@ -118,6 +118,15 @@ def test_another_suite_does_not_mix_into_a_run(finished: tuple[Suite, Path]) -> 
         finish(replace(suite, seed=1), folder)
 
 
+def test_two_runs_in_one_folder_refuse_each_other(dataset_path: Path, tmp_path: Path) -> None:
+    suite = suite_on(dataset_path, planners=("astar_dwa",), risks=("mean",), scenarios=("std",), recorded=0)
+    first = run_suite(suite, tmp_path / "run")
+    next(first)
+    with pytest.raises(BenchnavError, match="Another run"):
+        finish(suite, tmp_path / "run")
+    first.close()
+
+
 def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:
     suite, folder = finished
     path = record_episode(suite, folder, "astar_dwa", "mean", "hs", 1)
@@ -162,6 +171,8 @@ def test_models_see_observations_and_planners_the_prediction(
         def plan(self, state, plan_state):  # type: ignore[no-untyped-def]
             return original.plan(state, plan_state)
 
+    monkeypatch.setattr(predictor, "_FACTORIES", {})
+    monkeypatch.setattr(planners, "_FACTORIES", {})
     predictor.register_model("spy", lambda *_, **__: Spy())
     planners.register("watched", lambda options: Watched())
     suite = suite_on(
@@ -189,10 +200,13 @@ def test_suites_are_checked_before_anything_runs(dataset_path: Path, tmp_path: P
         ({"model": "no-such-model"}, "no-such-model"),
         ({"data": "no-such-data"}, "no-such-data"),
         ({"noise": "loud"}, "loud"),
+        ({"instances": 9}, "instances"),
+        ({"risks": ("cvar", "cvar:0.9")}, "risks"),
+        ({"time_budget_s": 0.01}, "time_budget_s"),
     ):
         with pytest.raises(BenchnavError, match=expected):
             finish(suite_on(dataset_path, **change), tmp_path / "run")
-        assert not (tmp_path / "run" / "episodes.parquet").exists()
+        assert not (tmp_path / "run").exists()
 
 
 def test_units_cover_every_episode_once_in_blocks_of_twenty() -> None:

@@ -8,6 +8,7 @@ import torch
 
 from benchnav import gridgraph
 from benchnav.planning import astar
+from benchnav.terrain import Grid
 from tests import factories
 
 
@@ -89,3 +90,9 @@ def test_no_way_is_an_infinite_cost() -> None:
     assert field.cost[0, 2, 2].isinf()
     assert field.cost[1, 2, 2].isfinite()
     assert gridgraph.NO_CELL not in field.following
+
+
+def test_a_goal_at_a_corner_of_coarse_cells_is_reached() -> None:
+    problem = factories.problem(torch.full((1, 8, 8), 0.9), start=(3.0, 3.0), goal=(12.0, 12.0))
+    coarse = replace(problem, grid=Grid(8, 8, 2.0))
+    assert astar.search(coarse).cost[0, 1, 1].isfinite()
