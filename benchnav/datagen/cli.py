@@ -131,6 +131,7 @@ def preview(file: str, split: str = "test/std", maps: list[int] | None = None, o
     from benchnav.datagen.preview import save_preview
     from benchnav.datagen.store import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
+    from benchnav.files import replacing
 
     path = Path(out or f"preview-{split.replace('/', '-')}.png")
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
@@ -138,8 +139,10 @@ def preview(file: str, split: str = "test/std", maps: list[int] | None = None, o
     if maps == []:
         raise ConfigError("Expected `maps` with at least one index, got none.")
     dataset = TerrainDataset(find_dataset(file))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_preview(dataset, split, sorted(set(maps if maps is not None else [0, 1, 2])), path)
+    with replacing(path) as partial:
+        save_preview(
+            dataset, split, sorted(set(maps if maps is not None else [0, 1, 2])), partial, path.suffix[1:]
+        )
     print(f"wrote {path}")
 
 

@@ -15,14 +15,15 @@ from benchnav.datagen.store import TerrainDataset
 _TITLES = ("colour", "class", "elevation [m]", "slope [°]", "traversability λ")
 
 
-def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path) -> None:
+def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path, kind: str) -> None:
     """Draws maps of a split to an image file.
 
     Args:
         dataset: where the maps are.
         split: name of a split.
         indices: which maps, ascending.
-        path: file to write; its suffix chooses the format.
+        path: file to write.
+        kind: format of the picture, such as png.
     """
     maps = dataset.read(split, indices)
     rows = len(indices)
@@ -36,7 +37,7 @@ def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], pa
             panel.set_xlabel("x [m]" if row == rows - 1 else "")
     for panel, title in zip(panels[0], _TITLES, strict=True):
         panel.set_title(title, fontsize=10)
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=130, format=kind)
 
 
 def _draw_row(

@@ -147,6 +147,14 @@ class Recipe:
                 raise ConfigError(
                     f"Expected `{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y})."
                 )
+        if self.start_m == self.goal_m:
+            raise ConfigError(f"Expected `goal_m` apart from `start_m`, got both at {self.goal_m}.")
+        for name, scenario in self.scenarios.items():
+            if scenario.crater_count[1] > 0 and 2 * scenario.crater_radius_m[1] > min(extent_x, extent_y):
+                raise ConfigError(
+                    f"Expected `crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
+                    f"got {scenario.crater_radius_m}."
+                )
         if not np.isclose(sum(self.occupancy), 1, atol=1e-6) or not all(
             0 < share <= 1 for share in self.occupancy
         ):
@@ -281,7 +289,9 @@ def _parse(kind: type, data: Any) -> Any:
     try:
         return parser.instantiate_classes(parser.parse_object({"value": deepcopy(data)})).value
     except (ArgumentError, TypeError, ValueError) as error:
-        raise ConfigError(" ".join(str(error).split())) from error
+        # "value" is the parser's name for the whole, not a key that the user wrote.
+        message = re.sub(r"\bvalue\.", "", " ".join(str(error).split())).replace("Group 'value'", "It")
+        raise ConfigError(message) from error
 
 
 def _plain(value: Any) -> Any:

@@ -1,5 +1,6 @@
 """The command `benchnav-eval`: run suites, report on them, replay episodes."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -16,7 +17,6 @@ def run_command(suite: Suite, out: str = "runs/latest", jobs: int = 1, overwrite
         jobs: Worker processes. The result is the same for any number.
         overwrite: Drop a run that is there.
     """
-    import os
     import shutil
 
     from benchnav.command import show_progress
@@ -89,31 +89,38 @@ def replay(
         instance,
     )
     print(f"recording: {path}")
-    viewer = [sys.executable, "-m", "rerun", str(path)]
-    if view:
-        subprocess.run(viewer, check=False)
+    shown = sys.platform != "linux" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if view and shown:
+        subprocess.run([sys.executable, "-m", "rerun", str(path)], check=True)
     else:
-        print(f"view it with: rerun {path}")
+        print(f"{'' if shown else 'there is no display here; '}view it with: {_program('rerun')} {path}")
 
 
 def _print_table(summary) -> None:  # type: ignore[no-untyped-def]
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from benchnav.eval.report import HEADINGS, table_rows
 
-    table = Table(*HEADINGS)
+    # Escaped, since square brackets are markup.
+    table = Table(*map(escape, HEADINGS))
     for row in table_rows(summary):
         table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    Console(width=None if sys.stdout.isatty() else 130).print(table)
 
 
 def _print_replay(suite: Suite, folder: Path) -> None:
-    program = Path(sys.argv[0])
-    command = program if program.parent.name == "bin" and ".venv" in program.parts else Path("benchnav-eval")
-    if command.is_absolute() and command.is_relative_to(Path.cwd()):
-        command = command.relative_to(Path.cwd())
-    print(f"replay:  {command} replay {folder} --planner {suite.planners[-1]} --risk {suite.risks[0]}")
+    command = f"replay {folder} --planner {suite.planners[-1]} --risk {suite.risks[0]}"
+    print(f"replay:  {_program('benchnav-eval')} {command}")
+
+
+def _program(name: str) -> str:
+    """How a program of this environment is called from here."""
+    path = Path(sys.executable).parent / name
+    if any(Path(folder) == path.parent for folder in os.environ.get("PATH", "").split(os.pathsep)):
+        return name
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
 def main() -> None:

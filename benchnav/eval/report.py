@@ -77,7 +77,7 @@ def _markdown(rows: list[tuple[str, ...]], suite: Suite, about: dict[str, Any], 
         "",
         f"Dataset `{about['dataset']['id']}`, model `{suite.model}`, seed {suite.seed}, noise {suite.noise}, "
         f"T = {suite.time_budget_s:g} s.",
-        f"Planner options: {suite.planner_options or 'defaults'}. Command: `{about['command']}`",
+        f"Planner options: {_options(suite)}. Command: `{about['command']}`",
         "",
         "T_total counts a failure as T. Mean ± standard deviation over instances.",
         "",
@@ -87,6 +87,15 @@ def _markdown(rows: list[tuple[str, ...]], suite: Suite, about: dict[str, Any], 
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     lines += [text for name in figures for text in ("", f"![{name}](figures/{name}.png)")]
     return "\n".join([*lines, ""])
+
+
+def _options(suite: Suite) -> str:
+    changes = [
+        f"{planner} {name} = {value}"
+        for planner, options in suite.planner_options.items()
+        for name, value in options.items()
+    ]
+    return ", ".join(changes) or "defaults"
 
 
 def _latex(rows: list[tuple[str, ...]]) -> str:

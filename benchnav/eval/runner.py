@@ -12,6 +12,7 @@ import os
 import platform
 import shlex
 import sys
+import warnings
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -69,6 +70,8 @@ def _run_units(
     missing = [unit for unit in every if not (folder / "units" / f"{unit.name}.json").exists()]
     done = len(every) - len(missing)
     yield done, len(every)
+    # A worker whose memory has grown is replaced; that is no concern of a user's.
+    warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
     workers = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
     for _ in workers(joblib.delayed(run_unit)(suite, unit, folder) for unit in missing):
         done += 1
@@ -136,7 +139,10 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Run the same command again to finish it."
         )
-    return pd.read_parquet(path)
+    try:
+        return pd.read_parquet(path)
+    except ValueError as error:
+        raise ConfigError(f"{path} is damaged: {error}. Remove it and run the same command again.") from error
 
 
 def run_unit(suite: Suite, unit: Unit, folder: Path) -> None:

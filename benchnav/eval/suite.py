@@ -134,6 +134,6 @@ def containing(
             return replace(unit, recorded=unit.instances.index(instance) + 1)
     raise ConfigError(
         f"Expected an episode of the run, got planner {planner!r}, risk {risk!r}, scenario {scenario!r}, "
-        f"instance {instance}. It has planners {list(suite.planners)}, risks {list(suite.risks)} and "
-        f"scenarios {list(suite.scenarios)}."
+        f"instance {instance}. It has planners {list(suite.planners)}, risks {list(suite.risks)}, "
+        f"scenarios {list(suite.scenarios)}, and instances 0–{(suite.instances or sizes.get(scenario, 1)) - 1}."
     )

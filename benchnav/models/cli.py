@@ -1,6 +1,8 @@
 """The command `benchnav-train`: train the halves of a model and measure the whole."""
 
+import os
 import sys
+import tempfile
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -154,7 +156,9 @@ def _start(data: str, out: str, names: set[str], overwrite: bool) -> "tuple[Terr
         dataset_digest=",".join(f"{name}:{dataset.splits[name]['digest']}" for name in ("train", "valid")),
     )
     if not Path(out).exists():
-        Path(out).parent.mkdir(parents=True, exist_ok=True)  # now rather than after the training
+        # Whether a checkpoint can be written there shows now rather than after the training.
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        os.rmdir(tempfile.mkdtemp(dir=Path(out).parent))
         return dataset, fresh
     if not (Path(out) / "config.json").is_file():
         raise CheckpointError(

@@ -43,6 +43,8 @@ def test_severity_moves_from_std_to_the_preset() -> None:
         ({"resolution_m": 0}, "resolution_m"),
         ({"environments": 0}, "environments"),
         ({"id": "../x"}, "id"),
+        ({"goal_m": [4, 4]}, "goal_m"),
+        ({"scenarios": {"std": {"preset": "hg", "crater_radius_m": [9, 9]}}}, "crater_radius_m"),
         ({"splits": {"test+std": {"scenario": "std", "maps": 1}}}, "split name"),
         ({"splits": {"manifest": {"scenario": "std", "maps": 1}}}, "split name"),
         ({"scenarios": {"std": {"preset": ["std"]}}}, "preset"),
