@@ -41,3 +41,20 @@ def test_a_robot_that_spins_stops_spinning() -> None:
         state = problem.dynamics(state, velocity, problem.traversability_at(state))
     assert abs(velocity[0, 1]) < 0.6
     assert torch.linalg.vector_norm(state[0, :2] - problem.goal_m[0]) < 3.0
+
+
+def test_it_turns_on_the_spot_toward_a_waypoint_behind_on_either_side() -> None:
+    problem = factories.problem(torch.full((2, 16, 16), 0.8), start=(4.0, 4.0), goal=(4.0, 7.0))
+    state = torch.tensor([[4.0, 4.0, -0.3], [4.0, 4.0, 3.4]])
+    behind = torch.tensor([[1.0, 4.0], [7.0, 4.0]])
+    velocity, _, _ = choose_velocity(problem, state, torch.zeros(2, 2), behind, CONFIG)
+    # The shorter way round: from −0.3 to −π rightward, from 3.4 to 2π leftward.
+    assert velocity[0, 1] < -0.04
+    assert velocity[1, 1] > 0.04
+
+
+def test_a_near_waypoint_does_not_slow_the_robot() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.9), start=(2.0, 4.0), goal=(7.0, 4.0))
+    near = torch.tensor([[3.0, 4.0]])
+    velocity, _, _ = choose_velocity(problem, problem.start, torch.tensor([[0.6, 0.0]]), near, CONFIG)
+    assert velocity[0, 0] > 0.64

@@ -67,6 +67,16 @@ def test_reward_is_progress_less_time_and_arrival_ends(dataset_path: Path) -> No
     assert distance < 1
 
 
+def test_each_episode_has_luck_of_its_own(dataset_path: Path) -> None:
+    env = gymnasium.make(ID, data=dataset_path).unwrapped
+    env.reset(seed=0)
+    met = []
+    for _ in range(6):
+        env.reset(options={"instance": 0})
+        met.append(env.step(np.zeros(2, np.float32))[4]["traversability"])
+    assert len(set(met)) > 2
+
+
 def test_no_truth_is_observed(dataset_path: Path) -> None:
     env = gymnasium.make(ID, data=dataset_path)
     assert set(env.observation_space.spaces) == {"state", "goal", "rgb", "elevation_m", "slope_deg"}

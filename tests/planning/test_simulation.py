@@ -75,6 +75,13 @@ def test_a_time_budget_without_a_step_is_refused(budget: float) -> None:
         simulation(torch.full((1, 16, 16), 0.5), (90.0, 90.0), time_budget_s=budget)
 
 
+def test_traversability_is_clipped_to_its_range() -> None:
+    sim = simulation(torch.stack([torch.full((16, 16), v) for v in [1.0, 0.0] * 20]), (90.0, 90.0))
+    _, met = sim.step(sim.init(torch.zeros(40, 3) + 4), torch.zeros(40, 2))
+    assert met.min() == 0
+    assert met.max() == 1
+
+
 def test_frozen_noise_is_the_maps_realised_traversability() -> None:
     mean = torch.rand(1, 16, 16)
     sim = simulation(mean, (90.0, 90.0), noise="frozen")
