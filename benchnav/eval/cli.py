@@ -64,7 +64,7 @@ def replay(
     scenario: str | None = None,
     instance: int = 0,
     view: bool = True,
-) -> None:
+) -> int:
     """Play an episode back in the Rerun viewer, recording it first where that was not done.
 
     Args:
@@ -91,9 +91,11 @@ def replay(
     print(f"recording: {path}")
     shown = sys.platform != "linux" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if view and shown:
-        subprocess.run([sys.executable, "-m", "rerun", str(path)], check=True)
-    else:
-        print(f"{'' if shown else 'there is no display here; '}view it with: {_program('rerun')} {path}")
+        return 1 if subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode else 0
+    print(
+        f"{'there is no display here; ' if view and not shown else ''}view it with: {_program('rerun')} {path}"
+    )
+    return 0
 
 
 def _print_table(summary) -> None:  # type: ignore[no-untyped-def]

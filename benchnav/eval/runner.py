@@ -258,9 +258,9 @@ def _simulate(
                 sketches[member].append(_sketch(step, plan, member))
 
     episodes = run_episodes(planner, problem, simulation, generator, watch if unit.recorded else None)
-    # What was planned after an episode's end is not part of it.
-    ends = episodes.steps.tolist()
-    return problem, episodes, [[p for p in plans if p.step < ends[m]] for m, plans in enumerate(sketches)]
+    # What was planned after an episode's end is not part of it; the first plan is, also one that failed.
+    last = (episodes.steps - 1).clamp(min=0).tolist()
+    return problem, episodes, [[p for p in plans if p.step <= last[m]] for m, plans in enumerate(sketches)]
 
 
 def _sketch(step: int, plan: Plan, member: int) -> PlanSketch:

@@ -215,3 +215,28 @@ def test_units_cover_every_episode_once_in_blocks_of_twenty() -> None:
     assert [len(unit.instances) for unit in made] == [20, 20, 5, 3, 20]
     assert len({unit.name for unit in made}) == len(made)
     assert sum(unit.recorded for unit in made) == 1
+
+
+def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Hopeless:
+        def init(self, problem, generator):  # type: ignore[no-untyped-def]
+            return None
+
+        def plan(self, state, plan_state):  # type: ignore[no-untyped-def]
+            failed = torch.full((len(state),), int(planners.PlanStatus.FAILED))
+            return torch.zeros(len(state), 2), None, planners.Plan.empty(len(state), status=failed)
+
+    monkeypatch.setattr(planners, "_FACTORIES", {"hopeless": lambda options: Hopeless()})
+    suite = suite_on(
+        dataset_path, planners=("hopeless",), risks=("mean",), scenarios=("std",), planner_options={}
+    )
+    episodes = finish(suite, tmp_path / "run")
+    assert episodes["outcome"].tolist() == ["planner_failure"] * 2
+    assert episodes["end_time_s"].tolist() == [0, 0]
+    assert episodes["total_time_s"].tolist() == [40, 40]
+    write_report(tmp_path / "run")
+    (recording,) = (tmp_path / "run" / "playback").glob("*.rrd")
+    _, positions = playback.read_path(recording)
+    assert len(positions) == 1
