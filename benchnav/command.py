@@ -20,7 +20,8 @@ class Command:
     Args:
         function: does the work; its type hints and docstring become flags and help. It returns the
             exit status, or None for success.
-        positionals: names of its parameters that are given by place rather than by flag.
+        positionals: names of its parameters that are given by place rather than by flag; one that is a
+            list takes what is left.
         settings: a dataclass whose fields become flags; one of it is the function's first argument.
     """
 
@@ -55,8 +56,11 @@ def run(
         child.add_argument("--config", action="config", help="Path of a YAML file with these settings.")
         hints = get_type_hints(command.function)
         for positional in command.positionals:
+            rest = {"type": str, "nargs": "*"} if hints[positional] == list[str] else {}
             child.add_argument(
-                positional, type=hints[positional], help=_argument_help(command.function, positional)
+                positional,
+                **({"type": hints[positional]} | rest),
+                help=_argument_help(command.function, positional),
             )
         skip: set[str | int] = set(command.positionals)
         if command.settings:

@@ -10,7 +10,7 @@ from benchnav.errors import BenchnavError
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
     """Gives a name to write to; what stands there at the end takes `path`'s place in one step.
 
     A kill at any moment leaves `path` as it was or as it is to be. The name is the process's own, so
@@ -18,13 +18,15 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Args:
         path: the file to be written; its folder is made.
+        durable: wait until it is on the disk, so that not even a loss of power leaves it damaged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
-        with open(partial, "rb") as written:
-            os.fsync(written.fileno())
+        if durable:
+            with open(partial, "rb") as written:
+                os.fsync(written.fileno())
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

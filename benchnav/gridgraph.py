@@ -15,7 +15,7 @@ NO_CELL = -1
 
 @lru_cache(maxsize=8)
 def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lists the directed edges between 8-connected cells.
+    """Lists the directed edges between 8-connected cells, in the order of their targets.
 
     Returns:
         Flat index of the source cells, of the target cells, and the length of each edge in cell
@@ -29,7 +29,9 @@ def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np
         sources += [here, there]
         targets += [there, here]
         lengths += [np.full(2 * here.size, np.hypot(step_x, step_y))]
-    return np.concatenate(sources), np.concatenate(targets), np.concatenate(lengths)
+    source, target, length = (np.concatenate(parts) for parts in (sources, targets, lengths))
+    order = np.lexsort((source, target))
+    return source[order], target[order], length[order]
 
 
 def cost_to_go(
@@ -49,18 +51,20 @@ def cost_to_go(
         [B, H·W].
     """
     batch, cells = len(edge_costs), shape[0] * shape[1]
-    source, target, _ = neighbour_pairs(*shape)
-    member, edge = np.nonzero(np.isfinite(edge_costs))
-    # Searching backward from the goals, so the edges are turned round.
-    graph = csr_array(
-        (edge_costs[member, edge], (member * cells + target[edge], member * cells + source[edge])),
-        shape=(batch * cells, batch * cells),
-    )
     starts = np.flatnonzero(goals)
     if starts.size == 0:
         return np.full((batch, *shape), np.inf), np.full((batch, cells), NO_CELL)
-    cost, previous, _ = dijkstra(graph, indices=starts, min_only=True, return_predecessors=True)
+    # Searching backward from the goals, so the edges are turned round: rows are their targets.
+    source, target, _ = neighbour_pairs(*shape)
     offset = cells * np.arange(batch)[:, None]
+    ends = np.cumsum(np.bincount(target, minlength=cells))
+    rows = np.concatenate([[0], (len(source) * np.arange(batch)[:, None] + ends).ravel()])
+    graph = csr_array(
+        (edge_costs.ravel(), (source + offset).ravel(), rows), shape=(batch * cells, batch * cells)
+    )
+    # The finite limit keeps infinite edges from being taken.
+    limit = np.finfo(np.float64).max
+    cost, previous, _ = dijkstra(graph, indices=starts, min_only=True, return_predecessors=True, limit=limit)
     following = previous.reshape(batch, cells).astype(np.int64)
     return cost.reshape(batch, *shape), np.where(following >= 0, following - offset, NO_CELL)
 
@@ -80,4 +84,4 @@ def travel_time_costs(traversability: np.ndarray, free: np.ndarray, resolution_m
     source, target, length = neighbour_pairs(height, width)
     pace = np.full((batch, height * width), np.inf)
     np.divide(1.0, traversability.reshape(batch, -1), out=pace, where=free.reshape(batch, -1))
-    return 0.5 * length * resolution_m * (pace[:, source] + pace[:, target])
+    return 0.5 * length * resolution_m * (np.take(pace, source, axis=1) + np.take(pace, target, axis=1))

@@ -55,12 +55,16 @@ def random_bits(key: int, indices: np.ndarray, count: int) -> np.ndarray:
 def uniform(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
     """Draws uniforms in the open interval (0, 1), float64, shape [B, *shape]."""
     bits = random_bits(key, indices, int(np.prod(shape, dtype=int)))
-    return (((bits >> np.uint64(11)) + 0.5) * 2.0**-53).reshape(len(bits), *shape)
+    drawn = (bits >> np.uint64(11)).astype(np.float64)
+    drawn += 0.5
+    drawn *= 2.0**-53
+    return drawn.reshape(len(bits), *shape)
 
 
 def normal(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
     """Draws standard normals by inversion, float64, shape [B, *shape]."""
-    return ndtri(uniform(key, indices, shape))
+    drawn = uniform(key, indices, shape)
+    return ndtri(drawn, out=drawn)
 
 
 def permutation(key: int, indices: np.ndarray, n: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from benchnav.datagen.scenario import Recipe, load_recipe
-from benchnav.datagen.store import create
+from benchnav.datagen.writer import create
 from benchnav.planning.dynamics import Unicycle
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.problem import Problem, heading_to

@@ -8,9 +8,10 @@ import torch
 
 from benchnav import gridgraph, rng
 from benchnav.datagen import appearance, elevation, latent
+from benchnav.datagen.block import Block
 from benchnav.datagen.generate import generate
 from benchnav.datagen.scenario import load_recipe
-from benchnav.datagen.schema import SplitDigest
+from benchnav.datagen.schema import entry_digests
 from benchnav.planning import astar, mppi
 from benchnav.planning.dwa import DWAConfig, choose_velocity
 from benchnav.planning.risk import NAMES, RiskSetting
@@ -56,7 +57,8 @@ def test_datagen() -> None:
     same_after(lambda: generate(tiny_recipe(), "test/hg", indices), indices)
     same_after(lambda: rng.normal(1, indices, (3,)), indices)
     maps = generate(tiny_recipe(), "test/hg", np.arange(2))
-    same_after(lambda: SplitDigest().update(maps), *maps.values())
+    same_after(lambda: entry_digests(maps), *maps.values())
+    same_after(lambda: Block.of(maps), *maps.values())
 
 
 def test_planning() -> None:

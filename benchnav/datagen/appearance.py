@@ -20,9 +20,12 @@ def class_bands(noise: np.ndarray, occupancy: np.ndarray) -> np.ndarray:
         Band index in [0, M), int64, shape [B, H, W]; each share is met to within one cell.
     """
     flat = noise.reshape(len(noise), -1)
-    rank = np.argsort(np.argsort(flat, axis=1, kind="stable"), axis=1, kind="stable")
-    edges = np.round(np.cumsum(occupancy)[:-1] * flat.shape[1])
-    return np.searchsorted(edges, rank, side="right").reshape(noise.shape)
+    edges = np.round(np.cumsum(occupancy)[:-1] * flat.shape[1]).astype(int)
+    levels = np.sort(flat, axis=1)[:, edges[edges < flat.shape[1]]]
+    bands = np.zeros(flat.shape, dtype=np.int64)
+    for level in levels.T:
+        bands += flat >= level[:, None]
+    return bands.reshape(noise.shape)
 
 
 def light_direction(azimuth_rad: np.ndarray, height: np.ndarray) -> np.ndarray:
@@ -51,10 +54,18 @@ def shade(elevation_m: np.ndarray, resolution_m: float, light: np.ndarray, ambie
     Returns:
         Brightness in [0, 1], shape [B, H, W].
     """
-    slope_x, slope_y = horn_gradient(elevation_m, resolution_m)
+    return lambert(*horn_gradient(elevation_m, resolution_m), light, ambient)
+
+
+def lambert(along_x: np.ndarray, along_y: np.ndarray, light: np.ndarray, ambient: float) -> np.ndarray:
+    """Brightness of ground of the given ∂z/∂x and ∂z/∂y; see `shade`, shape [B, H, W]."""
     x, y, z = (light[:, k, None, None] for k in range(3))
-    lambert = (z - x * slope_x - y * slope_y) / np.sqrt(1 + slope_x**2 + slope_y**2)
-    return ambient + (1 - ambient) * np.maximum(lambert, 0)
+    cosine = z - x * along_x - y * along_y
+    cosine /= np.sqrt(1 + along_x * along_x + along_y * along_y)
+    np.maximum(cosine, 0, out=cosine)
+    cosine *= 1 - ambient
+    cosine += ambient
+    return cosine
 
 
 def paint(class_id: np.ndarray, colours: np.ndarray, brightness: np.ndarray) -> np.ndarray:
@@ -68,5 +79,9 @@ def paint(class_id: np.ndarray, colours: np.ndarray, brightness: np.ndarray) -> 
     Returns:
         Image, uint8, shape [B, 3, H, W].
     """
-    lit = colours[class_id] * brightness[..., None]
-    return np.moveaxis(np.round(lit), -1, 1).clip(0, 255).astype(np.uint8)
+    image = np.empty((len(class_id), 3, *class_id.shape[1:]), dtype=np.uint8)
+    for channel in range(3):
+        lit = np.take(colours[:, channel], class_id)
+        lit *= brightness
+        image[:, channel] = np.rint(lit, out=lit)
+    return image

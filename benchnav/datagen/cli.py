@@ -1,14 +1,19 @@
-"""The command `benchnav-datagen`: make, list, show, check and draw datasets."""
+"""The command `benchnav-datagen`: make, list, show, check, mend, combine, import and draw datasets."""
 
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from benchnav.command import Command, run
+
+if TYPE_CHECKING:
+    from benchnav.datagen.store import TerrainDataset
 
 
 def create(
     recipe: str,
+    overrides: list[str],
     out: str = "",
     jobs: int = 1,
     seed: int | None = None,
@@ -19,87 +24,83 @@ def create(
 
     Args:
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
+        overrides: Changes to it, such as id=mine splits.train.maps=50 scenarios.hs.severity=0.5.
         out: File to write; datasets/ID.h5 when not given.
         jobs: Worker processes. The result is the same for any number.
-        seed: Root seed in place of the recipe's; makes other maps of the same classes.
-        splits: Only these splits, for example [test/std,test/hg].
+        seed: Root seed in place of the recipe's: a sibling, of id ID-seedN, with other maps of the same classes.
+        splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
         overwrite: Replace a file that is there.
     """
     from benchnav.command import show_progress
     from benchnav.datagen.scenario import load_recipe
     from benchnav.datagen.store import TerrainDataset
-    from benchnav.datagen.store import create as create_dataset
+    from benchnav.datagen.writer import create as create_dataset
     from benchnav.errors import ConfigError
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
-    chosen = load_recipe(recipe)
-    if seed is not None:
-        chosen = replace(chosen, seed=seed)
+    chosen = load_recipe(recipe, overrides)
+    if seed is not None and seed != chosen.seed:
+        chosen = replace(chosen, seed=seed, id=f"{chosen.id}-seed{seed}")
     if splits is not None:
         unknown = [name for name in splits if name not in chosen.splits]
-        if unknown:
-            raise ConfigError(f"Expected `splits` among {sorted(chosen.splits)}, got {unknown}.")
+        if unknown or not splits:
+            raise ConfigError(f"Expected `splits` among {sorted(chosen.splits)}, got {unknown or 'none'}.")
         chosen = replace(
             chosen, splits={name: chosen.splits[name] for name in chosen.splits if name in splits}
         )
     path = Path(out or f"datasets/{chosen.id}.h5")
     show_progress(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite), "maps")
-    print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    for name, split in TerrainDataset(path).splits.items():
-        print(f"  {name:10} {split['maps']:6} maps  {split['digest']}")
+    _report(TerrainDataset(path))
 
 
-def list_datasets(folder: str = "datasets") -> None:
-    """List the shipped recipes and the datasets in a folder.
+def list_datasets(folder: str = "") -> None:
+    """List the shipped recipes and the datasets at hand.
 
     Args:
-        folder: Where to look for files.
+        folder: Where to look for files; where ids are looked up when not given.
     """
     from benchnav.datagen.scenario import load_recipe, shipped_recipes
-    from benchnav.datagen.store import TerrainDataset
+    from benchnav.datagen.store import TerrainDataset, dataset_folders
+    from benchnav.errors import DatasetError
 
     print("recipes:")
     for name in shipped_recipes():
         sizes = ", ".join(f"{split} {spec.maps}" for split, spec in load_recipe(name).splits.items())
         print(f"  {name:12} {sizes}")
-    print(f"files in {folder}:")
-    for path in sorted(Path(folder).glob("*.h5")):
-        dataset = TerrainDataset(path)
-        sizes = ", ".join(f"{split} {entry['maps']}" for split, entry in dataset.splits.items())
-        print(f"  {path.name:20} {dataset.id:12} {sizes}")
+    for place in [Path(folder)] if folder else dataset_folders():
+        print(f"files in {place}:")
+        for path in sorted(place.glob("*.h5")):
+            try:
+                dataset = TerrainDataset(path)
+            except DatasetError as error:
+                print(f"  {path.name:20} not readable: {error}")
+                continue
+            sizes = ", ".join(f"{split} {entry['maps']}" for split, entry in dataset.splits.items())
+            print(f"  {path.name:20} {dataset.id:12} {sizes}")
 
 
-def show(file: str) -> None:
-    """Show what a dataset holds: splits, scenarios, class table, provenance, digests.
+def show(file: str, json: bool = False) -> None:
+    """Show what a dataset holds: splits, scenarios, sizes, class table, provenance, digests.
 
     Args:
         file: Path or id of a dataset.
+        json: Print it as JSON.
     """
-    from rich.console import Console
-    from rich.table import Table
+    from json import dumps
 
+    from rich.console import Console
+
+    from benchnav.datagen.describe import describe, tables
     from benchnav.datagen.store import TerrainDataset, find_dataset
 
-    dataset = TerrainDataset(find_dataset(file))
-    recipe, console = dataset.recipe, Console()
-    print(f"{dataset.path}: {dataset.id}, seed {recipe.seed}, format {dataset.manifest['format_version']}")
-    print(
-        f"made by {dataset.manifest['generator']['package']} {dataset.manifest['generator']['version']}; "
-        f"maps of {recipe.height}×{recipe.width} cells of {recipe.resolution_m} m; "
-        f"start {recipe.start_m}, goal {recipe.goal_m}; {recipe.environments} environments"
-    )
-    table = Table("split", "scenario", "maps", "digest", title="splits")
-    for name, split in dataset.splits.items():
-        table.add_row(name, split["scenario"], str(split["maps"]), split["digest"])
-    console.print(table)
-    table = Table("id", "class", "colour", "a", "b", "o", "σ", title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
-    for number, item in enumerate(recipe.classes):
-        table.add_row(
-            str(number), item.name, str(tuple(item.colour)), f"{item.scale:g}", f"{item.exponent:g}",
-            f"{item.offset:g}", f"{item.noise:g}",
-        )  # fmt: skip
-    console.print(table)
+    described = describe(TerrainDataset(find_dataset(file)))
+    if json:
+        print(dumps(described, indent=1))
+        return
+    console = Console(highlight=False)
+    for item in tables(described):
+        console.print(item, soft_wrap=isinstance(item, str))
 
 
 def validate(file: str) -> int:
@@ -117,6 +118,51 @@ def validate(file: str) -> int:
         print(fault)
     print(f"{path}: {len(faults)} fault(s)" if faults else f"{path}: sound")
     return 1 if faults else 0
+
+
+def repair(file: str) -> None:
+    """Make the damaged maps of a dataset anew, and only those.
+
+    Args:
+        file: Path or id of a dataset.
+    """
+    from benchnav.command import show_progress
+    from benchnav.datagen.repair import maps_to_make
+    from benchnav.datagen.repair import repair as repair_dataset
+    from benchnav.datagen.store import TerrainDataset, find_dataset
+    from benchnav.datagen.validate import find_faults
+
+    path = find_dataset(file)
+    faults = find_faults(path)
+    if not faults:
+        print(f"{path}: sound, nothing to repair")
+        return
+    dataset = TerrainDataset(path)
+    chosen = maps_to_make(dataset, faults)
+    show_progress(repair_dataset(dataset, chosen), "maps")
+    for split, indices in chosen.items():
+        if len(indices):
+            print(f"  {split}: made anew {len(indices)} map(s): {', '.join(map(str, indices))}")
+    _report(TerrainDataset(path))
+
+
+def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> None:
+    """Combine datasets of the same grid and classes to one; splits of one name are joined.
+
+    Args:
+        files: Paths or ids of two or more datasets.
+        out: File to write.
+        id: Id of the new dataset; the name of the file when not given.
+        overwrite: Replace a file that is there.
+    """
+    from benchnav.command import show_progress
+    from benchnav.datagen.merge import merge as merge_datasets
+    from benchnav.datagen.store import TerrainDataset, find_dataset
+
+    path = Path(out)
+    sources = [find_dataset(file) for file in files]
+    show_progress(merge_datasets(sources, path, id or path.stem, overwrite), "maps")
+    _report(TerrainDataset(path))
 
 
 def preview(file: str, split: str = "test/std", maps: list[int] | None = None, out: str = "") -> None:
@@ -146,13 +192,23 @@ def preview(file: str, split: str = "test/std", maps: list[int] | None = None, o
     print(f"wrote {path}")
 
 
+def _report(dataset: "TerrainDataset") -> None:
+    print(f"wrote {dataset.path} ({dataset.path.stat().st_size / 1e6:.1f} MB)")
+    for name, split in dataset.splits.items():
+        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
+
+
 def main() -> None:
     """Entry point of `benchnav-datagen`."""
     commands = {
-        "create": Command(create, ("recipe",)),
+        "create": Command(create, ("recipe", "overrides")),
         "list": Command(list_datasets),
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
+        "repair": Command(repair, ("file",)),
+        "merge": Command(merge, ("files",)),
         "preview": Command(preview, ("file",)),
     }
-    sys.exit(run("benchnav-datagen", "Make, list, show, check and draw terrain datasets.", commands))
+    sys.exit(
+        run("benchnav-datagen", "Make, list, show, check, mend, combine and draw terrain datasets.", commands)
+    )

@@ -4,10 +4,7 @@ Elevation is quantised first; slope, shading and λ are derived from what is sto
 float64. Letters in shapes: B maps, H×W cells.
 """
 
-from collections.abc import Callable
-
 import numpy as np
-import torch
 
 from benchnav import gridgraph, rng
 from benchnav.datagen import appearance, elevation, latent
@@ -15,9 +12,9 @@ from benchnav.datagen.noise import fractal_perlin
 from benchnav.datagen.scenario import Recipe, Scenario
 from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
 
 MOST_ATTEMPTS = 200
+_PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache
 
 Maps = dict[str, np.ndarray]
 
@@ -37,10 +34,21 @@ def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
         ConfigError: a split asks for solvable maps and the recipe yields none for some index.
     """
     indices = np.asarray(indices, dtype=np.int64)
+    pieces = [
+        _generate_piece(recipe, split, indices[i : i + _PIECE])
+        for i in range(0, max(len(indices), 1), _PIECE)
+    ]
+    return {
+        name: np.concatenate([piece[name] for piece in pieces]).astype(field.dtype, copy=False)
+        for name, field in FIELDS.items()
+    }
+
+
+def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
     if not recipe.splits[split].solvable:
         maps = _attempt(recipe, split, indices, 0)
         maps["reference_time_s"] = np.full(len(indices), np.nan)
-        return _cast(maps)
+        return maps
     pending = np.arange(len(indices))
     maps = {}
     for attempt in range(MOST_ATTEMPTS):
@@ -50,19 +58,11 @@ def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
             maps.setdefault(name, np.empty((len(indices), *values.shape[1:]), values.dtype))[pending] = values
         pending = pending[~np.isfinite(drawn["reference_time_s"])]
         if len(pending) == 0:
-            return _cast(maps)
+            return maps
     raise ConfigError(
         f"Expected split {split!r} to have maps whose goal can be reached; {MOST_ATTEMPTS} draws gave none "
         f"for map {int(indices[pending[0]])}. Ease its scenario or lower `stuck_threshold`."
     )
-
-
-def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """E[λ] of the clipped Gaussian N(mean, std), shape of `mean`, [B, H, W]."""
-    means, stds = (
-        torch.from_numpy(np.ascontiguousarray(a, dtype=np.float64)).unsqueeze(1) for a in (mean, std)
-    )
-    return TraversabilityMixture(torch.ones_like(means), means, stds).mean().numpy()
 
 
 def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
@@ -74,7 +74,7 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
         Seconds, infinite where no free path joins start and goal, shape [B].
     """
     mean = latent.latent_mean(maps["class_id"], maps["slope_deg"], recipe.classes)
-    expected = expected_traversability(mean, latent.latent_std(maps["class_id"], recipe.classes))
+    expected = latent.expected_traversability(mean, latent.latent_std(maps["class_id"], recipe.classes))
     costs = gridgraph.travel_time_costs(expected, expected > recipe.stuck_threshold, recipe.resolution_m)
     (start_column, start_row), (goal_column, goal_row) = (
         (int(value / recipe.resolution_m) for value in position)
@@ -86,57 +86,98 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     return cost[:, start_row, start_column]
 
 
-def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
-    scenario = recipe.scenarios[recipe.splits[split].scenario]
-    shape = recipe.grid.shape
+def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0) -> np.ndarray:
+    """Lays out the classes of each map's environment, `environment_of(recipe, indices)`.
+
+    Returns:
+        Class indices, shape [B, H, W].
+    """
+    periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
+    noise = fractal_perlin(recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods)
+    # Which class takes which band differs from map to map, so no two classes are neighbours always.
+    order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
+    order = rng.permutation(order_key, indices, len(recipe.occupancy))
+    table = np.stack([recipe.environment_classes(e) for e in range(recipe.environments)])
+    shown = np.take_along_axis(table[environment_of(recipe, indices)], order, axis=1)
+    bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
+    return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(bands.shape)
+
+
+def environment_of(recipe: Recipe, indices: np.ndarray) -> np.ndarray:
+    """The environment that each map shows: they take turns. Shape of `indices`."""
+    return indices % recipe.environments
+
+
+def complete(
+    recipe: Recipe,
+    scenario: Scenario,
+    split: str,
+    indices: np.ndarray,
+    class_id: np.ndarray,
+    elevation_m: np.ndarray,
+    attempt: int = 0,
+) -> Maps:
+    """Derives all else from classes and elevation: slope, colour under a random light, λ.
+
+    Args:
+        recipe: class table, seed, start and goal.
+        scenario: its light.
+        split: name of the maps' split, for their random streams.
+        indices: which maps of the split, shape [B].
+        class_id: shape [B, H, W].
+        elevation_m: shape [B, H, W]; it is quantised first, and everything follows what is stored.
+        attempt: how many draws of these maps were rejected before.
+
+    Returns:
+        The fields of `schema.FIELDS` but `reference_time_s`.
+    """
 
     def key(purpose: str) -> int:
         return rng.stream_key(recipe.seed, split, purpose, attempt)
 
-    environment = indices % recipe.environments
-    class_id = _class_map(recipe, (split, "class", attempt), key("class order"), indices, environment)
-    height = quantise(_elevation(recipe, scenario, key, indices), 13)
-    slope = quantise(elevation.slope_deg(height, recipe.resolution_m), 10)
+    height = quantise(elevation_m, 13)
+    gradient = elevation.horn_gradient(height, recipe.resolution_m)
+    slope = quantise(elevation.inclination_deg(*gradient), 10)
     mean = latent.latent_mean(class_id, slope, recipe.classes)
-    noise = latent.latent_std(class_id, recipe.classes) * rng.normal(key("traversability"), indices, shape)
+    noise = rng.normal(key("traversability"), indices, recipe.grid.shape)
+    noise *= latent.latent_std(class_id, recipe.classes)
     direction = rng.uniform(key("light"), indices, (2,))
     light = appearance.light_direction(
         2 * np.pi * direction[:, 0], _within(scenario.light_height, direction[:, 1])
     )
-    brightness = appearance.shade(height, recipe.resolution_m, light, scenario.ambient)
+    brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     return {
         "rgb": appearance.paint(class_id, colours, brightness),
         "class_id": class_id,
         "elevation_m": height,
         "slope_deg": slope,
-        "traversability": quantise(np.clip(mean + noise, 0, 1), 16),
-        "environment": environment,
+        "traversability": quantise(np.minimum(np.maximum(mean + noise, 0), 1), 16),
+        "environment": environment_of(recipe, indices),
         "start_m": np.tile(np.asarray(recipe.start_m, np.float64), (len(indices), 1)),
         "goal_m": np.tile(np.asarray(recipe.goal_m, np.float64), (len(indices), 1)),
     }
 
 
-def _class_map(
-    recipe: Recipe, names: tuple[rng.Name, ...], order_key: int, indices: np.ndarray, environment: np.ndarray
-) -> np.ndarray:
-    periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
-    noise = fractal_perlin(recipe.seed, names, indices, recipe.grid.shape, periods)
-    # Which class takes which band differs from map to map, so no two classes are neighbours always.
-    order = rng.permutation(order_key, indices, len(recipe.occupancy))
-    table = np.stack([recipe.environment_classes(e) for e in range(recipe.environments)])
-    shown = np.take_along_axis(table[environment], order, axis=1)
-    bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
-    return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(bands.shape)
+def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
+    scenario = recipe.scenarios[recipe.splits[split].scenario]
+    class_id = class_map(recipe, split, indices, attempt)
+    height = _elevation(recipe, scenario, split, indices, attempt)
+    return complete(recipe, scenario, split, indices, class_id, height, attempt)
 
 
 def _elevation(
-    recipe: Recipe, scenario: Scenario, key: Callable[[str], int], indices: np.ndarray
+    recipe: Recipe, scenario: Scenario, split: str, indices: np.ndarray, attempt: int
 ) -> np.ndarray:
+    def key(purpose: str) -> int:
+        return rng.stream_key(recipe.seed, split, purpose, attempt)
+
     draws = rng.uniform(key("relief"), indices, (2,))
     ground = elevation.fractal(key("elevation"), indices, recipe.grid.shape, scenario.roughness)
-    ground = ground * _within(scenario.relief_m, draws[:, 0])[:, None, None]
+    ground *= _within(scenario.relief_m, draws[:, 0])[:, None, None]
     low, high = (round(value) for value in scenario.crater_count)
+    if high == 0:
+        return ground
     count = low + np.floor((high - low + 1) * draws[:, 1])
     centres, radii = elevation.place_craters(
         key("craters"), indices, recipe.grid.extent_m, count, scenario.crater_radius_m, high
@@ -148,7 +189,3 @@ def _elevation(
 
 def _within(limits: tuple[float, float], share: np.ndarray) -> np.ndarray:
     return limits[0] + (limits[1] - limits[0]) * share
-
-
-def _cast(maps: Maps) -> Maps:
-    return {name: maps[name].astype(field.dtype) for name, field in FIELDS.items()}

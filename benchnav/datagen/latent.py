@@ -7,6 +7,7 @@ with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr
 
 from benchnav.errors import ConfigError
 
@@ -48,10 +49,22 @@ def latent_mean(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[Terr
     scale, exponent, offset = (
         np.array([getattr(c, name) for c in classes]) for name in ("scale", "exponent", "offset")
     )
-    loss = scale[class_id] * 1e-3 * slope_deg ** exponent[class_id] + offset[class_id]
-    return np.clip(1 - loss, 0, 1)
+    loss = slope_deg ** np.take(exponent, class_id)
+    loss *= np.take(scale * 1e-3, class_id)
+    loss += np.take(offset, class_id)
+    return np.minimum(np.maximum(1 - loss, 0), 1)
 
 
 def latent_std(class_id: np.ndarray, classes: tuple[TerrainClass, ...]) -> np.ndarray:
     """σ_c of each cell, shape of `class_id`."""
-    return np.array([c.noise for c in classes])[class_id]
+    return np.take(np.array([c.noise for c in classes]), class_id)
+
+
+def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """E[λ] of the clipped Gaussian N(mean, std), shape of `mean`.
+
+    The integral of 1 − Φ from 0 to 1; `TraversabilityMixture.mean` says the same for mixtures of tensors.
+    """
+    below = (np.array([[1.0], [0.0]]) - mean.ravel()) / std.ravel()
+    integral = below * ndtr(below) + np.exp(-0.5 * below * below) / np.sqrt(2 * np.pi)
+    return 1 - std * (integral[0] - integral[1]).reshape(mean.shape)

@@ -23,26 +23,33 @@ def perlin(key: int, indices: np.ndarray, shape: tuple[int, int], period: float)
         Noise in about [−0.7, 0.7], float64, shape [B, H, W].
     """
     height, width = shape
-    rows, columns = (np.arange(n) + 0.5 for n in shape)
     lattice = (int(np.ceil(height / period)) + 2, int(np.ceil(width / period)) + 2)
     draws = rng.uniform(key, indices, (lattice[0] * lattice[1] + 2,))
     angle = 2 * np.pi * draws[:, 2:].reshape(-1, *lattice)
-    gradient_y, gradient_x = np.sin(angle), np.cos(angle)
     # A random phase, so that the lattice does not stand at the same place in every map.
-    y = rows[None, :, None] / period + draws[:, 0, None, None]
-    x = columns[None, None, :] / period + draws[:, 1, None, None]
-    row, column = y.astype(np.int64), x.astype(np.int64)
-    dy, dx = y - row, x - column
-    batch = np.arange(len(draws))[:, None, None]
+    rows = (np.arange(height) + 0.5) / period + draws[:, 0, None]
+    columns = (np.arange(width) + 0.5) / period + draws[:, 1, None]
+    # Σ over a cell's four corners of fade_y·fade_x·(g_y·Δy + g_x·Δx) is separable: the weights of
+    # rows and of columns are matrices around the lattice's gradients.
+    weight_y, offset_y = _corner_weights(rows, lattice[0])
+    weight_x, offset_x = (np.swapaxes(w, 1, 2) for w in _corner_weights(columns, lattice[1]))
+    return offset_y @ (np.sin(angle) @ weight_x) + weight_y @ (np.cos(angle) @ offset_x)
 
-    def corner(step_y: int, step_x: int) -> np.ndarray:
-        at = (batch, row + step_y, column + step_x)
-        return gradient_y[at] * (dy - step_y) + gradient_x[at] * (dx - step_x)
 
-    fade_y, fade_x = _fade(dy), _fade(dx)
-    top = corner(0, 0) + fade_x * (corner(0, 1) - corner(0, 0))
-    bottom = corner(1, 0) + fade_x * (corner(1, 1) - corner(1, 0))
-    return top + fade_y * (bottom - top)
+def _corner_weights(position: np.ndarray, lattice: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fade weights of the lattice points next to each position, alone and times the signed distance.
+
+    Args:
+        position: in lattice spacings, shape [B, N].
+        lattice: lattice points L.
+
+    Returns:
+        Two arrays of shape [B, N, L], zero but at the two neighbours of each position.
+    """
+    distance = position[..., None] - np.arange(lattice)
+    fade = np.maximum(1 - np.abs(distance), 0)
+    weight = fade * fade * fade * (fade * (6 * fade - 15) + 10)
+    return weight, weight * distance
 
 
 def fractal_perlin(
@@ -62,7 +69,3 @@ def fractal_perlin(
         for octave, period in enumerate(periods)
     ]
     return sum(octaves[1:], octaves[0]) / sum(periods)
-
-
-def _fade(t: np.ndarray) -> np.ndarray:
-    return t * t * t * (t * (6 * t - 15) + 10)

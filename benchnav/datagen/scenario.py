@@ -7,6 +7,7 @@ beyond.
 """
 
 import re
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from benchnav.errors import ConfigError
 from benchnav.terrain import Grid
 
 RECIPES = Path(__file__).parent / "recipes"
+_MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
 PRESETS = RECIPES / "presets.yaml"
 
 Range = tuple[float, float]
@@ -65,6 +67,14 @@ class Scenario:
                 raise ConfigError(
                     f"Expected scenario `{name}` finite, ordered and within [{least:g}, {most:g}], got {value}."
                 )
+
+    @property
+    def mean_crater_area_m2(self) -> float:
+        """Mean area inside a rim; radii are uniform in their logarithm."""
+        low, high = self.crater_radius_m
+        if low == high:
+            return float(np.pi * low**2)
+        return float(np.pi * (high**2 - low**2) / (2 * np.log(high / low)))
 
 
 def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
@@ -155,6 +165,12 @@ class Recipe:
                     f"Expected `crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
                     f"got {scenario.crater_radius_m}."
                 )
+            covered = scenario.crater_count[1] * scenario.mean_crater_area_m2 / (extent_x * extent_y)
+            if covered > _MOST_CRATERED:
+                raise ConfigError(
+                    f"Expected the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} of a map, "
+                    f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` or `crater_radius_m`."
+                )
         if not np.isclose(sum(self.occupancy), 1, atol=1e-6) or not all(
             0 < share <= 1 for share in self.occupancy
         ):
@@ -210,11 +226,16 @@ class Recipe:
         return _plain(asdict(self))
 
 
-def load_recipe(source: str | Path) -> Recipe:
+def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     """Reads a recipe by shipped id or by path of a YAML file.
 
+    Args:
+        source: id or path.
+        overrides: changes such as `splits.train.maps=50` or `scenarios.hs.severity=0.5`, the value
+            in YAML. What differs needs a name of its own, so `id=NAME` has to be among them.
+
     Raises:
-        ConfigError: there is no such recipe, or it is not one.
+        ConfigError: there is no such recipe, or it is not one; or other maps would bear its id.
     """
     path = RECIPES / f"{source}.yaml"
     if not path.exists():
@@ -228,7 +249,46 @@ def load_recipe(source: str | Path) -> Recipe:
         data = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         raise ConfigError(f"Expected YAML in {path}, got: {' '.join(str(error).split())}") from error
-    return recipe_from_dict(data, str(path))
+    changed = override(data, overrides) if overrides else data
+    recipe = recipe_from_dict(changed, str(source))
+    if overrides and recipe.id == data.get("id"):
+        raise ConfigError(
+            f"Expected `id=NAME` among the overrides, since {recipe.id!r} names the maps of the recipe as it is."
+        )
+    if path.parent != RECIPES and recipe.id in shipped_recipes() and recipe != load_recipe(recipe.id):
+        raise ConfigError(
+            f"Expected an `id` of its own in {path}, got {recipe.id!r}, which names other maps: "
+            "a recipe shipped with the package."
+        )
+    return recipe
+
+
+def override(data: Any, overrides: Sequence[str]) -> Any:
+    """Sets values in a recipe's plain data.
+
+    Args:
+        data: a mapping as in a recipe file.
+        overrides: `key.key=value` each, the value in YAML.
+
+    Raises:
+        ConfigError: one is not of that form, or leads through what is no mapping.
+    """
+    changed = deepcopy(data)
+    for text in overrides:
+        name, equals, value = text.partition("=")
+        if not equals or not all(name.split(".")):
+            raise ConfigError(f"Expected an override such as splits.train.maps=50, got {text!r}.")
+        *parents, last = name.split(".")
+        place = changed
+        for parent in parents:
+            place = place.get(parent) if isinstance(place, dict) else None
+        if not isinstance(place, dict):
+            raise ConfigError(f"Expected an override of something in the recipe, got {text!r}.")
+        try:
+            place[last] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"Expected YAML after '=' in override {text!r}.") from error
+    return changed
 
 
 def shipped_recipes() -> list[str]:

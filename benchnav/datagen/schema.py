@@ -1,11 +1,12 @@
-"""Dataset format 1.0: fields, manifest and content digest.
+"""Dataset format 1.0: fields, manifest and content digests; `docs/format.md` describes it for readers.
 
-One HDF5 file is one dataset. Groups are splits; each holds the fields of `FIELDS`. The manifest is
-a JSON text in the dataset `manifest`. A digest covers a split's logical arrays, not the file's
-bytes, so it is the same whatever compression, machine or number of workers wrote the file.
+One HDF5 file is one dataset. Groups are splits; each holds the fields of `FIELDS` and the SHA-256 of
+every entry. The manifest is a JSON text in the dataset `manifest`. Digests cover logical arrays, not
+the file's bytes, so they are the same whatever compression, machine or number of workers wrote it.
 """
 
 import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,8 @@ import numpy as np
 FORMAT = "benchnav-dataset"
 FORMAT_VERSION = (1, 0)
 MANIFEST = "manifest"
+ENTRY_DIGESTS = "entry_digests"
+DIGEST_BYTES = 32
 
 
 @dataclass(frozen=True)
@@ -58,39 +61,74 @@ FIELDS: dict[str, Field] = {
 }
 
 
+MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
+
+
 def quantise(values: np.ndarray, bits: int) -> np.ndarray:
     """Rounds to multiples of 2^−bits, so that the last bits of a machine's arithmetic do not show."""
-    return np.round(values * 2.0**bits) / 2.0**bits
+    steps = values * 2.0**bits
+    np.rint(steps, out=steps)
+    steps *= 2.0**-bits
+    return steps
+
+
+def entry_digests(maps: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
+
+    Args:
+        maps: every field of `FIELDS`, each of shape [B, *entry shape].
+
+    Returns:
+        uint8, shape [B, F, 32], the F fields in the order of `FIELDS`.
+    """
+    columns = []
+    for name, field in FIELDS.items():
+        entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
+        columns.append([hashlib.sha256(entry.tobytes()).digest() for entry in entries])
+    digests = np.frombuffer(b"".join(b"".join(row) for row in zip(*columns, strict=True)), np.uint8)
+    return digests.reshape(-1, len(FIELDS), DIGEST_BYTES)
 
 
 class SplitDigest:
-    """SHA-256 over the fields of a split, fed a block of maps at a time in order.
+    """The digest of a split: SHA-256 over its field table and its entries' digests, map by map."""
 
-    Each field has a running hash of its little-endian bytes; the digest is the hash of the fields'
-    names, dtypes, shapes and hashes. So it does not depend on how maps are cut into blocks.
-    """
+    def __init__(self, maps: int, height: int, width: int) -> None:
+        """Starts the digest of a split of `maps` maps of height × width cells."""
+        shapes = {name: [maps, *field.entry_shape(height, width)] for name, field in FIELDS.items()}
+        table = [[name, field.dtype, shapes[name]] for name, field in FIELDS.items()]
+        self._hash = hashlib.sha256(json.dumps(table, separators=(",", ":")).encode())
 
-    def __init__(self) -> None:
-        """Starts with no maps."""
-        self._hashes = {name: hashlib.sha256() for name in FIELDS}
-        self._shapes: dict[str, list[int]] = {name: [] for name in FIELDS}
-        self._maps = 0
-
-    def update(self, block: Mapping[str, np.ndarray]) -> None:
-        """Adds a block of maps, each field of shape [B, *entry shape]."""
-        for name, field in FIELDS.items():
-            array = np.ascontiguousarray(block[name], dtype=field.dtype)
-            self._hashes[name].update(array.tobytes())
-            self._shapes[name] = list(array.shape[1:])
-        self._maps += len(block["rgb"])
+    def update(self, digests: np.ndarray) -> None:
+        """Adds the next maps' `entry_digests`, shape [B, F, 32]."""
+        self._hash.update(digests.tobytes())
 
     def hexdigest(self) -> str:
-        """The digest of all maps so far."""
-        whole = hashlib.sha256()
-        for name, field in FIELDS.items():
-            whole.update(f"{name} {field.dtype} {[self._maps, *self._shapes[name]]} ".encode())
-            whole.update(self._hashes[name].digest())
-        return whole.hexdigest()
+        """The digest of the maps so far."""
+        return self._hash.hexdigest()
+
+
+def seal(manifest: Mapping[str, Any]) -> str:
+    """Writes a manifest as JSON text that holds its own SHA-256, under `manifest_digest`."""
+    return json.dumps({**manifest, "manifest_digest": _text_digest(manifest)}, indent=1)
+
+
+def unseal(text: str | bytes) -> dict[str, Any]:
+    """Reads a manifest's text.
+
+    Raises:
+        ValueError: it is no JSON object, or not what was written.
+    """
+    manifest = json.loads(text)
+    if not isinstance(manifest, dict):
+        raise ValueError("it is not a JSON object")
+    if manifest.pop("manifest_digest", None) != _text_digest(manifest):
+        raise ValueError("its text does not match its digest")
+    return manifest
+
+
+def _text_digest(manifest: Mapping[str, Any]) -> str:
+    text = json.dumps(manifest, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def field_table(height: int, width: int) -> dict[str, Any]:

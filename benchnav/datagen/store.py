@@ -1,78 +1,26 @@
-"""Writing and reading datasets of format 1.0 (HDF5).
+"""Reading datasets of format 1.0 (HDF5).
 
-A dataset is made in blocks of maps kept beside the target in `.NAME.partial`; a killed run goes on
-from the blocks it finished. The target's name never holds a partial file. Readers open the file at
-each call, so they may be passed to other processes.
+Readers open the file at each call, so they may be passed to other processes.
 """
 
 import json
-import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import h5py
-import joblib
 import numpy as np
 import torch
 
-import benchnav
 from benchnav.datagen import latent, schema
-from benchnav.datagen.generate import Maps, generate
+from benchnav.datagen.generate import Maps
 from benchnav.datagen.scenario import Recipe, recipe_from_dict
 from benchnav.errors import DatasetError
-from benchnav.files import replacing, sole_writer, write_text
 from benchnav.terrain import Grid, Terrain
 
-BLOCK_MAPS = 100
-
-_MAP_FIELDS = tuple(name for name, field in schema.FIELDS.items() if "H" in field.shape)
-
-
-def create(
-    recipe: Recipe, path: Path, jobs: int = 1, block_maps: int = BLOCK_MAPS, overwrite: bool = False
-) -> Iterator[tuple[int, int]]:
-    """Makes a dataset, yielding (maps done, maps in all) as it goes; to be iterated to the end.
-
-    Args:
-        recipe: what to make.
-        path: file to write.
-        jobs: worker processes.
-        block_maps: maps a unit of work; changes nothing in the result.
-        overwrite: replace a file that is there.
-
-    Raises:
-        DatasetError: the file exists, another run is writing it, or it cannot be written.
-        ConfigError: the recipe cannot be met.
-    """
-    if path.exists() and not overwrite:
-        raise DatasetError(
-            f"Expected `out` to be a new file, but {path} exists. Pass --overwrite true to replace it."
-        )
-    blocks = [
-        (split, start, min(start + block_maps, spec.maps))
-        for split, spec in recipe.splits.items()
-        for start in range(0, spec.maps, block_maps)
-    ]
-    total = sum(stop - start for _, start, stop in blocks)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _workspace(path, _made_of(recipe, block_maps)) as folder:
-            missing = [block for block in blocks if not _block_path(folder, *block).exists()]
-            done = total - sum(stop - start for _, start, stop in missing)
-            workers = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")
-            for made in workers(joblib.delayed(_make_block)(recipe, folder, *block) for block in missing):
-                done += made
-                yield done, total
-            with replacing(path) as partial:
-                _assemble(recipe, folder, blocks, partial)
-            shutil.rmtree(folder, ignore_errors=True)
-    except OSError as error:
-        raise DatasetError(
-            f"Could not write {path}: {error.strerror or error}. Nothing was left under its name."
-        ) from error
+# What HDF5 and h5py raise where a file is damaged, by where the damage lies.
+READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, MemoryError)
 
 
 class TerrainDataset:
@@ -93,31 +41,8 @@ class TerrainDataset:
                 f"Expected a dataset file, got {self.path}, which is not there. "
                 "Make one with `benchnav-datagen create`."
             )
-        with self._open() as file:
-            if schema.MANIFEST not in file:
-                raise DatasetError(
-                    f"Expected a {schema.FORMAT} file with a manifest, got {self.path} without one."
-                )
-            try:
-                self.manifest: dict[str, Any] = json.loads(file[schema.MANIFEST][()])
-                kind = self.manifest["format"]
-                major, minor = (int(part) for part in self.manifest["format_version"].split("."))
-                missing = {"id", "seed", "generator", "recipe", "splits"} - set(self.manifest)
-            except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-                raise DatasetError(
-                    f"The manifest of {self.path} is damaged: {error!r}. Make the file again."
-                ) from error
-        if kind != schema.FORMAT:
-            raise DatasetError(f"Expected format {schema.FORMAT!r} in {self.path}, got {kind!r}.")
-        if (major, minor) > schema.FORMAT_VERSION:
-            raise DatasetError(
-                f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {self.path}, "
-                f"got {major}.{minor}. Read it with a newer benchnav: pip install --upgrade benchnav."
-            )
-        if missing:
-            raise DatasetError(
-                f"The manifest of {self.path} lacks {', '.join(sorted(missing))}. Make the file again."
-            )
+        with self.open() as file:
+            self.manifest: dict[str, Any] = self._read_manifest(file)
 
     @property
     def id(self) -> str:
@@ -126,13 +51,13 @@ class TerrainDataset:
 
     @property
     def splits(self) -> dict[str, Any]:
-        """Splits by name, each with `maps`, `scenario` and `digest`."""
+        """Splits by name, each with `maps`, `scenario`, `digest` and `parts`."""
         return self.manifest["splits"]
 
     @cached_property
     def recipe(self) -> Recipe:
-        """The recipe that the file was made by."""
-        return recipe_from_dict(self.manifest["recipe"], f"in {self.path}")
+        """The recipe that the file was made by; of the first part where it was made from several."""
+        return recipe_from_dict(self.manifest["recipes"][0], f"in {self.path}")
 
     @property
     def grid(self) -> Grid:
@@ -160,11 +85,7 @@ class TerrainDataset:
         Raises:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
-        if split not in self.splits:
-            raise DatasetError(
-                f"Expected a split of {self.path}, one of {sorted(self.splits)}, got {split!r}."
-            )
-        size = self.splits[split]["maps"]
+        size = self.map_count(split)
         if indices is not None and len(indices) and not (min(indices) >= 0 and max(indices) < size):
             raise DatasetError(
                 f"Expected map indices in 0–{size - 1} of split {split!r}, got {list(indices)}."
@@ -173,21 +94,18 @@ class TerrainDataset:
         chosen, order = (
             (slice(None), slice(None)) if indices is None else np.unique(indices, return_inverse=True)
         )
-        with self._open() as file:
+        with self.open() as file:
             arrays = {}
             for name in fields or schema.FIELDS:
                 try:
                     arrays[name] = file[split][name][chosen][order]
-                except (KeyError, OSError) as error:
-                    raise DatasetError(
-                        f"Field {name!r} of split {split!r} in {self.path} is damaged: {error}. "
-                        "Run `benchnav-datagen validate` on the file."
-                    ) from error
+                except READ_ERRORS as error:
+                    raise self.damage(split, name, error) from error
         return arrays
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> Terrain:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
-        maps = self.read(split, indices, _MAP_FIELDS)
+        maps = self.read(split, indices, schema.MAP_FIELDS)
         classes = self.recipe.classes
         mean = latent.latent_mean(maps["class_id"], maps["slope_deg"].astype(np.float64), classes)
         std = latent.latent_std(maps["class_id"], classes)
@@ -202,94 +120,79 @@ class TerrainDataset:
             grid=self.grid,
         )
 
-    def _open(self) -> h5py.File:
+    def map_count(self, split: str) -> int:
+        """Number of maps of a split.
+
+        Raises:
+            DatasetError: there is no such split.
+        """
+        if split not in self.splits:
+            raise DatasetError(
+                f"Expected a split of {self.path}, one of {sorted(self.splits)}, got {split!r}."
+            )
+        return self.splits[split]["maps"]
+
+    def open(self) -> h5py.File:
+        """Opens the file for reading.
+
+        Raises:
+            DatasetError: it is no HDF5 file, or its structure is damaged.
+        """
         try:
             return h5py.File(self.path, "r")
         except OSError as error:
             raise DatasetError(f"{self.path} is no readable HDF5 file: {error}. Make it again.") from error
 
+    def damage(self, split: str, field: str, error: Exception) -> DatasetError:
+        """Says that a field cannot be read, and what to do."""
+        return DatasetError(
+            f"Field {field!r} of split {split!r} in {self.path} is damaged: {error}. Run `benchnav-datagen "
+            "validate` on the file, and `benchnav-datagen repair` to make its damaged maps anew."
+        )
+
+    def _read_manifest(self, file: h5py.File) -> dict[str, Any]:
+        try:
+            if schema.MANIFEST not in file:
+                raise DatasetError(
+                    f"Expected a {schema.FORMAT} file with a manifest, got {self.path} without one."
+                )
+            text = file[schema.MANIFEST][()]
+            manifest = json.loads(text)
+            kind, version = manifest["format"], manifest["format_version"]
+            major, minor = (int(part) for part in version.split("."))
+            if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
+                return schema.unseal(text)
+        except READ_ERRORS as error:
+            raise DatasetError(
+                f"The manifest of {self.path} is damaged: {error!r}. Make the file again."
+            ) from error
+        if kind != schema.FORMAT:
+            raise DatasetError(f"Expected format {schema.FORMAT!r} in {self.path}, got {kind!r}.")
+        raise DatasetError(
+            f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {self.path}, "
+            f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+        )
+
+
+def dataset_folders() -> list[Path]:
+    """Where datasets are looked for by id: `datasets/` here and in this checkout."""
+    here, shipped = Path("datasets"), Path(__file__).parents[2] / "datasets"
+    return [here] if here.resolve() == shipped.resolve() else [here, shipped]
+
 
 def find_dataset(source: str | Path) -> Path:
-    """Finds a dataset by path, or by id among `datasets/` here and in this checkout.
+    """Finds a dataset by path, or by id in `dataset_folders`.
 
     Raises:
         DatasetError: neither is there.
     """
     if Path(source).is_file():
         return Path(source)
-    folders = [Path("datasets"), Path(__file__).parents[2] / "datasets"]
-    for folder in folders:
+    for folder in dataset_folders():
         for name in (f"{source}.h5", f"{source}-test.h5"):
             if (folder / name).is_file():
                 return folder / name
     raise DatasetError(
         f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
-        f"{' or '.join(map(str, folders))}. Make one with `benchnav-datagen create`."
+        f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."
     )
-
-
-def _made_of(recipe: Recipe, block_maps: int) -> dict[str, Any]:
-    return {"recipe": recipe.to_dict(), "block_maps": block_maps, "version": benchnav.__version__}
-
-
-def _make_block(recipe: Recipe, folder: Path, split: str, start: int, stop: int) -> int:
-    maps = generate(recipe, split, np.arange(start, stop))
-    with replacing(_block_path(folder, split, start, stop)) as partial, open(partial, "wb") as file:
-        np.savez(file, **maps)  # type: ignore[arg-type]
-    return stop - start
-
-
-def _block_path(folder: Path, split: str, start: int, stop: int) -> Path:
-    return folder / f"{split.replace('/', '+')}-{start:07d}-{stop:07d}.npz"
-
-
-@contextmanager
-def _workspace(path: Path, made_of: dict[str, Any]) -> Iterator[Path]:
-    """Holds the folder of finished blocks, one run at a time; blocks of another recipe are dropped."""
-    folder = path.parent / f".{path.name}.partial"
-    folder.mkdir(exist_ok=True)
-    with sole_writer(folder, str(path)):
-        stamp, text = folder / "made_of.json", json.dumps(made_of, sort_keys=True)
-        if not stamp.exists() or stamp.read_text() != text:
-            for block in folder.glob("*.npz"):
-                block.unlink()
-            write_text(stamp, text)
-        yield folder
-
-
-def _assemble(recipe: Recipe, folder: Path, blocks: list[tuple[str, int, int]], target: Path) -> None:
-    grid = recipe.grid
-    digests = {split: schema.SplitDigest() for split in recipe.splits}
-    with h5py.File(target, "w", libver=("earliest", "v110")) as file:
-        for split, start, stop in blocks:
-            group = file.require_group(split)
-            with np.load(_block_path(folder, split, start, stop)) as block:
-                maps = {name: block[name] for name in schema.FIELDS}
-            digests[split].update(maps)
-            for name, field in schema.FIELDS.items():
-                if name not in group:
-                    _new_array(group, name, field, recipe.splits[split].maps, grid)
-                group[name][start:stop] = maps[name]
-        manifest = {
-            "format": schema.FORMAT,
-            "format_version": ".".join(map(str, schema.FORMAT_VERSION)),
-            "id": recipe.id,
-            "seed": recipe.seed,
-            "generator": {"package": "benchnav", "version": benchnav.__version__},
-            "fields": schema.field_table(*grid.shape),
-            "splits": {
-                name: {"scenario": split.scenario, "maps": split.maps, "digest": digests[name].hexdigest()}
-                for name, split in recipe.splits.items()
-            },
-            "recipe": recipe.to_dict(),
-        }
-        file[schema.MANIFEST] = json.dumps(manifest, indent=1)
-
-
-def _new_array(group: h5py.Group, name: str, field: schema.Field, maps: int, grid: Grid) -> None:
-    entry = field.entry_shape(*grid.shape)
-    chunk = (1, *entry) if "H" in field.shape else (maps, *entry)
-    array = group.create_dataset(
-        name, (maps, *entry), field.dtype, chunks=chunk, compression="gzip", shuffle=True, fletcher32=True
-    )
-    array.attrs["unit"], array.attrs["meaning"] = field.unit, field.meaning

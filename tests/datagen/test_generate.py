@@ -4,8 +4,8 @@ import networkx
 import numpy as np
 import pytest
 
-from benchnav.datagen.generate import expected_traversability, generate
-from benchnav.datagen.latent import latent_mean, latent_std
+from benchnav.datagen.generate import generate
+from benchnav.datagen.latent import expected_traversability, latent_mean, latent_std
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.schema import FIELDS
 from benchnav.errors import ConfigError

@@ -2,10 +2,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import h5py
 import pytest
 
-from benchnav.datagen import cli as datagen_cli
 from benchnav.eval import cli as eval_cli
 
 SMALL = (
@@ -78,33 +76,6 @@ def test_bad_input_is_one_line_and_status_2(arguments, dataset_path, tmp_path, m
     assert captured.out == ""
     assert len(captured.err.strip().splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_datagen_commands(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.chdir(tmp_path)
-
-    def datagen(*arguments: str) -> int:
-        return call(datagen_cli.main, "benchnav-datagen", arguments, monkeypatch)
-
-    assert datagen("create", "tiny-v1", "--out", "d.h5", "--splits", "[test/std,test/hg]") == 0
-    assert datagen("create", "tiny-v1", "--out", "d.h5") == 2
-    assert datagen("show", "d.h5") == 0
-    assert "scree" in capsys.readouterr().out
-    assert datagen("validate", "d.h5") == 0
-    assert datagen("preview", "d.h5", "--split", "test/hg", "--maps", "[1]", "--out", "p.png") == 0
-    assert (tmp_path / "p.png").stat().st_size > 10_000
-    assert datagen("list", "--folder", ".") == 0
-    assert "tiny-v1" in capsys.readouterr().out
-    with h5py.File("d.h5") as file:
-        chunk = file["test/hg"]["elevation_m"].id.get_chunk_info(0)
-    raw = bytearray((tmp_path / "d.h5").read_bytes())
-    raw[chunk.byte_offset + 9] ^= 255
-    (tmp_path / "bad.h5").write_bytes(raw)
-    assert datagen("validate", "bad.h5") == 1
-    for bad in (("create", "nope"), ("show", "nope"), ("preview", "d.h5", "--maps", "[99]"), ("create",)):
-        capsys.readouterr()
-        assert datagen(*bad) == 2
-        assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("command", ["datagen", "train", "eval"])

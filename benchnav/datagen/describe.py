@@ -1,0 +1,69 @@
+"""What a dataset holds, as plain data and as tables."""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+from rich.table import Table
+
+from benchnav.datagen import schema
+from benchnav.datagen.store import TerrainDataset
+
+
+def describe(dataset: TerrainDataset) -> dict[str, Any]:
+    """Gathers what `show` shows, ready for JSON."""
+    manifest, recipe = dataset.manifest, dataset.recipe
+    with dataset.open() as file:
+        stored = {
+            split: sum(file[split][name].id.get_storage_size() for name in schema.FIELDS)
+            for split in dataset.splits
+        }
+    return {
+        "path": str(dataset.path),
+        "bytes": dataset.path.stat().st_size,
+        "id": dataset.id,
+        "format_version": manifest["format_version"],
+        "generator": manifest["generator"],
+        "grid": asdict(dataset.grid),
+        "environments": recipe.environments,
+        "stuck_threshold": recipe.stuck_threshold,
+        "splits": {name: {**entry, "stored_bytes": stored[name]} for name, entry in dataset.splits.items()},
+        "classes": [asdict(item) for item in recipe.classes],
+        "fields": manifest["fields"],
+        "recipes": manifest["recipes"],
+    }
+
+
+def tables(described: dict[str, Any]) -> Iterator[Table | str]:
+    """Lays out what `describe` gathered, for a terminal."""
+    grid, generator = described["grid"], described["generator"]
+    yield (
+        f"{described['path']}: {described['id']}, format {described['format_version']}, "
+        f"{described['bytes'] / 1e6:.1f} MB, written by {generator['package']} {generator['version']}"
+    )
+    yield (
+        f"maps of {grid['height']} × {grid['width']} cells of {grid['resolution_m']:g} m, "
+        f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
+    )
+    splits = Table("split", "scenario", "maps", "MB", "made from", title="splits")
+    for name, entry in described["splits"].items():
+        origin = ", ".join(_origin(described, part) for part in entry["parts"])
+        splits.add_row(
+            name, entry["scenario"], str(entry["maps"]), f"{entry['stored_bytes'] / 1e6:.1f}", origin
+        )
+    yield splits
+    yield "content digests"
+    yield from (f"  {name:12} {entry['digest']}" for name, entry in described["splits"].items())
+    classes = Table("id", "class", "colour", "a", "b", "o", "σ", title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
+    for number, item in enumerate(described["classes"]):
+        colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
+        numbers = (f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise"))
+        classes.add_row(str(number), item["name"], f"[on {colour}]  [/] {colour}", *numbers)
+    yield classes
+
+
+def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
+    if "recipe" not in part:
+        return f"{part['maps']} of {part['source']['file']}"
+    recipe = described["recipes"][part["recipe"]]
+    return f"{part['maps']} of {recipe['id']} {part['split']}, seed {recipe['seed']}"

@@ -1,0 +1,163 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import pytest
+
+from benchnav.datagen import cli
+from benchnav.datagen.scenario import load_recipe, shipped_recipes
+from benchnav.datagen.store import TerrainDataset
+from benchnav.errors import ConfigError
+
+Call = Callable[..., int]
+
+SMALL = ["id=small", "splits.train.maps=3", "splits.valid.maps=1"]
+RECIPE = (Path(cli.__file__).parent / "recipes" / "tiny-v1.yaml").read_text()
+
+
+@pytest.fixture
+def datagen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call:
+    """Runs the command in an empty folder and gives its exit status."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: str) -> int:
+        monkeypatch.setattr("sys.argv", ["benchnav-datagen", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return ended.value.code or 0  # type: ignore[return-value]
+
+    return call
+
+
+def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "tiny-v1", "--out", "d.h5", "--splits", "[test/std,test/hg]") == 0
+    assert datagen("create", "tiny-v1", "--out", "d.h5") == 2
+    capsys.readouterr()
+    assert datagen("show", "d.h5") == 0
+    shown = capsys.readouterr().out
+    assert "scree" in shown
+    assert TerrainDataset("d.h5").splits["test/hg"]["digest"] in shown
+    assert datagen("show", "d.h5", "--json", "true") == 0
+    described = json.loads(capsys.readouterr().out)
+    assert described["splits"]["test/hg"]["maps"] == 4
+    assert described["classes"][5]["name"] == "scree"
+    assert 0 < described["splits"]["test/hg"]["stored_bytes"] < described["bytes"]
+    assert datagen("validate", "d.h5") == 0
+    assert datagen("preview", "d.h5", "--split", "test/hg", "--maps", "[1]", "--out", "p.png") == 0
+    assert (tmp_path / "p.png").stat().st_size > 5_000
+    assert datagen("list", "--folder", ".") == 0
+    assert "tiny-v1" in capsys.readouterr().out
+    with h5py.File("d.h5") as file:
+        chunk = file["test/hg"]["elevation_m"].id.get_chunk_info(0)
+    whole = Path("d.h5").read_bytes()
+    raw = bytearray(whole)
+    raw[chunk.byte_offset + 9] ^= 255
+    Path("d.h5").write_bytes(raw)
+    capsys.readouterr()
+    assert datagen("validate", "d.h5") == 1
+    assert "test/hg: map 0: field 'elevation_m' is damaged" in capsys.readouterr().out
+    assert datagen("repair", "d.h5") == 0
+    assert "made anew 1 map(s): 0" in capsys.readouterr().out
+    assert datagen("validate", "d.h5") == 0
+
+
+def test_parts_made_apart_are_merged(datagen: Call) -> None:
+    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "a.h5") == 0
+    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[valid]", "--out", "b.h5", "--jobs", "2") == 0
+    assert datagen("merge", "a.h5", "b.h5", "--out", "c.h5") == 0
+    assert TerrainDataset("c.h5").id == "c"
+    assert set(TerrainDataset("c.h5").splits) == {"train", "valid"}
+    assert datagen("merge", "a.h5", "c.h5", "--out", "e.h5") == 2
+
+
+def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:
+    splits = ("--splits", "[train]")
+    assert datagen("create", "tiny-v1", *SMALL, "scenarios.std={preset: hs, severity: 0.5}", *splits) == 0
+    made = TerrainDataset("datasets/small.h5")
+    assert made.splits["train"]["maps"] == 3
+    assert made.recipe.scenarios["std"].light_height == pytest.approx((0.55, 0.9))
+    assert datagen("create", "tiny-v1", *SMALL, "--seed", "4", *splits) == 0
+    sibling = TerrainDataset("datasets/small-seed4.h5")
+    assert sibling.recipe.seed == 4
+    assert sibling.recipe.classes == made.recipe.classes
+    assert sibling.digest != made.digest
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("seed: 0", "seed: 0\ncraters: 3", "craters"),
+        ("occupancy: [0.3, 0.3, 0.2, 0.2]", "occupancy: [0.3, 0.3, 0.2, 0.1]", "summing to 1"),
+        ("crater_count: [1, 2]", "crater_count: [30, 40]", "cover at most 40%"),
+        ("crater_radius_m: [1.5, 3.0]", "crater_radius_m: [1.5, 30.0]", "crater_radius_m"),
+        ("maps: 40", "maps: 0", "`maps` ≥ 1"),
+        ("resolution_m: 0.5", "resolution_m: .nan", "resolution_m"),
+        ("relief_m: [1.0, 1.2]", "relief_m: [1.0, .nan]", "relief_m"),
+        ("occupancy: [0.3", "occupancy: [.nan", "occupancy"),
+        ("start_m: [4, 4]", "start_m: [.nan, 4]", "start_m"),
+        ("stuck_threshold: 0.3", "stuck_threshold: .nan", "stuck_threshold"),
+        ("stuck_threshold: 0.3", "stuck_threshold: 0.999", "goal can be reached"),
+        ("class_periods_m: [6, 3]", "class_periods_m: [.nan, 3]", "class_periods_m"),
+        ("{preset: hs, relief", "{preset: hs, severity: .nan, relief", "severity"),
+        ("height: 32", "height: many", "height"),
+        ("id: mine", "id: my maps", "my maps"),
+        ("environments: 5", "environments: 4", "`id` of its own"),
+        ("scenario: std", "scenario: dusk", "dusk"),
+        ("splits:", "splits: []\nmore:", "splits"),
+        (RECIPE, "[1, 2]", "mapping"),
+        (RECIPE, "a: [", "YAML"),
+    ],
+)
+def test_a_bad_recipe_is_one_clear_line_and_status_2(
+    datagen: Call, capsys, old: str, new: str, said: str
+) -> None:  # type: ignore[no-untyped-def]
+    own = RECIPE if "of its own" in said else RECIPE.replace("id: tiny-v1", "id: mine")
+    text = new if old == RECIPE else own.replace(old, new, 1)
+    assert text != RECIPE
+    Path("r.yaml").write_text(text)
+    assert datagen("create", "r.yaml", "--out", "d.h5") == 2
+    lines = [line for line in capsys.readouterr().err.strip().splitlines() if not line.startswith("maps: ")]
+    assert len(lines) == 1
+    assert said in lines[0]
+    assert not Path("d.h5").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["create"],
+        ["create", "nope"],
+        ["create", "tiny-v1", "splits.train.maps=3"],
+        ["create", "tiny-v1", "id=x", "splits.train"],
+        ["create", "tiny-v1", "id=x", "nothing.at.all=3"],
+        ["create", "tiny-v1", "id=x", "seed=[1"],
+        ["create", "tiny-v1", "--jobs", "0"],
+        ["create", "tiny-v1", "--splits", "[nope]"],
+        ["create", "tiny-v1", "--seed", "many"],
+        ["show", "nope"],
+        ["validate", "r.yaml"],
+        ["repair", "nope"],
+        ["merge", "nope", "--out", "d.h5"],
+        ["merge", "--out", "d.h5"],
+        ["preview", "nope"],
+    ],
+    ids=" ".join,
+)
+def test_bad_arguments_are_one_line_and_status_2(datagen: Call, capsys, arguments: list[str]) -> None:  # type: ignore[no-untyped-def]
+    assert datagen(*arguments) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not Path("d.h5").exists()
+
+
+def test_shipped_recipes_load_and_full_has_the_papers_maps() -> None:
+    recipes = {name: load_recipe(name) for name in shipped_recipes()}
+    assert {"paper-v1", "full-v1", "tiny-v1", "shift-v1"} <= set(recipes)
+    assert all(recipe.id == name for name, recipe in recipes.items())
+    paper, full = recipes["paper-v1"], recipes["full-v1"]
+    assert full.to_dict() | {"id": 0, "splits": 0} == paper.to_dict() | {"id": 0, "splits": 0}
+    assert {name: split.maps for name, split in full.splits.items()} == {
+        "train": 1000, "valid": 250, "test/std": 200, "test/hg": 200, "test/hs": 200,
+    }  # fmt: skip
+    with pytest.raises(ConfigError, match="shipped recipe"):
+        load_recipe("full")

@@ -1,0 +1,59 @@
+from pathlib import Path
+
+import h5py
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from benchnav.datagen.maps import TerrainMaps
+from benchnav.datagen.store import TerrainDataset
+from benchnav.errors import DatasetError
+from tests.factories import tiny_dataset
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_maps_are_what_is_stored(dataset_path: Path, in_memory: bool) -> None:
+    maps = TerrainMaps(dataset_path, "train", ("slope_deg", "environment", "start_m"), in_memory=in_memory)
+    stored = TerrainDataset(dataset_path).read("train")
+    assert len(maps) == 8
+    for index in (0, 5, -1):
+        assert list(maps[index]) == ["slope_deg", "environment", "start_m"]
+        for name, value in maps[index].items():
+            assert torch.equal(value, torch.from_numpy(stored[name])[index])
+    with pytest.raises(IndexError, match="0–7"):
+        maps[8]
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_workers_read_what_this_process_reads(dataset_path: Path, context: str, in_memory: bool) -> None:
+    maps = TerrainMaps(dataset_path, "train", in_memory=in_memory)
+    here = torch.stack([maps[i]["rgb"] for i in range(len(maps))])  # and so the file is open already
+    workers = {"fork": 2, "spawn": 1}[context]
+    loader = DataLoader(maps, batch_size=2, num_workers=workers, multiprocessing_context=context)
+    assert torch.equal(torch.cat([batch["rgb"] for batch in loader]), here)
+    assert torch.equal(maps[3]["rgb"], here[3])
+
+
+def test_only_the_fields_asked_for_are_read(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with h5py.File(path, "r+") as file:
+        del file["train/elevation_m"]
+    assert TerrainMaps(path, "train")[0].keys() == {"rgb", "class_id"}
+
+
+def test_bad_requests_and_damage_are_named(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with pytest.raises(DatasetError, match=r"fields.*'colour'"):
+        TerrainMaps(path, "train", ("rgb", "colour"))
+    with pytest.raises(DatasetError, match="'nope'"):
+        TerrainMaps(path, "nope")
+    with h5py.File(path, "r") as file:
+        place = file["train/rgb"].id.get_chunk_info(1)
+    raw = bytearray(path.read_bytes())
+    raw[place.byte_offset + 9] ^= 16
+    path.write_bytes(raw)
+    maps = TerrainMaps(path, "train")
+    assert maps[0]
+    with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
+        maps[1]

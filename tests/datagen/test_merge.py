@@ -1,0 +1,87 @@
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from benchnav.datagen.merge import merge
+from benchnav.datagen.repair import maps_to_make, repair
+from benchnav.datagen.scenario import Recipe
+from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.validate import find_faults
+from benchnav.errors import DatasetError
+from tests.factories import tiny_dataset, tiny_recipe
+
+
+def only(recipe: Recipe, *splits: str) -> Recipe:
+    return replace(recipe, splits={name: recipe.splits[name] for name in splits})
+
+
+def run(paths: list[Path], out: Path, name: str = "both") -> TerrainDataset:
+    for _ in merge(paths, out, name):
+        pass
+    return TerrainDataset(out)
+
+
+def test_splits_made_apart_are_the_whole(tmp_path: Path) -> None:
+    recipe = tiny_recipe()
+    whole = TerrainDataset(tiny_dataset(tmp_path / "whole.h5", recipe))
+    some = tiny_dataset(tmp_path / "a.h5", only(recipe, "train", "valid"))
+    rest = tiny_dataset(tmp_path / "b.h5", only(recipe, "test/std", "test/hg", "test/hs"))
+    assert run([some, rest], tmp_path / "m.h5").digest == whole.digest
+
+
+def test_siblings_are_joined_end_to_end_and_stay_repairable(tmp_path: Path) -> None:
+    first = tiny_dataset(tmp_path / "a.h5")
+    second = tiny_dataset(tmp_path / "b.h5", replace(tiny_recipe(), seed=1))
+    merged = run([first, second], tmp_path / "m.h5")
+    assert find_faults(merged.path) == []
+    for split in merged.splits:
+        halves = [TerrainDataset(path).read(split) for path in (first, second)]
+        for name, values in merged.read(split).items():
+            np.testing.assert_array_equal(values, np.concatenate([half[name] for half in halves]))
+    digest = merged.digest
+    with h5py.File(merged.path, "r+") as file:
+        file["train/rgb"][2] = 0
+        file["train/rgb"][13] = 0
+    chosen = maps_to_make(merged, find_faults(merged.path))
+    assert chosen["train"].tolist() == [2, 13]
+    for _ in repair(merged, chosen):
+        pass
+    assert find_faults(merged.path) == []
+    assert TerrainDataset(merged.path).digest == digest
+    third = tiny_dataset(tmp_path / "c.h5", replace(tiny_recipe(), seed=2))
+    assert run([merged.path, third], tmp_path / "n.h5").splits["train"]["maps"] == 24
+
+
+def test_all_reasons_are_given_at_once(tmp_path: Path) -> None:
+    recipe = tiny_recipe()
+    first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train", "test/hs"))
+    classes = (replace(recipe.classes[0], scale=9.0), *recipe.classes[1:])
+    scenarios = recipe.scenarios | {"hs": replace(recipe.scenarios["hs"], ambient=0.5)}
+    unlike = replace(recipe, seed=5, classes=classes, resolution_m=0.6, scenarios=scenarios)
+    second = tiny_dataset(tmp_path / "b.h5", only(unlike, "train", "test/hs"))
+    with pytest.raises(DatasetError) as caught:
+        run([first, second, first], tmp_path / "m.h5", "no spaces")
+    for reason in (
+        r"unlike resolution_m (0.5, 0.6)", "unlike classes", "unlike scenarios in split 'test/hs'",
+        "10 map(s) in common", "id 'no spaces'",
+    ):  # fmt: skip
+        assert reason in str(caught.value)
+    assert not (tmp_path / "m.h5").exists()
+    with pytest.raises(DatasetError, match="fewer than two"):
+        run([first], tmp_path / "m.h5")
+
+
+def test_a_damaged_source_is_refused_and_an_existing_target_kept(tmp_path: Path) -> None:
+    recipe = tiny_recipe()
+    first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train"))
+    second = tiny_dataset(tmp_path / "b.h5", only(recipe, "valid"))
+    with h5py.File(second, "r+") as file:
+        file["valid/class_id"][1] = 3
+    with pytest.raises(DatasetError, match=r"'valid'.*do not match"):
+        run([first, second], tmp_path / "m.h5")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]
+    with pytest.raises(DatasetError, match="exists"):
+        run([first, second], first)
