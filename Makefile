@@ -6,11 +6,12 @@ STAMP := $(VENV)/.installed
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
-.PHONY: help demo test lint clean
+.PHONY: help demo test bench lint clean
 
 help:
 	@echo "make demo   set up, run a small suite of the shipped model on the shipped maps, write report and playback"
 	@echo "make test   set up, run the tests"
+	@echo "make bench  speed, side by side with peers"
 	@echo "make lint   ruff and mypy"
 
 # The stamp depends on what is installed, so a second run installs nothing.
@@ -27,6 +28,9 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS)
+
+bench: $(STAMP)
+	$(BIN)/python benchmarks/datasets.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

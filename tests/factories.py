@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
+from benchnav.datagen.create import create
 from benchnav.datagen.scenario import Recipe, load_recipe
-from benchnav.datagen.writer import create
 from benchnav.planning.dynamics import Unicycle
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.problem import Problem, heading_to

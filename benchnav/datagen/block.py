@@ -75,26 +75,30 @@ class Block:
         )
 
 
-def new_split(file: h5py.File, name: str, maps: int, height: int, width: int) -> h5py.Group:
-    """Makes the empty arrays of a split, to be filled by `write`."""
-    group = file.create_group(name)
+def new_split(file: h5py.File, name: str, maps: int, height: int, width: int) -> dict[str, h5py.Dataset]:
+    """Makes the empty arrays of a split, to be filled by `write`.
+
+    Returns:
+        The arrays by name. To be kept until all is written: HDF5 writes an array out when it is let go.
+    """
+    group, arrays = file.create_group(name), {}
     for field_name, field in schema.FIELDS.items():
         entry = field.entry_shape(height, width)
-        if field_name in schema.MAP_FIELDS:
-            array = chunks.new_array(group, field_name, maps, entry, field.dtype)
-        else:
-            array = _new_values(group, field_name, maps, entry, field.dtype)
-        array.attrs["unit"], array.attrs["meaning"] = field.unit, field.meaning
-    _new_values(group, schema.ENTRY_DIGESTS, maps, (len(schema.FIELDS), schema.DIGEST_BYTES), "|u1")
-    return group
+        new = chunks.new_array if field_name in schema.MAP_FIELDS else _new_values
+        arrays[field_name] = new(group, field_name, maps, entry, field.dtype)
+        arrays[field_name].attrs["unit"] = field.unit
+        arrays[field_name].attrs["meaning"] = field.meaning
+    digests = (len(schema.FIELDS), schema.DIGEST_BYTES)
+    arrays[schema.ENTRY_DIGESTS] = _new_values(group, schema.ENTRY_DIGESTS, maps, digests, "|u1")
+    return arrays
 
 
-def write(group: h5py.Group, start: int, block: Block) -> None:
+def write(arrays: Mapping[str, h5py.Dataset], start: int, block: Block) -> None:
     """Puts a block into a split from `new_split`, from map `start` on."""
     for name, encoded in block.chunks.items():
-        chunks.write(group[name], start, encoded)
+        chunks.write(arrays[name], start, encoded)
     for name, values in {**block.values, schema.ENTRY_DIGESTS: block.digests}.items():
-        group[name][start : start + len(block)] = values
+        arrays[name][start : start + len(block)] = values
 
 
 def _new_values(group: h5py.Group, name: str, maps: int, entry: tuple[int, ...], dtype: str) -> h5py.Dataset:

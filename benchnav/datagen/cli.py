@@ -32,9 +32,9 @@ def create(
         overwrite: Replace a file that is there.
     """
     from benchnav.command import show_progress
+    from benchnav.datagen.create import create as create_dataset
     from benchnav.datagen.scenario import load_recipe
     from benchnav.datagen.store import TerrainDataset
-    from benchnav.datagen.writer import create as create_dataset
     from benchnav.errors import ConfigError
 
     if jobs < 1:

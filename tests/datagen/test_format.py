@@ -82,7 +82,7 @@ def test_the_golden_file_is_laid_out_as_documented() -> None:
 def test_digests_are_the_same_on_other_processors(tmp_path: Path, settings: dict[str, str]) -> None:
     code = (
         "from pathlib import Path; from benchnav.datagen.scenario import load_recipe; "
-        "from benchnav.datagen.writer import create\n"
+        "from benchnav.datagen.create import create\n"
         f"for _ in create(load_recipe({str(DATA / 'golden.yaml')!r}), Path('d.h5')): pass"
     )
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | settings, check=True)

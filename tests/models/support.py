@@ -5,9 +5,9 @@ from pathlib import Path
 
 import torch
 
+from benchnav.datagen.create import create
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
-from benchnav.datagen.writer import create
 from benchnav.models.data import PixelTable
 from benchnav.models.slope_table import SlopeTable, table_slopes
 from benchnav.terrain import Grid, Terrain

@@ -1,0 +1,333 @@
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from benchnav.datagen.preview import (
+    TITLES,
+    class_colours,
+    contact_columns,
+    contact_sheet_figure,
+    preview_figure,
+    save_contact_sheet,
+    save_preview,
+)
+from benchnav.datagen.scenario import Recipe, load_recipe
+from benchnav.datagen.store import TerrainDataset
+from benchnav.errors import ConfigError, DatasetError
+from tests.factories import tiny_dataset, tiny_recipe
+
+BARS = ("elevation_m", "slope_deg", "traversability")
+
+
+@pytest.fixture
+def dataset(dataset_path: Path) -> TerrainDataset:
+    return TerrainDataset(dataset_path)
+
+
+def train_only(maps: int = 3, **changes: Any) -> Recipe:
+    recipe = tiny_recipe(train=maps)
+    kept = {"splits": {"train": recipe.splits["train"]}, "scenarios": {"std": recipe.scenarios["std"]}}
+    return replace(recipe, **kept | changes)
+
+
+def panels(figure: Figure) -> dict[str, Axes]:
+    return {str(panel.get_label()): panel for panel in figure.axes}
+
+
+def legend_names(figure: Figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def seen_texts(figure: Figure) -> list[Text]:
+    figure.draw_without_rendering()
+    hidden = set()
+    for panel in figure.axes:
+        for axis in (panel.xaxis, panel.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
+                if not low <= tick.get_loc() <= high or not panel.axison:
+                    hidden |= {tick.label1, tick.label2}
+    texts = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible())
+    return [text for text in texts if text.get_text().strip() and text not in hidden]
+
+
+def check_texts(figure: Figure) -> None:
+    """All text is of a legible size, on the page, and clear of other text and of the panels of others."""
+    texts = seen_texts(figure)
+    page = figure.bbox
+    boxes = [text.get_window_extent().padded(-0.5) for text in texts]
+    for text, box in zip(texts, boxes, strict=True):
+        assert text.get_fontsize() >= 7
+        inside = page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
+        assert inside, f"{text.get_text()!r} leaves the page"
+    for (one, first), (other, second) in combinations(zip(texts, boxes, strict=True), 2):
+        assert not first.overlaps(second), f"{one.get_text()!r} is on {other.get_text()!r}"
+
+
+def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset) -> None:
+    indices = [1, 0]
+    figure = preview_figure(dataset, "test/hg", indices)
+    drawn, stored = panels(figure), dataset.read("test/hg", indices)
+    assert set(drawn) == {f"{field} {row}" for field in TITLES for row in (0, 1)} | {
+        f"{field} bar" for field in BARS
+    }
+    for row in (0, 1):
+        for field in TITLES:
+            panel, values = drawn[f"{field} {row}"], stored[field][row]
+            if field == "rgb":
+                values = values.transpose(1, 2, 0)
+            elif field == "elevation_m":
+                values = values - values.min()
+            np.testing.assert_array_equal(panel.images[0].get_array(), values)
+            assert panel.images[0].origin == "lower"
+            assert panel.images[0].get_extent() == [0, 16, 0, 16]
+            assert (panel.get_xlim(), panel.get_ylim()) == ((0, 16), (0, 16))
+            marked = [tuple(np.concatenate(line.get_data())) for line in panel.lines]
+            assert marked == [tuple(stored["start_m"][row]), tuple(stored["goal_m"][row])]
+    texts = [text.get_text() for text in seen_texts(figure)]
+    for once in ("tiny-v1, split test/hg", "map 1", "map 0", "x [m]", "y [m]", "start", "goal"):
+        assert texts.count(once) == 1
+    for title in TITLES.values():
+        assert texts.count(title) == 1
+
+
+def test_rows_share_scales_and_compare(dataset: TerrainDataset) -> None:
+    drawn = panels(preview_figure(dataset, "train", [0, 1, 2]))
+    elevation = dataset.read("train", [0, 1, 2])["elevation_m"]
+    relief = np.ptp(elevation, axis=(1, 2)).max()
+    for row in range(3):
+        assert drawn[f"elevation_m {row}"].images[0].get_clim() == pytest.approx((0, relief))
+        assert drawn[f"slope_deg {row}"].images[0].get_clim() == (0, 30)
+        assert drawn[f"traversability {row}"].images[0].get_clim() == (0, 1)
+    assert drawn["elevation_m bar"].get_xlim() == pytest.approx((0, relief))
+
+
+def test_axes_are_numbered_once(dataset: TerrainDataset) -> None:
+    figure = preview_figure(dataset, "train", [0, 1])
+    figure.draw_without_rendering()
+    for label, panel in panels(figure).items():
+        field, row = label.split()
+        if row != "bar":
+            assert panel.yaxis.get_major_ticks()[0].label1.get_visible() == (field == "rgb")
+            assert panel.xaxis.get_major_ticks()[0].label1.get_visible() == (row == "1")
+
+
+def test_a_class_has_one_colour_in_every_map_and_figure(dataset: TerrainDataset) -> None:
+    colours = class_colours(dataset.recipe.classes)
+    for split, indices in (("train", [0, 1, 2, 3, 4]), ("test/hs", [1])):
+        figure, stored = preview_figure(dataset, split, indices), dataset.read(split, indices)["class_id"]
+        for row in range(len(indices)):
+            image = panels(figure)[f"class_id {row}"].images[0]
+            np.testing.assert_allclose(image.to_rgba(stored[row])[..., :3], colours[stored[row]])
+        shown = np.unique(stored)
+        names = [f"{number} {dataset.recipe.classes[number].name.replace('_', ' ')}" for number in shown]
+        legend = figure.legends[1]
+        assert [text.get_text() for text in legend.get_texts()] == names
+        for patch, number in zip(legend.get_patches(), shown, strict=True):
+            np.testing.assert_allclose(patch.get_facecolor()[:3], colours[number])
+
+
+def lightness(rgb: np.ndarray) -> np.ndarray:
+    """CIE L*, 0–100, of sRGB in [0, 1]."""
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return 116 * np.cbrt(linear @ (0.2126, 0.7152, 0.0722)) - 16
+
+
+def test_class_colours_keep_the_tables_order_and_neighbours_apart() -> None:
+    classes = load_recipe("paper-v1").classes
+    light = lightness(class_colours(classes))
+    assert np.all(np.diff(light) > 5)
+    neighbours = np.linalg.norm(np.diff(class_colours(classes), axis=0), axis=1)
+    own = np.linalg.norm(np.diff([c.colour for c in classes], axis=0) / 255, axis=1)
+    assert neighbours.min() > 2 * own.max()
+    np.testing.assert_array_equal(class_colours(classes[::-1]), class_colours(classes)[::-1])
+
+
+@pytest.mark.parametrize("count", [1, 2, 256])
+def test_tables_of_any_size_have_colours(count: int) -> None:
+    one = load_recipe("paper-v1").classes[0]
+    colours = class_colours([replace(one, colour=(k, k, k)) for k in range(count)])
+    assert colours.shape == (count, 3)
+    assert len(np.unique(colours.round(6), axis=0)) == count
+
+
+@pytest.mark.parametrize("indices", [[0], [0, 1, 2], list(range(8))])
+def test_texts_are_legible(dataset: TerrainDataset, indices: list[int]) -> None:
+    figure = preview_figure(dataset, "train", indices)
+    check_texts(figure)
+    assert figure.get_figwidth() == pytest.approx(7.2) if len(indices) < 5 else figure.get_figheight() < 9.7
+
+
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (12, 48), (48, 12), (20, 30)])
+def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
+    goal = (width / 2 - 2, height / 2 - 2)
+    recipe = train_only(height=height, width=width, start_m=(1, 1), goal_m=goal)
+    shaped = TerrainDataset(tiny_dataset(tmp_path / "shaped.h5", recipe))
+    figure = preview_figure(shaped, "train", [0, 1])
+    check_texts(figure)
+    for field in TITLES:
+        panel = panels(figure)[f"{field} 1"]
+        assert panel.images[0].get_array().shape[:2] == (height, width)
+        box = panel.get_window_extent()
+        assert box.height / box.width == pytest.approx(height / width)
+    sheet = contact_sheet_figure(shaped, "train")
+    check_texts(sheet)
+    box = sheet.axes[0].images[2].get_window_extent()
+    assert box.height / box.width == pytest.approx(height / width)
+
+
+def test_only_shown_classes_of_many_are_named(tmp_path: Path) -> None:
+    one = load_recipe("paper-v1").classes[0]
+    many = tuple(replace(one, name=f"stony_$k_{k}$", colour=(k, k, k)) for k in range(256))
+    recipe = train_only(classes=many, occupancy=(1 / 30,) * 30)
+    figure = preview_figure(TerrainDataset(tiny_dataset(tmp_path / "many.h5", recipe)), "train", [0])
+    assert len(legend_names(figure)) == 2 + 30
+    assert "3 stony $k 3$" in legend_names(figure)
+    check_texts(figure)
+
+
+def with_values(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch, **changed: Callable[..., Any]
+) -> None:
+    """Lets a dataset read what `changed` makes of its arrays."""
+    read = dataset.read
+
+    def reading(split: str, indices: Sequence[int], fields: Iterable[str]) -> dict[str, np.ndarray]:
+        stored = read(split, indices, fields)
+        return stored | {name: change(stored[name]) for name, change in changed.items() if name in stored}
+
+    monkeypatch.setattr(dataset, "read", reading)
+
+
+def test_unobserved_traversability_is_grey_and_explained(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert legend_names(preview_figure(dataset, "train", [0]))[:2] == ["start", "goal"]
+    assert "unobserved" not in legend_names(preview_figure(dataset, "train", [0]))
+    hole = np.zeros((32, 32), dtype=bool)
+    hole[4:9, 10:30] = True
+    with_values(
+        dataset,
+        monkeypatch,
+        traversability=lambda values: np.where(hole, np.nan, values),
+        reference_time_s=lambda values: np.full_like(values, np.nan),
+    )
+    figure = preview_figure(dataset, "train", [0])
+    assert legend_names(figure)[:3] == ["start", "goal", "unobserved"]
+    image = panels(figure)["traversability 0"].images[0]
+    rgba = image.to_rgba(image.get_array())
+    grey = figure.legends[0].get_patches()[0].get_facecolor()
+    assert len(set(grey[:3])) == 1
+    np.testing.assert_array_equal((rgba == grey).all(-1), hole)
+
+
+def test_level_maps_are_drawn(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    with_values(dataset, monkeypatch, elevation_m=lambda z: z * 0 + 5, slope_deg=np.zeros_like)
+    panel = panels(preview_figure(dataset, "train", [0]))["elevation_m 0"]
+    assert not panel.images[0].get_array().any()
+    assert panel.images[0].get_clim() == (0, 1)
+    assert np.allclose(panel.images[1].get_array()[..., 3], 0)
+
+
+def test_hillshade_lights_the_north_west(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    y, x = np.mgrid[:32, :32]
+    dome = 3 - np.hypot(x - 15.5, y - 15.5)[None] / 10
+    with_values(dataset, monkeypatch, elevation_m=lambda z: dome)
+    veil = panels(preview_figure(dataset, "train", [0]))["elevation_m 0"].images[1].get_array()
+    assert veil[24, 8, 0] == 1
+    assert veil[8, 24, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("jpg", b"\xff\xd8")]
+)
+def test_pictures_are_written(dataset: TerrainDataset, tmp_path: Path, kind: str, magic: bytes) -> None:
+    settings = dict(matplotlib.rcParams)
+    save_preview(dataset, "test/std", [0, 1], tmp_path / "sheet", kind)
+    save_contact_sheet(dataset, "test/std", tmp_path / "contact", kind)
+    assert dict(matplotlib.rcParams) == settings
+    for name in ("sheet", "contact"):
+        written = (tmp_path / name).read_bytes()
+        assert written.startswith(magic)
+        if kind == "pdf":
+            assert b"/CIDFontType2" in written
+            assert b"/Type3" not in written
+
+
+def test_a_contact_sheet_has_every_map_in_order(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stored, asked = dataset.read("train")["rgb"], []
+    read = dataset.read
+    monkeypatch.setattr("benchnav.datagen.preview._READ_MAPS", 3)
+    monkeypatch.setattr(dataset, "read", lambda *given: asked.append(given) or read(*given))
+    figure = contact_sheet_figure(dataset, "train")
+    (sheet,) = figure.axes
+    assert [list(indices) for _, indices, _ in asked] == [[0, 1, 2], [3, 4, 5], [6, 7]]
+    assert {tuple(fields) for *_, fields in asked} == {("rgb",)}
+    assert len(sheet.images) == 8
+    corners = []
+    for index, (image, label) in enumerate(zip(sheet.images, sheet.texts, strict=True)):
+        np.testing.assert_array_equal(image.get_array(), stored[index].transpose(1, 2, 0))
+        assert image.get_interpolation() == "none"
+        assert label.get_text() == str(index)
+        left, right, bottom, top = image.get_extent()
+        # The page counts inches downward.
+        assert top < bottom
+        assert left <= label.get_position()[0] < right
+        assert top <= label.get_position()[1] < bottom
+        corners.append((round(top, 6), left))
+    assert corners == sorted(corners)
+    assert figure.texts[0].get_text().replace("\n", " ") == "tiny-v1, split train (scenario std): 8 maps"
+    check_texts(figure)
+
+
+def test_a_contact_sheet_stops_at_most(dataset: TerrainDataset) -> None:
+    figure = contact_sheet_figure(dataset, "train", most=5)
+    assert len(figure.axes[0].images) == 5
+    assert "first 5 of 8 maps" in figure.texts[0].get_text().replace("\n", " ")
+    assert "first" not in contact_sheet_figure(dataset, "train", most=8).texts[0].get_text()
+
+
+@pytest.mark.parametrize(("count", "ratio", "columns"), [(100, 1, 10), (20, 1, 5), (1, 1, 1), (16, 4, 8)])
+def test_contact_columns(count: int, ratio: float, columns: int) -> None:
+    assert contact_columns(count, ratio) == columns
+
+
+@given(count=st.integers(1, 1000), ratio=st.floats(0.25, 4))
+def test_contact_grids_are_nearly_square_and_full(count: int, ratio: float) -> None:
+    columns = contact_columns(count, ratio)
+    rows = -(-count // columns)
+    assert (rows - 1) * columns < count <= rows * columns
+    if count >= 50:
+        assert 0.5 <= columns / (rows * ratio) <= 2
+
+
+@pytest.mark.parametrize(
+    "draw", [lambda d: preview_figure(d, "nope", [0]), lambda d: contact_sheet_figure(d, "nope")]
+)
+def test_an_unknown_split_is_refused(
+    dataset: TerrainDataset, draw: Callable[[TerrainDataset], Figure]
+) -> None:
+    with pytest.raises(DatasetError, match="'nope'"):
+        draw(dataset)
+
+
+def test_nothing_to_draw_is_refused(dataset: TerrainDataset) -> None:
+    with pytest.raises(ConfigError, match="at least one map"):
+        preview_figure(dataset, "train", [])
+    with pytest.raises(ConfigError, match="`most` ≥ 1, got 0"):
+        contact_sheet_figure(dataset, "train", most=0)
+    with pytest.raises(DatasetError, match="indices in 0–7"):
+        preview_figure(dataset, "train", [8])
