@@ -165,30 +165,90 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     _report(TerrainDataset(path))
 
 
-def preview(file: str, split: str = "test/std", maps: list[int] | None = None, out: str = "") -> None:
+def import_dem(
+    dem: str,
+    out: str,
+    id: str = "",
+    recipe: str = "paper-v1",
+    split: str = "test/real",
+    scenario: str = "std",
+    classes: str = "",
+    class_ids: dict[int, str] | None = None,
+    photo: str = "",
+    solvable: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Make a dataset from a GeoTIFF elevation model; needs the extra benchnav[geo].
+
+    Args:
+        dem: GeoTIFF of elevations in metres, in a projected CRS in metres.
+        out: File to write.
+        id: Id of the dataset; the name of the file when not given.
+        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
+        split: Name of the only split.
+        scenario: Which of the recipe's scenarios lights the maps.
+        classes: GeoTIFF of terrain classes that covers the elevation model; laid out at random when not given.
+        class_ids: Class names by value of that raster, such as '{1: gravel, 2: scree}'; else values are indices.
+        photo: GeoTIFF of red, green and blue that covers the elevation model; painted when not given.
+        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
+        overwrite: Replace a file that is there.
+    """
+    from benchnav.command import show_progress
+    from benchnav.datagen.dem import import_dem as import_maps
+    from benchnav.datagen.scenario import load_recipe
+    from benchnav.datagen.store import TerrainDataset
+
+    path = Path(out)
+    steps = import_maps(
+        Path(dem),
+        path,
+        load_recipe(recipe),
+        dataset_id=id or path.stem,
+        split=split,
+        scenario=scenario,
+        classes=Path(classes) if classes else None,
+        class_ids=class_ids,
+        photo=Path(photo) if photo else None,
+        solvable=solvable,
+        overwrite=overwrite,
+    )
+    show_progress(steps, "maps")
+    _report(TerrainDataset(path))
+
+
+def preview(
+    file: str,
+    split: str = "test/std",
+    maps: list[int] | None = None,
+    out: str = "",
+    contact_sheet: bool = False,
+) -> None:
     """Draw maps of a dataset to a picture.
 
     Args:
         file: Path or id of a dataset.
         split: Which split.
         maps: Which maps; [0, 1, 2] when not given.
-        out: Picture to write; preview-SPLIT.png when not given.
+        out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
+        contact_sheet: A thumbnail of every map of the split instead.
     """
-    from benchnav.datagen.preview import save_preview
+    from benchnav.datagen.preview import save_contact_sheet, save_preview
     from benchnav.datagen.store import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
     from benchnav.files import replacing
 
-    path = Path(out or f"preview-{split.replace('/', '-')}.png")
+    path = Path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
         raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
-    if maps == []:
-        raise ConfigError("Expected `maps` with at least one index, got none.")
+    if maps is not None and (not maps or contact_sheet):
+        raise ConfigError(f"Expected `maps` with at least one index and no contact sheet, got {maps}.")
     dataset = TerrainDataset(find_dataset(file))
     with replacing(path) as partial:
-        save_preview(
-            dataset, split, sorted(set(maps if maps is not None else [0, 1, 2])), partial, path.suffix[1:]
-        )
+        if contact_sheet:
+            save_contact_sheet(dataset, split, partial, path.suffix[1:])
+        else:
+            some = range(min(3, dataset.map_count(split))) if maps is None else sorted(set(maps))
+            save_preview(dataset, split, list(some), partial, path.suffix[1:])
     print(f"wrote {path}")
 
 
@@ -207,8 +267,13 @@ def main() -> None:
         "validate": Command(validate, ("file",)),
         "repair": Command(repair, ("file",)),
         "merge": Command(merge, ("files",)),
+        "import-dem": Command(import_dem, ("dem",)),
         "preview": Command(preview, ("file",)),
     }
     sys.exit(
-        run("benchnav-datagen", "Make, list, show, check, mend, combine and draw terrain datasets.", commands)
+        run(
+            "benchnav-datagen",
+            "Make, list, show, check, mend, combine, import and draw terrain datasets.",
+            commands,
+        )
     )

@@ -45,7 +45,9 @@ def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys)
     assert 0 < described["splits"]["test/hg"]["stored_bytes"] < described["bytes"]
     assert datagen("validate", "d.h5") == 0
     assert datagen("preview", "d.h5", "--split", "test/hg", "--maps", "[1]", "--out", "p.png") == 0
-    assert (tmp_path / "p.png").stat().st_size > 5_000
+    assert datagen("preview", "d.h5", "--split", "test/hg", "--contact_sheet", "true") == 0
+    for picture in ("p.png", "contact-test-hg.png"):
+        assert (tmp_path / picture).stat().st_size > 5_000
     assert datagen("list", "--folder", ".") == 0
     assert "tiny-v1" in capsys.readouterr().out
     with h5py.File("d.h5") as file:

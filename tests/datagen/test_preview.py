@@ -94,6 +94,7 @@ def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset)
             assert panel.images[0].get_extent() == [0, 16, 0, 16]
             assert (panel.get_xlim(), panel.get_ylim()) == ((0, 16), (0, 16))
             marked = [tuple(np.concatenate(line.get_data())) for line in panel.lines]
+            assert not any(line.get_clip_on() for line in panel.lines)
             assert marked == [tuple(stored["start_m"][row]), tuple(stored["goal_m"][row])]
     texts = [text.get_text() for text in seen_texts(figure)]
     for once in ("tiny-v1, split test/hg", "map 1", "map 0", "x [m]", "y [m]", "start", "goal"):
@@ -169,7 +170,7 @@ def test_texts_are_legible(dataset: TerrainDataset, indices: list[int]) -> None:
     assert figure.get_figwidth() == pytest.approx(7.2) if len(indices) < 5 else figure.get_figheight() < 9.7
 
 
-@pytest.mark.parametrize(("height", "width"), [(16, 16), (12, 48), (48, 12), (20, 30)])
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (12, 96), (48, 12), (20, 30)])
 def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
     goal = (width / 2 - 2, height / 2 - 2)
     recipe = train_only(height=height, width=width, start_m=(1, 1), goal_m=goal)
@@ -181,6 +182,10 @@ def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
         assert panel.images[0].get_array().shape[:2] == (height, width)
         box = panel.get_window_extent()
         assert box.height / box.width == pytest.approx(height / width)
+        for axis, cells in ((panel.xaxis, width), (panel.yaxis, height)):
+            numbered = [place for place in axis.get_ticklocs() if 0 <= place <= cells / 2]
+            assert numbered, "an axis has no number"
+            assert max(numbered) < cells / 2, "a number at the end touches the next panel's first"
     sheet = contact_sheet_figure(shaped, "train")
     check_texts(sheet)
     box = sheet.axes[0].images[2].get_window_extent()
@@ -193,6 +198,10 @@ def test_only_shown_classes_of_many_are_named(tmp_path: Path) -> None:
     recipe = train_only(classes=many, occupancy=(1 / 30,) * 30)
     figure = preview_figure(TerrainDataset(tiny_dataset(tmp_path / "many.h5", recipe)), "train", [0])
     assert len(legend_names(figure)) == 2 + 30
+    assert not any(text.get_parse_math() for text in figure.legends[1].get_texts())
+    bar = panels(figure)["elevation_m bar"]
+    figure.draw_without_rendering()
+    assert figure.legends[1].get_window_extent().y1 < bar.xaxis.label.get_window_extent().y0
     assert "3 stony $k 3$" in legend_names(figure)
     check_texts(figure)
 
