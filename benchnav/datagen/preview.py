@@ -42,26 +42,8 @@ _LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.06, 0.42, 0.94, 0.12
 _TEXT, _TITLE, _LINE, _LETTER = 7.0, 8.0, 0.135, 0.054
 _UNOBSERVED = "0.7"
 _READ_MAPS = 20
-_MARKS: dict[str, dict[str, Any]] = {
-    "start": {
-        "marker": "o",
-        "ms": 3.6,
-        "mfc": "white",
-        "mec": "black",
-        "mew": 0.8,
-        "ls": "",
-        "clip_on": False,
-    },
-    "goal": {
-        "marker": "*",
-        "ms": 6.5,
-        "mfc": "white",
-        "mec": "black",
-        "mew": 0.7,
-        "ls": "",
-        "clip_on": False,
-    },
-}
+_MARK: dict[str, Any] = {"ls": "", "mfc": "white", "mec": "black", "mew": 0.75, "clip_on": False}
+_MARKS = {"start": _MARK | {"marker": "o", "ms": 3.6}, "goal": _MARK | {"marker": "*", "ms": 6.5}}
 # Ladders of equal lightness in Oklab; brown against blue is told apart by every kind of colour vision.
 _EARTH = LinearSegmentedColormap.from_list("earth", ["#472400", "#8d591d", "#cc9967", "#ffe0bf"])
 _BLUE = LinearSegmentedColormap.from_list("blue", ["#092f52", "#35699d", "#79a9db", "#caecff"])
