@@ -83,7 +83,7 @@ def main() -> None:
             rate, text = per_second(total, lambda jobs=jobs: make(recipe, path, jobs))  # type: ignore[misc]
             table.add_row(f"create, {jobs} worker(s), to closed file", text, f"{rate / base:.1f}")
         command = [str(Path(sys.executable).with_name("benchnav-datagen")), "create", "paper-v1"]
-        command += ["--jobs", "2", "--overwrite", "true", "--out", str(path)]
+        command += ["--jobs", "2", "--overwrite", "--out", str(path)]
         rate, text = per_second(total, lambda: subprocess.run(command, check=True, capture_output=True), 3)
         table.add_row("the whole command, 2 workers", text, f"{rate / base:.1f}")
         order = np.random.default_rng(0).integers(1000, size=READS)

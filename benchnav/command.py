@@ -48,7 +48,7 @@ def run(
 
     # Notices of libraries to their own developers would bury what a user has to read.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
-    argv = list(sys.argv[1:] if argv is None else argv)
+    argv = _as_parsed(sys.argv[1:] if argv is None else argv, commands)
     parser = ArgumentParser(prog=program, description=description, exit_on_error=False)
     subcommands = parser.add_subcommands(required=True, metavar="COMMAND", dest="command")
     for name, command in commands.items():
@@ -128,6 +128,23 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
         if done * 10 // total > tenths:
             tenths = done * 10 // total
             print(f"{what}: {done}/{total}", file=sys.stderr, flush=True)
+
+
+def _as_parsed(argv: Sequence[str], commands: dict[str, Command]) -> list[str]:
+    """Spells flags as the parser knows them: `--contact-sheet` for `--contact_sheet true`."""
+    hints = [get_type_hints(command.function) for command in commands.values()]
+    switches = {f"--{name}" for types in hints for name, kind in types.items() if kind is bool}
+    spelled = []
+    for word, following in zip(argv, [*argv[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if not name.startswith("--"):
+            spelled.append(word)
+            continue
+        name = "--" + name[2:].replace("-", "_")
+        if name in switches and not equals and following.lower() not in ("true", "false", "yes", "no"):
+            equals, value = "=", "true"
+        spelled.append(name + equals + value)
+    return spelled
 
 
 def _summary(function: Callable[..., Any]) -> str:

@@ -213,12 +213,15 @@ def import_dem(
         overwrite=overwrite,
     )
     show_progress(steps, "maps")
-    _report(TerrainDataset(path))
+    made = TerrainDataset(path)
+    _report(made)
+    left = made.splits[split]["parts"][0]["source"]["left_out"]
+    print(f"  left out: {left['missing_cells']} with missing cells, {left['not_solvable']} not solvable")
 
 
 def preview(
     file: str,
-    split: str = "test/std",
+    split: str = "",
     maps: list[int] | None = None,
     out: str = "",
     contact_sheet: bool = False,
@@ -227,7 +230,7 @@ def preview(
 
     Args:
         file: Path or id of a dataset.
-        split: Which split.
+        split: Which split; test/std, or else the first, when not given.
         maps: Which maps; [0, 1, 2] when not given.
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
         contact_sheet: A thumbnail of every map of the split instead.
@@ -237,12 +240,13 @@ def preview(
     from benchnav.errors import ConfigError
     from benchnav.files import replacing
 
+    dataset = TerrainDataset(find_dataset(file))
+    split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
     path = Path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
         raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
     if maps is not None and (not maps or contact_sheet):
         raise ConfigError(f"Expected `maps` with at least one index and no contact sheet, got {maps}.")
-    dataset = TerrainDataset(find_dataset(file))
     with replacing(path) as partial:
         if contact_sheet:
             save_contact_sheet(dataset, split, partial, path.suffix[1:])

@@ -33,7 +33,7 @@ def check_target(path: Path, overwrite: bool) -> None:
     """
     if path.exists() and not overwrite:
         raise DatasetError(
-            f"Expected `out` to be a new file, but {path} exists. Pass --overwrite true to replace it."
+            f"Expected `out` to be a new file, but {path} exists. Pass --overwrite to replace it."
         )
 
 

@@ -315,7 +315,7 @@ def _begin(suite: Suite, dataset: TerrainDataset, folder: Path) -> None:
         if differing:
             raise ConfigError(
                 f"Expected `out` to be new or an interrupted run of the same suite, but {folder} has another "
-                f"{' and '.join(differing)}. Choose another `out`, or pass --overwrite true."
+                f"{' and '.join(differing)}. Choose another `out`, or pass --overwrite."
             )
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

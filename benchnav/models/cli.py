@@ -173,13 +173,13 @@ def _start(data: str, out: str, names: set[str], overwrite: bool) -> "tuple[Terr
     if not fits:
         raise CheckpointError(
             f"Expected checkpoint {out} to be of the maps of {dataset.path}, got one of other maps, of "
-            f"dataset {there.dataset_id}. Choose another `out`, or pass --overwrite true to replace it."
+            f"dataset {there.dataset_id}. Choose another `out`, or pass --overwrite to replace it."
         )
     # GPs alone are what an interrupted training of both halves leaves, to be gone on from.
     if (names & set(there.parts)) - ({"gp"} if len(names) > 1 else set()):
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(sorted(names))}, got {out} with "
-            f"{' and '.join(sorted(there.parts))}. Choose another `out`, or pass --overwrite true to "
+            f"{' and '.join(sorted(there.parts))}. Choose another `out`, or pass --overwrite to "
             "replace it."
         )
     return dataset, there

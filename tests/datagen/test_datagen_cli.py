@@ -3,6 +3,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 
 from benchnav.datagen import cli
@@ -38,14 +39,14 @@ def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys)
     shown = capsys.readouterr().out
     assert "scree" in shown
     assert TerrainDataset("d.h5").splits["test/hg"]["digest"] in shown
-    assert datagen("show", "d.h5", "--json", "true") == 0
+    assert datagen("show", "d.h5", "--json") == 0
     described = json.loads(capsys.readouterr().out)
     assert described["splits"]["test/hg"]["maps"] == 4
     assert described["classes"][5]["name"] == "scree"
     assert 0 < described["splits"]["test/hg"]["stored_bytes"] < described["bytes"]
     assert datagen("validate", "d.h5") == 0
     assert datagen("preview", "d.h5", "--split", "test/hg", "--maps", "[1]", "--out", "p.png") == 0
-    assert datagen("preview", "d.h5", "--split", "test/hg", "--contact_sheet", "true") == 0
+    assert datagen("preview", "d.h5", "--split", "test/hg", "--contact-sheet") == 0
     for picture in ("p.png", "contact-test-hg.png"):
         assert (tmp_path / picture).stat().st_size > 5_000
     assert datagen("list", "--folder", ".") == 0
@@ -71,6 +72,25 @@ def test_parts_made_apart_are_merged(datagen: Call) -> None:
     assert TerrainDataset("c.h5").id == "c"
     assert set(TerrainDataset("c.h5").splits) == {"train", "valid"}
     assert datagen("merge", "a.h5", "c.h5", "--out", "e.h5") == 2
+
+
+def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    rasterio = pytest.importorskip("rasterio")
+    north_up = rasterio.transform.from_origin(400_000, 4_000_000, 0.5, 0.5)
+    with rasterio.open(
+        "site.tif", "w", driver="GTiff", height=40, width=70, count=1, dtype="float32", crs="EPSG:32654",
+        transform=north_up, nodata=-9999,
+    ) as raster:  # fmt: skip
+        ground = np.linspace(0, 2, 70 * 40, dtype=np.float32).reshape(40, 70)
+        ground[20, 60] = -9999
+        raster.write(ground, 1)
+    assert datagen("import-dem", "site.tif", "--out", "site.h5", "--recipe", "tiny-v1") == 0
+    assert "left out: 1 with missing cells" in capsys.readouterr().out
+    assert TerrainDataset("site.h5").splits["test/real"]["maps"] == 1
+    assert datagen("show", "site.h5") == 0
+    assert "1 of site.tif" in capsys.readouterr().out
+    assert datagen("validate", "site.h5") == 0
+    assert datagen("import-dem", "nope.tif", "--out", "x.h5") == 2
 
 
 def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:
