@@ -80,7 +80,7 @@ def run(
             return command.function(**arguments) or 0
         settings = command.settings(**{f.name: arguments.pop(f.name) for f in fields(command.settings)})
         return command.function(settings, **arguments) or 0
-    except (ArgumentError, BenchnavError) as error:
+    except (ArgumentError, BenchnavError, UnicodeDecodeError) as error:
         print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except BrokenPipeError:

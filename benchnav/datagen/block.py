@@ -4,7 +4,7 @@ Making a block is the work that threads share; writing one is copying. Letters i
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import safetensors.numpy
 from benchnav.datagen import chunks, schema
 from benchnav.files import replacing
 
+BLOCK_MAPS = 32
 _VALUES_A_CHUNK = 1024
 
 
@@ -73,6 +74,11 @@ class Block:
             values={name: packed[name] for name in schema.FIELDS if name not in schema.MAP_FIELDS},
             digests=packed["digests"],
         )
+
+
+def spans(maps: int, size: int) -> Iterator[tuple[int, int]]:
+    """Cuts `maps` maps into stretches of `size`: the first of each, and one past its last."""
+    return ((start, min(start + size, maps)) for start in range(0, maps, size))
 
 
 def new_split(file: h5py.File, name: str, maps: int, height: int, width: int) -> dict[str, h5py.Dataset]:

@@ -14,6 +14,7 @@ import numpy as np
 
 _LEVEL = 4  # written into the file; it has no effect on reading
 _FLETCHER_MODULUS = 65535
+_FLETCHER_BYTES = 1 << 20  # at a time, so that sums stay within 64 bits
 
 
 def encode(entry: np.ndarray) -> bytes:
@@ -30,8 +31,12 @@ def encode(entry: np.ndarray) -> bytes:
 
 def fletcher32(data: bytes) -> int:
     """HDF5's Fletcher-32 checksum: two sums over big-endian 16-bit words, an odd last byte padded."""
-    words = np.frombuffer(data + b"\0" * (len(data) % 2), ">u2").astype(np.int64)
-    first, second = int(words.sum()), int(words @ np.arange(len(words), 0, -1))
+    first = second = 0
+    for start in range(0, len(data), _FLETCHER_BYTES):
+        part = data[start : start + _FLETCHER_BYTES]
+        words = np.frombuffer(part + b"\0" * (len(part) % 2), ">u2").astype(np.int64)
+        second += first * len(words) + int(words @ np.arange(len(words), 0, -1))
+        first += int(words.sum())
     return _reduce(second) << 16 | _reduce(first)
 
 

@@ -49,7 +49,7 @@ def create(
         chosen = replace(
             chosen, splits={name: chosen.splits[name] for name in chosen.splits if name in splits}
         )
-    path = Path(out or f"datasets/{chosen.id}.h5")
+    path = Path(out or f"datasets/{chosen.id}.h5").expanduser()
     show_progress(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite), "maps")
     _report(TerrainDataset(path))
 
@@ -68,6 +68,8 @@ def list_datasets(folder: str = "") -> None:
     for name in shipped_recipes():
         sizes = ", ".join(f"{split} {spec.maps}" for split, spec in load_recipe(name).splits.items())
         print(f"  {name:12} {sizes}")
+    if folder and not Path(folder).is_dir():
+        raise DatasetError(f"Expected `folder` to be one, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
         print(f"files in {place}:")
         for path in sorted(place.glob("*.h5")):
@@ -100,7 +102,7 @@ def show(file: str, json: bool = False) -> None:
         return
     console = Console(highlight=False)
     for item in tables(described):
-        console.print(item, soft_wrap=isinstance(item, str))
+        console.print(item, soft_wrap=isinstance(item, str), markup=not isinstance(item, str))
 
 
 def validate(file: str) -> int:
@@ -111,9 +113,14 @@ def validate(file: str) -> int:
     """
     from benchnav.datagen.store import find_dataset
     from benchnav.datagen.validate import find_faults
+    from benchnav.errors import DatasetError
 
     path = find_dataset(file)
-    faults = find_faults(path)
+    faults: list[object]
+    try:
+        faults = [*find_faults(path)]
+    except DatasetError as error:
+        faults = [error]
     for fault in faults:
         print(fault)
     print(f"{path}: {len(faults)} fault(s)" if faults else f"{path}: sound")
@@ -159,7 +166,7 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     from benchnav.datagen.merge import merge as merge_datasets
     from benchnav.datagen.store import TerrainDataset, find_dataset
 
-    path = Path(out)
+    path = Path(out).expanduser()
     sources = [find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id or path.stem, overwrite), "maps")
     _report(TerrainDataset(path))
@@ -198,7 +205,7 @@ def import_dem(
     from benchnav.datagen.scenario import load_recipe
     from benchnav.datagen.store import TerrainDataset
 
-    path = Path(out)
+    path = Path(out).expanduser()
     steps = import_maps(
         Path(dem),
         path,
@@ -242,7 +249,9 @@ def preview(
 
     dataset = TerrainDataset(find_dataset(file))
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
-    path = Path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
+    path = Path(
+        out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png"
+    ).expanduser()
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
         raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
     if maps is not None and (not maps or contact_sheet):

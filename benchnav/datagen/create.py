@@ -22,14 +22,12 @@ from pathlib import Path
 import numpy as np
 
 import benchnav
-from benchnav.datagen.block import Block
+from benchnav.datagen.block import BLOCK_MAPS, Block, spans
 from benchnav.datagen.generate import generate
 from benchnav.datagen.scenario import Recipe
 from benchnav.datagen.writer import check_target, named_errors, workspace, writing_into
 from benchnav.errors import ConfigError
 from benchnav.files import write_text
-
-BLOCK_MAPS = 32
 
 Span = tuple[str, int, int]  # split, first map, one past the last
 
@@ -50,13 +48,9 @@ def create(
         DatasetError: the file exists, another run is writing it, or it cannot be written.
         ConfigError: the recipe cannot be met.
     """
-    check_target(path, overwrite)
-    spans = [
-        (split, start, min(start + block_maps, spec.maps))
-        for split, spec in recipe.splits.items()
-        for start in range(0, spec.maps, block_maps)
-    ]
-    total = sum(stop - start for _, start, stop in spans)
+    check_target(path, overwrite=True)
+    work = [(split, *span) for split, spec in recipe.splits.items() for span in spans(spec.maps, block_maps)]
+    total = sum(stop - start for _, start, stop in work)
     splits = {
         name: {
             "scenario": spec.scenario,
@@ -65,11 +59,11 @@ def create(
         }
         for name, spec in recipe.splits.items()
     }
-    with named_errors(path), _workers(jobs) as run, workspace(path) as folder:
+    with named_errors(path), _workers(jobs) as run, workspace(path, overwrite) as folder:
         _drop_other_blocks(folder, recipe, block_maps)
         make, done = partial(_make_block, recipe, folder), 0
         with _left_nothing(folder), writing_into(folder, path, recipe.id, [recipe], splits) as write:
-            for (split, start, stop), finished in zip(spans, run(make, spans), strict=True):
+            for (split, start, stop), finished in zip(work, run(make, work), strict=True):
                 write(split, Block.load(finished))
                 done += stop - start
                 yield done, total

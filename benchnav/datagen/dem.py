@@ -104,7 +104,7 @@ def import_dem(
         recipe = replace(recipe, splits={split: replace(only, maps=count)})
         parts = [{"maps": count, "source": source}]
         splits = {split: {"scenario": scenario, "maps": count, "parts": parts}}
-        with writing(out, dataset_id, [recipe], splits) as write:
+        with writing(out, dataset_id, [recipe], splits, overwrite) as write:
             for block in made:
                 if len(block.numbers):
                     write(split, Block.load(block.path))

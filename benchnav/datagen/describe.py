@@ -4,20 +4,19 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
+import h5py
+from rich.markup import escape
 from rich.table import Table
 
 from benchnav.datagen import schema
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.store import READ_ERRORS, TerrainDataset
 
 
 def describe(dataset: TerrainDataset) -> dict[str, Any]:
     """Gathers what `show` shows, ready for JSON."""
     manifest, recipe = dataset.manifest, dataset.recipe
     with dataset.open() as file:
-        stored = {
-            split: sum(file[split][name].id.get_storage_size() for name in schema.FIELDS)
-            for split in dataset.splits
-        }
+        stored = {split: _stored_bytes(dataset, file, split) for split in dataset.splits}
     return {
         "path": str(dataset.path),
         "bytes": dataset.path.stat().st_size,
@@ -32,6 +31,16 @@ def describe(dataset: TerrainDataset) -> dict[str, Any]:
         "fields": manifest["fields"],
         "recipes": manifest["recipes"],
     }
+
+
+def _stored_bytes(dataset: TerrainDataset, file: h5py.File, split: str) -> int:
+    total, name = 0, ""
+    try:
+        for name in schema.FIELDS:
+            total += file[split][name].id.get_storage_size()
+    except READ_ERRORS as error:
+        raise dataset.damage(split, name, error) from error
+    return total
 
 
 def tables(described: dict[str, Any]) -> Iterator[Table | str]:
@@ -58,7 +67,7 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
     for number, item in enumerate(described["classes"]):
         colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
         numbers = (f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise"))
-        classes.add_row(str(number), item["name"], f"[on {colour}]  [/] {colour}", *numbers)
+        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers)
     yield classes
 
 

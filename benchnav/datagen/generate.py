@@ -76,14 +76,10 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     mean = latent.latent_mean(maps["class_id"], maps["slope_deg"], recipe.classes)
     expected = latent.expected_traversability(mean, latent.latent_std(maps["class_id"], recipe.classes))
     costs = gridgraph.travel_time_costs(expected, expected > recipe.stuck_threshold, recipe.resolution_m)
-    (start_column, start_row), (goal_column, goal_row) = (
-        (int(value / recipe.resolution_m) for value in position)
-        for position in (recipe.start_m, recipe.goal_m)
-    )
     goals = np.zeros(expected.shape, dtype=bool)
-    goals[:, goal_row, goal_column] = True
+    goals[(slice(None), *recipe.cell_of(recipe.goal_m))] = True
     cost, _ = gridgraph.cost_to_go(costs, goals, recipe.grid.shape)
-    return cost[:, start_row, start_column]
+    return cost[(slice(None), *recipe.cell_of(recipe.start_m))]
 
 
 def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0) -> np.ndarray:

@@ -40,7 +40,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         in_memory: bool = False,
     ) -> None:
         """Checks split and fields, and reads the maps where that is asked for."""
-        self.dataset, self.split, self.fields = TerrainDataset(path), split, tuple(fields)
+        self.dataset, self.split, self.fields = TerrainDataset(Path(path).resolve()), split, tuple(fields)
         unknown = sorted(set(fields) - set(schema.FIELDS))
         if unknown or not fields:
             raise DatasetError(
@@ -70,13 +70,13 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
             raise IndexError(f"Expected a map index in 0–{len(self) - 1}, got {index}.")
         index = int(index) % len(self)
         if self._memory is not None:
-            return {name: values[index] for name, values in self._memory.items()}
-        sample = {}
-        for name, array in self._arrays().items():
-            try:
+            return {name: values[index].clone() for name, values in self._memory.items()}
+        sample, name = {}, self.fields[0]
+        try:
+            for name, array in self._arrays().items():
                 sample[name] = torch.from_numpy(np.asarray(array[index]))
-            except READ_ERRORS as error:
-                raise self.dataset.damage(self.split, name, error) from error
+        except READ_ERRORS as error:
+            raise self.dataset.damage(self.split, name, error) from error
         return sample
 
     def __getstate__(self) -> dict[str, Any]:

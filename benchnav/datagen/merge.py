@@ -1,6 +1,6 @@
 """Combines datasets: splits side by side, and those of one name end to end."""
 
-import re
+import json
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 
 from benchnav.datagen import schema
-from benchnav.datagen.block import Block
-from benchnav.datagen.scenario import Recipe, recipe_from_dict
+from benchnav.datagen.block import BLOCK_MAPS, Block, spans
+from benchnav.datagen.scenario import Recipe, check_name, recipe_from_dict
 from benchnav.datagen.store import TerrainDataset
-from benchnav.datagen.writer import check_target, named_errors, writing
-from benchnav.errors import DatasetError
-
-_BLOCK_MAPS = 64
+from benchnav.datagen.writer import check_target, writing
+from benchnav.errors import ConfigError, DatasetError
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
@@ -37,59 +35,67 @@ def merge(
     Raises:
         DatasetError: the datasets are unlike, with every reason; one is damaged; or `out` exists.
     """
-    check_target(out, overwrite)
+    check_target(out, overwrite=True)
     datasets = [TerrainDataset(path) for path in paths]
     reasons = list(why_unlike(datasets))
     if len(datasets) < 2:
         reasons.append("fewer than two files")
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", dataset_id):
-        reasons.append(f"id {dataset_id!r} is not of letters, digits, '.', '_' and '-'")
+    try:
+        check_name("id", dataset_id)
+    except ConfigError as error:
+        reasons.append(str(error).rstrip("."))
     if reasons:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
     recipes, splits = _table_of_contents(datasets)
     total, done = sum(entry["maps"] for entry in splits.values()), 0
-    with named_errors(out), writing(out, dataset_id, recipes, splits) as write:
+    with writing(out, dataset_id, recipes, splits, overwrite) as write:
         for split in splits:
             for dataset in datasets:
                 maps = dataset.splits.get(split, {"maps": 0})["maps"]
-                for start in range(0, maps, _BLOCK_MAPS):
-                    indices = range(start, min(start + _BLOCK_MAPS, maps))
-                    write(split, _read_checked(dataset, split, indices))
-                    done += len(indices)
+                for start, stop in spans(maps, BLOCK_MAPS):
+                    write(split, _read_checked(dataset, split, range(start, stop)))
+                    done += stop - start
                     yield done, total
 
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
     """Gives every reason why datasets cannot be one."""
-    for first, second in combinations(datasets, 2):
-        ours, theirs = first.recipe, second.recipe
+    prints = [_fingerprints(dataset) for dataset in datasets]
+    for one, other in combinations(range(len(datasets)), 2):
+        first, second = datasets[one], datasets[other]
         pair = f"{first.path} and {second.path}"
         for name in _SHARED:
-            if getattr(ours, name) != getattr(theirs, name):
-                values = "" if name == "classes" else f" ({getattr(ours, name)}, {getattr(theirs, name)})"
-                yield f"{pair} have unlike {name}{values}"
+            ours, theirs = getattr(first.recipe, name), getattr(second.recipe, name)
+            if ours != theirs:
+                yield f"{pair} have unlike {name}" + ("" if name == "classes" else f" ({ours}, {theirs})")
         for split in sorted(set(first.splits) & set(second.splits)):
-            yield from (f"{pair} {reason}" for reason in _unlike_split(ours, theirs, split))
-        common = np.intersect1d(_fingerprints(first), _fingerprints(second))
+            if not _kinds(first, split) | _kinds(second, split) <= _kinds(first, split) & _kinds(
+                second, split
+            ):
+                yield f"{pair} have unlike scenarios or `solvable` in split {split!r}"
+        common = np.intersect1d(prints[one], prints[other])
         if len(common):
             yield f"{pair} have {len(common)} map(s) in common"
 
 
-def _unlike_split(ours: Recipe, theirs: Recipe, split: str) -> Iterator[str]:
-    if split not in ours.splits or split not in theirs.splits:
-        return
-    one, other = ours.splits[split], theirs.splits[split]
-    if one.scenario != other.scenario or ours.scenarios[one.scenario] != theirs.scenarios[other.scenario]:
-        yield f"have unlike scenarios in split {split!r}"
-    if one.solvable != other.solvable:
-        yield f"have unlike `solvable` in split {split!r}"
+def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
+    """What the maps of a split are by their recipes: scenario, and whether all can be solved."""
+    kinds = set()
+    for part in dataset.splits[split]["parts"]:
+        if "recipe" not in part:
+            kinds.add("imported")
+            continue
+        recipe = dataset.manifest["recipes"][part["recipe"]]
+        spec = recipe["splits"][part["split"]]
+        scenario = recipe["scenarios"][spec["scenario"]]
+        kinds.add(json.dumps([spec["scenario"], scenario, spec["solvable"]], sort_keys=True))
+    return kinds
 
 
 def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
     """The digests of all elevation maps, shape [N]."""
     column = list(schema.FIELDS).index("elevation_m")
-    with dataset.open() as file:
-        digests = [file[split][schema.ENTRY_DIGESTS][:, column] for split in dataset.splits]
+    digests = [dataset.entry_digests(split)[:, column] for split in dataset.splits]
     return np.ascontiguousarray(np.concatenate(digests)).view(f"S{schema.DIGEST_BYTES}").ravel()
 
 
@@ -111,9 +117,7 @@ def _table_of_contents(datasets: Sequence[TerrainDataset]) -> tuple[list[Recipe]
 
 def _read_checked(dataset: TerrainDataset, split: str, indices: range) -> Block:
     block = Block.of(dataset.read(split, indices))
-    with dataset.open() as file:
-        stored = file[split][schema.ENTRY_DIGESTS][indices.start : indices.stop]
-    if not np.array_equal(stored, block.digests):
+    if not np.array_equal(dataset.entry_digests(split, indices), block.digests):
         raise DatasetError(
             f"Maps of split {split!r} in {dataset.path} do not match their digests. "
             "Run `benchnav-datagen validate` on it, and `repair`."

@@ -6,15 +6,13 @@ from typing import Any
 import numpy as np
 
 from benchnav.datagen import schema
-from benchnav.datagen.block import Block
+from benchnav.datagen.block import BLOCK_MAPS, Block, spans
 from benchnav.datagen.generate import Maps, generate
 from benchnav.datagen.scenario import Recipe, recipe_from_dict
 from benchnav.datagen.store import TerrainDataset
 from benchnav.datagen.validate import Fault
-from benchnav.datagen.writer import named_errors, writing
+from benchnav.datagen.writer import writing
 from benchnav.errors import DatasetError
-
-_BLOCK_MAPS = 64
 
 
 def maps_to_make(dataset: TerrainDataset, faults: list[Fault]) -> dict[str, np.ndarray]:
@@ -61,11 +59,12 @@ def repair(dataset: TerrainDataset, chosen: dict[str, np.ndarray]) -> Iterator[t
         for name, entry in dataset.splits.items()
     }
     total, done = sum(entry["maps"] for entry in splits.values()), 0
-    with named_errors(dataset.path), writing(dataset.path, dataset.id, recipes, splits) as write:
+    # Through a link, so that the file is mended and not the link replaced.
+    with writing(dataset.path.resolve(), dataset.id, recipes, splits, overwrite=True) as write:
         for split, entry in splits.items():
             digest = schema.SplitDigest(entry["maps"], height, width)
-            for start in range(0, entry["maps"], _BLOCK_MAPS):
-                indices = np.arange(start, min(start + _BLOCK_MAPS, entry["maps"]))
+            for span in spans(entry["maps"], BLOCK_MAPS):
+                indices = np.arange(*span)
                 block = Block.of(_read_or_make(dataset, recipes, split, indices, chosen[split]))
                 digest.update(block.digests)
                 write(split, block)

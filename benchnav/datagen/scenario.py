@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import yaml
 
 from benchnav.datagen.latent import TerrainClass
+from benchnav.datagen.schema import FIELDS
 from benchnav.errors import ConfigError
 from benchnav.terrain import Grid
 
@@ -52,10 +54,10 @@ class Scenario:
     def __post_init__(self) -> None:
         """Refuses ranges that are not finite, ordered, or physical."""
         limits: dict[str, Range] = {
-            "relief_m": (0, np.inf),
+            "relief_m": (0, 1000),
             "roughness": (0, 1),
             "crater_count": (0, 1000),
-            "crater_radius_m": (1e-6, np.inf),
+            "crater_radius_m": (1e-6, 1e4),
             "crater_depth_ratio": (0, 1),
             "light_height": (0, 1),
             "ambient": (0, 1),
@@ -157,8 +159,14 @@ class Recipe:
                 raise ConfigError(
                     f"Expected `{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y})."
                 )
-        if self.start_m == self.goal_m:
-            raise ConfigError(f"Expected `goal_m` apart from `start_m`, got both at {self.goal_m}.")
+        if self.cell_of(self.start_m) == self.cell_of(self.goal_m):
+            raise ConfigError(
+                f"Expected `goal_m` in another cell than `start_m`, got both in that of {self.goal_m}."
+            )
+        if not 0 <= self.stuck_threshold < 1:
+            raise ConfigError(f"Expected `stuck_threshold` in [0, 1), got {self.stuck_threshold}.")
+        if not self.classes:
+            raise ConfigError("Expected at least one class in `classes`, got none.")
         for name, scenario in self.scenarios.items():
             if scenario.crater_count[1] > 0 and 2 * scenario.crater_radius_m[1] > min(extent_x, extent_y):
                 raise ConfigError(
@@ -179,19 +187,24 @@ class Recipe:
             raise ConfigError(
                 f"Expected at most {len(self.classes)} shares in `occupancy`, one a class, got {len(self.occupancy)}."
             )
-        if self.environments < 1:
-            raise ConfigError(f"Expected `environments` ≥ 1, got {self.environments}.")
-        if not self.class_periods_m or not all(0 < period < np.inf for period in self.class_periods_m):
-            raise ConfigError(f"Expected `class_periods_m` > 0, got {list(self.class_periods_m)}.")
+        most = FIELDS["environment"].most
+        if not 1 <= self.environments <= most:
+            raise ConfigError(f"Expected `environments` in 1–{most}, got {self.environments}.")
+        if not self.class_periods_m or not all(
+            self.resolution_m <= period < np.inf for period in self.class_periods_m
+        ):
+            raise ConfigError(
+                f"Expected `class_periods_m` of at least a cell, {self.resolution_m} m, "
+                f"got {list(self.class_periods_m)}."
+            )
         if len(self.classes) > 256:
             raise ConfigError(f"Expected at most 256 classes, got {len(self.classes)}.")
-        for kind, names in (
-            ("id", [self.id]),
-            ("split name", [p for n in self.splits for p in n.split("/")]),
-        ):
-            for name in names:
-                if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name == "manifest":
-                    raise ConfigError(f"Expected {kind} of letters, digits, '.', '_' and '-', got {name!r}.")
+        check_name("id", self.id)
+        for split_name in self.splits:
+            for part in split_name.split("/"):
+                check_name("split name", part)
+            if any(other.startswith(f"{split_name}/") for other in self.splits):
+                raise ConfigError(f"Expected splits side by side, got one inside {split_name!r}.")
         if not self.splits:
             raise ConfigError("Expected at least one split in `splits`, got none.")
         for name, split in self.splits.items():
@@ -205,6 +218,11 @@ class Recipe:
     def grid(self) -> Grid:
         """Size and resolution of every map."""
         return Grid(self.height, self.width, self.resolution_m)
+
+    def cell_of(self, position_m: tuple[float, float]) -> tuple[int, int]:
+        """Row and column of the cell that a position lies in, read in single precision as it is stored."""
+        row, column = self.grid.cell_of(*torch.tensor(position_m, dtype=torch.float32))
+        return int(row), int(column)
 
     def environment_classes(self, environment: int) -> np.ndarray:
         """The classes an environment shows: consecutive deals from one pack, so all are used equally.
@@ -255,12 +273,23 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         raise ConfigError(
             f"Expected `id=NAME` among the overrides, since {recipe.id!r} names the maps of the recipe as it is."
         )
-    if path.parent != RECIPES and recipe.id in shipped_recipes() and recipe != load_recipe(recipe.id):
+    as_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
+    if not as_shipped and recipe.id in shipped_recipes() and recipe != load_recipe(recipe.id):
         raise ConfigError(
-            f"Expected an `id` of its own in {path}, got {recipe.id!r}, which names other maps: "
+            f"Expected an `id` of its own in {source}, got {recipe.id!r}, which names other maps: "
             "a recipe shipped with the package."
         )
     return recipe
+
+
+def check_name(kind: str, name: str) -> None:
+    """Refuses names that would not do as a file's or a group's.
+
+    Raises:
+        ConfigError: with `kind` in its message.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name == "manifest":
+        raise ConfigError(f"Expected {kind} of letters, digits, '.', '_' and '-', got {name!r}.")
 
 
 def override(data: Any, overrides: Sequence[str]) -> Any:
@@ -308,6 +337,12 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
     """
     if not isinstance(data, dict):
         raise ConfigError(f"Expected a mapping in recipe {origin}, got {type(data).__name__}.")
+    for key in ("splits", "scenarios"):
+        named = data.get(key)
+        if isinstance(named, dict) and not all(isinstance(name, str) for name in named):
+            raise ConfigError(
+                f"Expected names in `{key}` of recipe {origin}, got {list(named)}. Quote numbers."
+            )
     presets = yaml.safe_load(PRESETS.read_text())
     data = {"classes": "default", **data}
     if data["classes"] == "default":

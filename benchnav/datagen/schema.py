@@ -7,7 +7,7 @@ the file's bytes, so they are the same whatever compression, machine or number o
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,21 +72,22 @@ def quantise(values: np.ndarray, bits: int) -> np.ndarray:
     return steps
 
 
-def entry_digests(maps: Mapping[str, np.ndarray]) -> np.ndarray:
+def entry_digests(maps: Mapping[str, np.ndarray], names: Sequence[str] = tuple(FIELDS)) -> np.ndarray:
     """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
 
     Args:
-        maps: every field of `FIELDS`, each of shape [B, *entry shape].
+        maps: arrays by field, each of shape [B, *entry shape].
+        names: the F fields to digest; all, in the order of `FIELDS`.
 
     Returns:
-        uint8, shape [B, F, 32], the F fields in the order of `FIELDS`.
+        uint8, shape [B, F, 32].
     """
     columns = []
-    for name, field in FIELDS.items():
-        entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
+    for name in names:
+        entries = np.ascontiguousarray(maps[name], dtype=FIELDS[name].dtype)
         columns.append([hashlib.sha256(entry.tobytes()).digest() for entry in entries])
     digests = np.frombuffer(b"".join(b"".join(row) for row in zip(*columns, strict=True)), np.uint8)
-    return digests.reshape(-1, len(FIELDS), DIGEST_BYTES)
+    return digests.reshape(-1, len(names), DIGEST_BYTES)
 
 
 class SplitDigest:

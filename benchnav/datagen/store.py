@@ -86,22 +86,44 @@ class TerrainDataset:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
         size = self.map_count(split)
-        if indices is not None and len(indices) and not (min(indices) >= 0 and max(indices) < size):
-            raise DatasetError(
-                f"Expected map indices in 0–{size - 1} of split {split!r}, got {list(indices)}."
-            )
-        # HDF5 reads ascending indices, each once; the asked order is made afterwards.
-        chosen, order = (
-            (slice(None), slice(None)) if indices is None else np.unique(indices, return_inverse=True)
-        )
+        names = tuple(schema.FIELDS if fields is None else fields)
+        unknown = [name for name in names if name not in schema.FIELDS]
+        if unknown:
+            raise DatasetError(f"Expected `fields` among {list(schema.FIELDS)}, got {unknown}.")
+        if indices is not None:
+            chosen = np.asarray(indices)
+            whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
+            if not whole or (chosen < 0).any() or (chosen >= size).any():
+                raise DatasetError(
+                    f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen.tolist()}."
+                )
         with self.open() as file:
-            arrays = {}
-            for name in fields or schema.FIELDS:
-                try:
-                    arrays[name] = file[split][name][chosen][order]
-                except READ_ERRORS as error:
-                    raise self.damage(split, name, error) from error
-        return arrays
+            return {name: self._read_array(file, split, name, indices) for name in names}
+
+    def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
+        """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
+
+        Raises:
+            DatasetError: no such split, or a stored chunk is damaged.
+        """
+        self.map_count(split)
+        with self.open() as file:
+            return self._read_array(file, split, schema.ENTRY_DIGESTS, indices)
+
+    def _read_array(
+        self, file: h5py.File, split: str, name: str, indices: Sequence[int] | None
+    ) -> np.ndarray:
+        # HDF5 reads ascending indices, each once; the asked order is made afterwards.
+        everything = (slice(None), slice(None))
+        chosen, order = (
+            everything
+            if indices is None
+            else np.unique(np.asarray(indices, dtype=np.int64), return_inverse=True)
+        )
+        try:
+            return file[split][name][chosen][order]
+        except READ_ERRORS as error:
+            raise self.damage(split, name, error) from error
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> Terrain:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
@@ -140,6 +162,10 @@ class TerrainDataset:
         """
         try:
             return h5py.File(self.path, "r")
+        except FileNotFoundError as error:
+            raise DatasetError(
+                f"Expected a dataset file, got {self.path}, which is not there any more."
+            ) from error
         except OSError as error:
             raise DatasetError(f"{self.path} is no readable HDF5 file: {error}. Make it again.") from error
 

@@ -1,6 +1,7 @@
 """Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split digests."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,9 +9,8 @@ import h5py
 import numpy as np
 
 from benchnav.datagen import schema
+from benchnav.datagen.block import BLOCK_MAPS, spans
 from benchnav.datagen.store import READ_ERRORS, TerrainDataset
-
-_BLOCK_MAPS = 64
 
 
 @dataclass(frozen=True, order=True)
@@ -74,24 +74,21 @@ def _split_faults(dataset: TerrainDataset, file: h5py.File, split: str) -> Itera
             yield Fault(split, -1, name, f"is {found[0]} {list(found[1])}, not {dtype} {[maps, *entry]}")
     digest, readable = schema.SplitDigest(maps, height, width), set(schema.FIELDS) <= set(sound)
     unlike: list[tuple[int, str]] = []
-    for start in range(0, maps, _BLOCK_MAPS):
-        stop = min(start + _BLOCK_MAPS, maps)
-        block: dict[str, np.ndarray] = {}
-        for name, array in sound.items():
-            try:
-                block[name] = array[start:stop]
-            except READ_ERRORS:
-                yield from _damaged_entries(split, name, array, start, stop)
-        for name in set(block) & set(schema.FIELDS):
+    for start, block in _read_blocks(sound, maps):
+        yield from (Fault(split, start, name, "is damaged") for name in sound if name not in block)
+        fields = [name for name in schema.FIELDS if name in block]
+        for name in fields:
             yield from _out_of_range(split, name, block[name], start, len(dataset.recipe.classes))
-        if not set(schema.FIELDS) <= set(block):
-            readable = False
+        readable = readable and len(fields) == len(schema.FIELDS)
+        if not fields:
             continue
-        digests = schema.entry_digests(block)
-        digest.update(digests)
+        digests = schema.entry_digests(block, fields)
+        if readable:
+            digest.update(digests)
         if schema.ENTRY_DIGESTS in block:
-            differ = np.argwhere((digests != block[schema.ENTRY_DIGESTS]).any(axis=2)).tolist()
-            unlike += [(start + index, list(schema.FIELDS)[column]) for index, column in differ]
+            columns = [list(schema.FIELDS).index(name) for name in fields]
+            differ = (digests != block[schema.ENTRY_DIGESTS][:, columns]).any(axis=2)
+            unlike += [(start + index, fields[column]) for index, column in np.argwhere(differ).tolist()]
     if readable and digest.hexdigest() == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
         for index in sorted({index for index, _ in unlike}):
@@ -103,13 +100,18 @@ def _split_faults(dataset: TerrainDataset, file: h5py.File, split: str) -> Itera
         yield Fault(split, -1, "", "the maps do not match the digest in the manifest")
 
 
-def _damaged_entries(split: str, name: str, array: h5py.Dataset, start: int, stop: int) -> Iterator[Fault]:
-    """Names the maps of a stretch that cannot be read."""
-    for index in range(start, stop):
+def _read_blocks(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Reads blocks of maps; of one that cannot be read whole, each map, with the arrays that can be read."""
+    for start, stop in spans(maps, BLOCK_MAPS):
         try:
-            array[index]
+            yield start, {name: array[start:stop] for name, array in arrays.items()}
         except READ_ERRORS:
-            yield Fault(split, index, name, "is damaged")
+            for index in range(start, stop):
+                readable = {}
+                for name, array in arrays.items():
+                    with suppress(*READ_ERRORS):
+                        readable[name] = array[index : index + 1]
+                yield index, readable
 
 
 def _out_of_range(split: str, name: str, values: np.ndarray, start: int, classes: int) -> Iterator[Fault]:

@@ -7,6 +7,7 @@ partial file.
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,13 @@ _SPARE_BYTES_A_MAP = 512
 
 
 def check_target(path: Path, overwrite: bool) -> None:
-    """Refuses a target that is there, unless it is to be replaced.
+    """Refuses a target that is there, unless it is to be replaced, and one that is a folder.
 
     Raises:
-        DatasetError: `path` exists and `overwrite` is false.
+        DatasetError: `path` exists and `overwrite` is false, or it is a folder.
     """
+    if path.is_dir():
+        raise DatasetError(f"Expected `out` to be a file, got the folder {path}.")
     if path.exists() and not overwrite:
         raise DatasetError(
             f"Expected `out` to be a new file, but {path} exists. Pass --overwrite to replace it."
@@ -39,7 +42,11 @@ def check_target(path: Path, overwrite: bool) -> None:
 
 @contextmanager
 def writing(
-    path: Path, dataset_id: str, recipes: list[Recipe], splits: dict[str, dict[str, Any]]
+    path: Path,
+    dataset_id: str,
+    recipes: list[Recipe],
+    splits: dict[str, dict[str, Any]],
+    overwrite: bool = False,
 ) -> Iterator[Callable[[str, Block], None]]:
     """Writes a dataset file, in a workspace of its own that it leaves no trace of.
 
@@ -48,17 +55,20 @@ def writing(
         dataset_id: name and version of the dataset.
         recipes: what the splits' parts refer to by number. The first gives grid and class table.
         splits: by name, the manifest's entry of each split without its digest.
+        overwrite: replace a file that is there.
 
     Yields:
         A function to be given every block with the name of its split, each split's in the order of
         its maps.
     """
-    with named_errors(path), workspace(path) as folder:
+    with named_errors(path), workspace(path, overwrite) as folder:
         try:
             with writing_into(folder, path, dataset_id, recipes, splits) as write:
                 yield write
         finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            # What a killed run made of the same name is not this one's to remove.
+            if not any(folder.glob("*.block")):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
@@ -108,6 +118,8 @@ def writing_into(
         with open(unfinished, "rb+") as finished:
             finished.truncate(size)
             os.fsync(finished.fileno())
+        if path.exists():
+            shutil.copymode(path, unfinished)
         os.replace(unfinished, path)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -124,15 +136,20 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 @contextmanager
-def workspace(path: Path) -> Iterator[Path]:
+def workspace(path: Path, overwrite: bool) -> Iterator[Path]:
     """Holds the folder for what is unfinished of a file, for one process; a kill frees it.
 
     Raises:
         BenchnavError: another process holds it.
+        DatasetError: the file is there, and not to be replaced.
     """
     folder = path.parent / f".{path.name}.partial"
     folder.mkdir(exist_ok=True)
     with sole_writer(folder, str(path)):
+        # Asked here, since another run may have finished it before this one came to hold the folder.
+        if path.exists() and not overwrite:
+            shutil.rmtree(folder, ignore_errors=True)
+        check_target(path, overwrite)
         yield folder
 
 
@@ -146,6 +163,11 @@ def named_errors(path: Path) -> Iterator[None]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            f"A worker that made maps of {path} was killed, perhaps for want of memory. Give the same command "
+            "again with fewer `jobs`; what was finished is kept."
+        ) from error
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise DatasetError(

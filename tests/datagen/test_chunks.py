@@ -55,3 +55,15 @@ def test_noise_takes_less_room_than_with_hdf5s_own_deflate() -> None:
         own = file.create_dataset("x", data=entry[None], chunks=(1, 64, 64), shuffle=True, compression="gzip")
         file.flush()
         assert len(chunks.encode(entry)) < 1.02 * own.id.get_storage_size()
+
+
+def test_checksum_holds_for_chunks_of_any_size() -> None:
+    # Sums in Python's integers, which do not overflow.
+    data = b"\xff" * (3 << 20) + bytes(range(251)) * 5000 + b"\x07"
+    words = np.frombuffer(data + b"\0" * (len(data) % 2), ">u2").tolist()
+    first = second = 0
+    for word in words:
+        first += word
+        second += first
+    fold = [total and (total - 1) % 65535 + 1 for total in (second, first)]
+    assert chunks.fletcher32(data) == fold[0] << 16 | fold[1]

@@ -151,3 +151,16 @@ def test_an_error_in_a_worker_is_the_runs_error(tmp_path: Path) -> None:
         for _ in create(recipe, tmp_path / "d.h5", jobs=2):
             pass
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_another_run_finished_meanwhile_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "d.h5"
+    late = create(tiny_recipe(), path, jobs=2)  # has asked nothing yet
+    tiny_dataset(path, tiny_recipe(train=9))
+    before = path.read_bytes()
+    with pytest.raises(DatasetError, match="exists"):
+        next(late)
+    assert path.read_bytes() == before
+    assert [item.name for item in tmp_path.iterdir()] == ["d.h5"]
+    with pytest.raises(DatasetError, match="got the folder"):
+        next(create(tiny_recipe(), tmp_path, overwrite=True))

@@ -65,6 +65,22 @@ def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys)
     assert datagen("validate", "d.h5") == 0
 
 
+def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5") == 0
+    with h5py.File("d.h5", "r+") as file:
+        del file["train/slope_deg"], file["train/entry_digests"]
+    for arguments in (["show", "d.h5"], ["merge", "d.h5", "d.h5", "--out", "m.h5"]):
+        capsys.readouterr()
+        assert datagen(*arguments) == 2
+        assert "repair" in capsys.readouterr().err
+    whole = Path("d.h5").read_bytes()
+    Path("d.h5").write_bytes(whole[: len(whole) // 2])
+    capsys.readouterr()
+    assert datagen("validate", "d.h5") == 1
+    assert "1 fault(s)" in capsys.readouterr().out
+    assert datagen("repair", "d.h5") == 2
+
+
 def test_parts_made_apart_are_merged(datagen: Call) -> None:
     assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "a.h5") == 0
     assert datagen("create", "tiny-v1", *SMALL, "--splits", "[valid]", "--out", "b.h5", "--jobs", "2") == 0
@@ -118,7 +134,15 @@ def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:
         ("relief_m: [1.0, 1.2]", "relief_m: [1.0, .nan]", "relief_m"),
         ("occupancy: [0.3", "occupancy: [.nan", "occupancy"),
         ("start_m: [4, 4]", "start_m: [.nan, 4]", "start_m"),
-        ("stuck_threshold: 0.3", "stuck_threshold: .nan", "stuck_threshold"),
+        ("stuck_threshold: 0.3", "stuck_threshold: .nan", "Expected `stuck_threshold`"),
+        ("stuck_threshold: 0.3", "stuck_threshold: 5", "Expected `stuck_threshold`"),
+        ("relief_m: [1.0, 1.2]", "relief_m: [20000, 20000]", "relief_m"),
+        ("environments: 5", "environments: 40000", "environments"),
+        ("class_periods_m: [6, 3]", "class_periods_m: [0.000000001]", "class_periods_m"),
+        ("  train:", "  1:", "Quote numbers"),
+        ("  train:", "  test:", "side by side"),
+        ("classes: default", "classes: []", "`classes`"),
+        ("goal_m: [12, 12]", "goal_m: [4.1, 4.1]", "another cell"),
         ("stuck_threshold: 0.3", "stuck_threshold: 0.999", "goal can be reached"),
         ("class_periods_m: [6, 3]", "class_periods_m: [.nan, 3]", "class_periods_m"),
         ("{preset: hs, relief", "{preset: hs, severity: .nan, relief", "severity"),
@@ -154,6 +178,8 @@ def test_a_bad_recipe_is_one_clear_line_and_status_2(
         ["create", "tiny-v1", "id=x", "splits.train"],
         ["create", "tiny-v1", "id=x", "nothing.at.all=3"],
         ["create", "tiny-v1", "id=x", "seed=[1"],
+        ["create", "tiny-v1", "id=paper-v1"],
+        ["list", "--folder", "nope"],
         ["create", "tiny-v1", "--jobs", "0"],
         ["create", "tiny-v1", "--splits", "[nope]"],
         ["create", "tiny-v1", "--seed", "many"],

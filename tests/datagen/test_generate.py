@@ -3,6 +3,7 @@ from dataclasses import replace
 import networkx
 import numpy as np
 import pytest
+import torch
 
 from benchnav.datagen.generate import generate
 from benchnav.datagen.latent import expected_traversability, latent_mean, latent_std
@@ -74,8 +75,6 @@ def test_solvable_instances_have_the_reference_time_of_networkx() -> None:
         latent_mean(maps["class_id"], slope, recipe.classes),
         latent_std(maps["class_id"], recipe.classes),
     )
-    import torch
-
     shaped = [torch.from_numpy(a)[:, None] for a in (np.ones_like(means), means, stds)]
     expected = TraversabilityMixture(*shaped).mean().numpy()
     for b in range(4):
@@ -96,3 +95,22 @@ def test_a_recipe_that_cannot_be_met_says_so() -> None:
     recipe = replace(tiny_recipe(), stuck_threshold=0.999)
     with pytest.raises(ConfigError, match="goal can be reached"):
         generate(recipe, "test/std", np.arange(2))
+
+
+def test_start_and_goal_are_free_in_the_cells_that_a_robot_stands_in() -> None:
+    tiny = tiny_recipe()
+    recipe = replace(
+        tiny,
+        resolution_m=0.1,
+        start_m=(0.7, 0.7),
+        goal_m=(2.9, 2.9),
+        class_periods_m=(1.2, 0.6),
+        scenarios={"std": replace(tiny.scenarios["std"], relief_m=(0.3, 0.4))},
+        splits={"test/std": tiny.splits["test/std"]},
+    )
+    maps = generate(recipe, "test/std", np.arange(60))
+    mean = latent_mean(maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes)
+    expected = expected_traversability(mean, latent_std(maps["class_id"], recipe.classes))
+    for name in ("start_m", "goal_m"):
+        row, column = recipe.grid.cell_of(*torch.from_numpy(maps[name][0]))
+        assert (expected[:, row, column] > recipe.stuck_threshold).all()

@@ -57,3 +57,21 @@ def test_bad_requests_and_damage_are_named(tmp_path: Path) -> None:
     assert maps[0]
     with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
         maps[1]
+
+
+def test_maps_from_memory_are_copies_and_relative_paths_hold(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.chdir(dataset_path.parent)
+    maps = [TerrainMaps(dataset_path.name, "train", in_memory=there) for there in (False, True)]
+    monkeypatch.chdir("/")
+    before = maps[0][2]["rgb"].clone()
+    for source in maps:
+        source[2]["rgb"].zero_()
+        assert torch.equal(source[2]["rgb"], before)
+
+
+def test_a_missing_array_is_damage(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with h5py.File(path, "r+") as file:
+        del file["train/rgb"]
+    with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
+        TerrainMaps(path, "train")[0]

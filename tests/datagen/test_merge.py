@@ -5,6 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
+from benchnav.datagen.create import create
 from benchnav.datagen.merge import merge
 from benchnav.datagen.repair import maps_to_make, repair
 from benchnav.datagen.scenario import Recipe
@@ -65,8 +66,8 @@ def test_all_reasons_are_given_at_once(tmp_path: Path) -> None:
     with pytest.raises(DatasetError) as caught:
         run([first, second, first], tmp_path / "m.h5", "no spaces")
     for reason in (
-        r"unlike resolution_m (0.5, 0.6)", "unlike classes", "unlike scenarios in split 'test/hs'",
-        "10 map(s) in common", "id 'no spaces'",
+        r"unlike resolution_m (0.5, 0.6)", "unlike classes", "unlike scenarios or `solvable` in split 'test/hs'",
+        "10 map(s) in common", "got 'no spaces'",
     ):  # fmt: skip
         assert reason in str(caught.value)
     assert not (tmp_path / "m.h5").exists()
@@ -85,3 +86,26 @@ def test_a_damaged_source_is_refused_and_an_existing_target_kept(tmp_path: Path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]
     with pytest.raises(DatasetError, match="exists"):
         run([first, second], first)
+
+
+def test_unlike_scenarios_are_found_in_files_that_were_merged_before(tmp_path: Path) -> None:
+    recipe = tiny_recipe()
+    first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train"))
+    second = tiny_dataset(tmp_path / "b.h5", only(recipe, "test/hs"))
+    scenarios = recipe.scenarios | {"hs": replace(recipe.scenarios["hs"], ambient=0.5)}
+    third = tiny_dataset(tmp_path / "c.h5", only(replace(recipe, seed=9, scenarios=scenarios), "test/hs"))
+    both = run([first, second], tmp_path / "ab.h5").path
+    for order in ([both, third], [third, both]):
+        with pytest.raises(DatasetError, match=r"unlike scenarios .*'test/hs'"):
+            run(order, tmp_path / "m.h5")
+
+
+def test_what_a_killed_run_made_of_the_same_name_is_kept(tmp_path: Path) -> None:
+    recipe = tiny_recipe()
+    steps = create(recipe, tmp_path / "m.h5", block_maps=4)
+    next(steps)
+    steps.close()
+    kept = set((tmp_path / ".m.h5.partial").glob("*.block"))
+    parts = [tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name)) for name in ("train", "valid")]
+    run(parts, tmp_path / "m.h5")
+    assert kept <= set((tmp_path / ".m.h5.partial").glob("*.block"))

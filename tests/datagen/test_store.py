@@ -66,5 +66,12 @@ def test_bad_requests_are_named(dataset_path: Path) -> None:
         dataset.read("nope")
     with pytest.raises(DatasetError, match="0–7"):
         dataset.read("train", [8])
+    for indices in ([-1], [0.5]):
+        with pytest.raises(DatasetError, match="0–7"):
+            dataset.read("train", indices)  # type: ignore[arg-type]
+    with pytest.raises(DatasetError, match=r"fields.*'colour'"):
+        dataset.read("train", fields=["colour"])
+    assert dataset.read("train", [], ["rgb"])["rgb"].shape == (0, 3, 32, 32)
+    assert dataset.read("train", fields=[]) == {}
     with pytest.raises(DatasetError, match="neither a file"):
         find_dataset("no-such-id")

@@ -157,3 +157,28 @@ def test_every_random_flip_in_data_is_found_and_mended(tmp_path: Path, seed: int
         # Unused room between arrays is no data: a flip there changes nothing.
         assert faults or same(content(path), sound)
     assert found > 12
+
+
+def test_damage_of_two_kinds_in_neighbouring_maps_is_named_and_mended(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    before = content(path)
+    with h5py.File(path, "r+") as file:
+        file["train/class_id"][5] = 1
+    flip(path, "train", "rgb", 3)
+    assert sorted(find_faults(path)) == [
+        Fault("train", 3, "rgb", "is damaged"),
+        Fault("train", 5, "class_id", "does not match its digest"),
+    ]
+    assert mend(path) == {"train": [3, 5]}
+    assert same(content(path), before)
+
+
+def test_a_file_is_mended_through_a_link_and_keeps_its_mode(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    path.chmod(0o600)
+    (tmp_path / "link.h5").symlink_to(path)
+    flip(path, "train", "rgb", 3)
+    mend(tmp_path / "link.h5")
+    assert (tmp_path / "link.h5").is_symlink()
+    assert find_faults(path) == []
+    assert path.stat().st_mode & 0o777 == 0o600
