@@ -8,7 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from benchnav.errors import BenchnavError
 
@@ -56,7 +56,7 @@ def run(
         child.add_argument("--config", action="config", help="Path of a YAML file with these settings.")
         hints = get_type_hints(command.function)
         for positional in command.positionals:
-            rest = {"type": str, "nargs": "*"} if hints[positional] == list[str] else {}
+            rest = {"type": str, "nargs": "*", "default": []} if hints[positional] == list[str] else {}
             child.add_argument(
                 positional,
                 **({"type": hints[positional]} | rest),
@@ -131,11 +131,20 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
 
 
 def _as_parsed(argv: Sequence[str], commands: dict[str, Command]) -> list[str]:
-    """Spells flags as the parser knows them: `--contact-sheet` for `--contact_sheet true`."""
+    """Spells flags as the parser knows them.
+
+    `--contact-sheet` for `--contact_sheet true`, and `--maps 3` for `--maps [3]`.
+    """
     hints = [get_type_hints(command.function) for command in commands.values()]
-    switches = {f"--{name}" for types in hints for name, kind in types.items() if kind is bool}
-    spelled = []
+    hints += [get_type_hints(command.settings) for command in commands.values() if command.settings]
+    kinds = {f"--{name}": kind for types in hints for name, kind in types.items()}
+    switches = {name for name, kind in kinds.items() if kind is bool}
+    lists = {name for name, kind in kinds.items() if _is_list(kind)}
+    spelled: list[str] = []
     for word, following in zip(argv, [*argv[1:], ""], strict=True):
+        if spelled and spelled[-1] in lists and not word.startswith(("[", "(", "-")):
+            spelled.append(f"[{word}]")
+            continue
         name, equals, value = word.partition("=")
         if not name.startswith("--"):
             spelled.append(word)
@@ -145,6 +154,10 @@ def _as_parsed(argv: Sequence[str], commands: dict[str, Command]) -> list[str]:
             equals, value = "=", "true"
         spelled.append(name + equals + value)
     return spelled
+
+
+def _is_list(kind: Any) -> bool:
+    return any(get_origin(part) in (list, tuple) for part in (kind, *get_args(kind)))
 
 
 def _summary(function: Callable[..., Any]) -> str:

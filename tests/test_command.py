@@ -5,7 +5,9 @@ from benchnav.command import Command, run
 seen: list[object] = []
 
 
-def work(place: str, rest: list[str], deep_cut: bool = False, much_more: int = 1) -> None:
+def work(
+    place: str, rest: list[str], deep_cut: bool = False, much_more: int = 1, some: list[int] | None = None
+) -> None:
     """Work.
 
     Args:
@@ -13,8 +15,9 @@ def work(place: str, rest: list[str], deep_cut: bool = False, much_more: int = 1
         rest: What else.
         deep_cut: Whether.
         much_more: How much.
+        some: Which.
     """
-    seen.append((place, rest, deep_cut, much_more))
+    seen.append((place, rest, deep_cut, much_more, *(some or ())))
 
 
 @pytest.mark.parametrize(
@@ -26,6 +29,10 @@ def work(place: str, rest: list[str], deep_cut: bool = False, much_more: int = 1
         (["--deep-cut", "false", "a"], ("a", [], False, 1)),
         (["a", "--deep-cut=true", "--much-more=3"], ("a", [], True, 3)),
         (["a", "b-c=1", "--d=2"], None),
+        ([], None),
+        (["a", "--some", "3"], ("a", [], False, 1, 3)),
+        (["a", "--some", "3,4", "--deep-cut"], ("a", [], True, 1, 3, 4)),
+        (["a", "--some", "[3, 4]"], ("a", [], False, 1, 3, 4)),
         (["a", "b-c=1", "e", "--much-more", "4", "--deep-cut"], ("a", ["b-c=1", "e"], True, 4)),
     ],
 )

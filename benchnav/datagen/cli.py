@@ -111,20 +111,24 @@ def validate(file: str) -> int:
     Args:
         file: Path or id of a dataset.
     """
-    from benchnav.datagen.store import find_dataset
-    from benchnav.datagen.validate import find_faults
+    from benchnav.datagen.store import TerrainDataset, find_dataset
+    from benchnav.datagen.validate import find_faults, summarise
     from benchnav.errors import DatasetError
 
     path = find_dataset(file)
-    faults: list[object]
     try:
-        faults = [*find_faults(path)]
+        faults = find_faults(path)
     except DatasetError as error:
-        faults = [error]
-    for fault in faults:
-        print(fault)
-    print(f"{path}: {len(faults)} fault(s)" if faults else f"{path}: sound")
-    return 1 if faults else 0
+        print(f"{error}\n{path}: 1 fault")
+        return 1
+    for line in summarise(faults):
+        print(line)
+    if faults:
+        print(f"{path}: {len(faults)} fault(s)")
+        return 1
+    splits = TerrainDataset(path).splits
+    print(f"{path}: sound, {sum(entry['maps'] for entry in splits.values())} maps in {len(splits)} split(s)")
+    return 0
 
 
 def repair(file: str) -> None:
@@ -240,7 +244,7 @@ def preview(
         split: Which split; test/std, or else the first, when not given.
         maps: Which maps; [0, 1, 2] when not given.
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
-        contact_sheet: A thumbnail of every map of the split instead.
+        contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
     from benchnav.datagen.preview import save_contact_sheet, save_preview
     from benchnav.datagen.store import TerrainDataset, find_dataset
@@ -254,8 +258,10 @@ def preview(
     ).expanduser()
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
         raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
-    if maps is not None and (not maps or contact_sheet):
-        raise ConfigError(f"Expected `maps` with at least one index and no contact sheet, got {maps}.")
+    if maps is not None and contact_sheet:
+        raise ConfigError("Expected either `maps` or `contact-sheet`, got both.")
+    if maps is not None and not maps:
+        raise ConfigError("Expected `maps` with at least one index, got none.")
     with replacing(path) as partial:
         if contact_sheet:
             save_contact_sheet(dataset, split, partial, path.suffix[1:])

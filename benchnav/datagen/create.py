@@ -61,21 +61,28 @@ def create(
     }
     with named_errors(path), _workers(jobs) as run, workspace(path, overwrite) as folder:
         _drop_other_blocks(folder, recipe, block_maps)
-        make, done = partial(_make_block, recipe, folder), 0
+        make = partial(_make_block, recipe, folder)
+        there = {span for span in work if _block_path(folder, span).exists()}
+        done = sum(stop - start for _, start, stop in there)
         with _left_nothing(folder), writing_into(folder, path, recipe.id, [recipe], splits) as write:
             for (split, start, stop), finished in zip(work, run(make, work), strict=True):
                 write(split, Block.load(finished))
-                done += stop - start
+                done += 0 if (split, start, stop) in there else stop - start
                 yield done, total
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _make_block(recipe: Recipe, folder: Path, span: Span) -> Path:
     split, start, stop = span
-    path = folder / f"{split.replace('/', '+')}-{start:07d}-{stop:07d}.block"
+    path = _block_path(folder, span)
     if not Block.is_whole(path):
         Block.of(generate(recipe, split, np.arange(start, stop))).save(path)
     return path
+
+
+def _block_path(folder: Path, span: Span) -> Path:
+    split, start, stop = span
+    return folder / f"{split.replace('/', '+')}-{start:07d}-{stop:07d}.block"
 
 
 @contextmanager

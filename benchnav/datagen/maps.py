@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from benchnav.datagen import schema
-from benchnav.datagen.store import READ_ERRORS, TerrainDataset
+from benchnav.datagen.store import READ_ERRORS, TerrainDataset, find_dataset
 from benchnav.errors import DatasetError
 
 
@@ -23,7 +23,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
     first map. Only the fields asked for are read.
 
     Args:
-        path: dataset file.
+        path: dataset file, or the id of one at hand.
         split: name of one of its splits.
         fields: names of `schema.FIELDS`.
         in_memory: read all maps at once, here; worth it for what is read many times.
@@ -40,7 +40,11 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         in_memory: bool = False,
     ) -> None:
         """Checks split and fields, and reads the maps where that is asked for."""
-        self.dataset, self.split, self.fields = TerrainDataset(Path(path).resolve()), split, tuple(fields)
+        self.dataset, self.split, self.fields = (
+            TerrainDataset(find_dataset(path).resolve()),
+            split,
+            tuple(fields),
+        )
         unknown = sorted(set(fields) - set(schema.FIELDS))
         if unknown or not fields:
             raise DatasetError(

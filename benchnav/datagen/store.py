@@ -190,7 +190,7 @@ class TerrainDataset:
                 return schema.unseal(text)
         except READ_ERRORS as error:
             raise DatasetError(
-                f"The manifest of {self.path} is damaged: {error!r}. Make the file again."
+                f"The manifest of {self.path} is damaged: {str(error)[:200]}. Make the file again."
             ) from error
         if kind != schema.FORMAT:
             raise DatasetError(f"Expected format {schema.FORMAT!r} in {self.path}, got {kind!r}.")

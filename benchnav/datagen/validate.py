@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -31,8 +31,27 @@ class Fault:
 
     def __str__(self) -> str:
         """One line."""
-        place = self.split + (f": map {self.map}" if self.map >= 0 else "")
-        return f"{place}: field {self.field!r} {self.problem}" if self.field else f"{place}: {self.problem}"
+        place = f"map {self.map}" if self.map >= 0 else ""
+        return _line(self, place)
+
+
+def summarise(faults: list[Fault]) -> Iterator[str]:
+    """Writes a line a fault, consecutive maps with the same fault in one."""
+    kinds: dict[tuple[str, str, str], list[Fault]] = {}
+    for fault in sorted(faults):
+        kinds.setdefault((fault.split, fault.field, fault.problem), []).append(fault)
+    for alike in kinds.values():
+        maps = np.array([fault.map for fault in alike])
+        for run in np.split(maps, np.flatnonzero(np.diff(maps) != 1) + 1):
+            if len(run) > 1:
+                yield _line(alike[0], f"maps {run[0]}–{run[-1]}")
+            else:
+                yield str(replace(alike[0], map=int(run[0])))
+
+
+def _line(fault: Fault, place: str) -> str:
+    words = [fault.split, place, f"field {fault.field!r} {fault.problem}" if fault.field else fault.problem]
+    return ": ".join(word for word in words if word)
 
 
 def find_faults(path: str | Path) -> list[Fault]:

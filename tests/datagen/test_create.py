@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from benchnav.datagen.block import Block
 from benchnav.datagen.create import create
 from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.validate import find_faults
 from benchnav.errors import BenchnavError, ConfigError, DatasetError
 from tests.factories import tiny_dataset, tiny_recipe
 
@@ -76,8 +78,9 @@ def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_blocks(tmp_pat
     finished = {block: block.stat().st_mtime_ns for block in folder.glob("*.block")}
     steps = create(tiny_recipe(train=4000), path, block_maps=20)
     for _ in range(len(finished) - jobs):
-        _, total = next(steps)
+        done, total = next(steps)
     assert total == 4009
+    assert done >= 20 * len(finished)
     # Not carried to the end here; the kept blocks stand untouched.
     steps.close()
     assert all(block.stat().st_mtime_ns == when for block, when in finished.items())
@@ -101,17 +104,19 @@ def test_a_resumed_run_has_the_digest_of_an_unbroken_one(tmp_path: Path) -> None
         for _ in create(recipe, path, block_maps=4):
             pass
     assert digests(broken) == digests(whole)
+    assert find_faults(broken) == []
     assert sorted(p.name for p in tmp_path.iterdir()) == ["broken.h5", "whole.h5"]
 
 
 def test_blocks_of_another_recipe_are_dropped(tmp_path: Path) -> None:
     path = tmp_path / "d.h5"
-    steps = create(tiny_recipe(train=12), path, block_maps=4)
+    steps = create(tiny_recipe(), path, block_maps=4)
     next(steps)
     steps.close()
-    for _ in create(tiny_recipe(train=9), path, block_maps=4):
+    other = replace(tiny_recipe(), seed=3)
+    for _ in create(other, path, block_maps=4):
         pass
-    assert digests(path) == digests(tiny_dataset(tmp_path / "other.h5", tiny_recipe(train=9)))
+    assert digests(path) == digests(tiny_dataset(tmp_path / "other.h5", other))
 
 
 def test_two_runs_on_one_file_refuse_each_other(tmp_path: Path) -> None:
@@ -144,8 +149,6 @@ def test_a_full_disk_is_named_and_leaves_no_half_file(tmp_path: Path, room: int)
 
 
 def test_an_error_in_a_worker_is_the_runs_error(tmp_path: Path) -> None:
-    from dataclasses import replace
-
     recipe = replace(tiny_recipe(), stuck_threshold=0.999)
     with pytest.raises(ConfigError, match="goal can be reached"):
         for _ in create(recipe, tmp_path / "d.h5", jobs=2):

@@ -77,7 +77,7 @@ def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  #
     Path("d.h5").write_bytes(whole[: len(whole) // 2])
     capsys.readouterr()
     assert datagen("validate", "d.h5") == 1
-    assert "1 fault(s)" in capsys.readouterr().out
+    assert "1 fault" in capsys.readouterr().out
     assert datagen("repair", "d.h5") == 2
 
 
@@ -120,6 +120,25 @@ def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:
     assert sibling.recipe.seed == 4
     assert sibling.recipe.classes == made.recipe.classes
     assert sibling.digest != made.digest
+
+
+def test_overrides_of_a_recipe_of_ones_own_need_an_id_too(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    Path("r.yaml").write_text(RECIPE.replace("id: tiny-v1", "id: mine"))
+    assert datagen("create", "r.yaml", "splits.train.maps=3", "--out", "d.h5") == 2
+    assert "id=NAME" in capsys.readouterr().err
+    assert datagen("create", "r.yaml", "splits.train.maps=3", "id=m", "--splits", "train") == 0
+
+
+def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "tiny-v1", *SMALL, "--splits", "train", "--out", "d.h5") == 0
+    with h5py.File("d.h5", "r+") as file:
+        file["train/start_m"][...] = 0
+    capsys.readouterr()
+    assert datagen("validate", "d.h5") == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "train: maps 0–2: field 'start_m' does not match its digest",
+        "d.h5: 3 fault(s)",
+    ]
 
 
 @pytest.mark.parametrize(

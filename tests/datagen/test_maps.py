@@ -35,6 +35,13 @@ def test_workers_read_what_this_process_reads(dataset_path: Path, context: str, 
     assert torch.equal(maps[3]["rgb"], here[3])
 
 
+def test_another_process_opens_the_file_for_itself(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    maps = TerrainMaps(dataset_path, "train")
+    here = [maps._arrays()["rgb"] for _ in range(2)]
+    monkeypatch.setattr("os.getpid", lambda: -1)
+    assert here[0] is here[1] is not maps._arrays()["rgb"]
+
+
 def test_only_the_fields_asked_for_are_read(tmp_path: Path) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
     with h5py.File(path, "r+") as file:
