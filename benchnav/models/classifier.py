@@ -20,6 +20,29 @@ from benchnav.models.config import ClassifierConfig
 
 _WARM_UP_SHARE = 0.15
 _STRIDE = 32  # the coarsest of any encoder: sides must be multiples of it
+_DETAIL_CHANNELS = 32
+
+
+class WithFullResolution(nn.Module):
+    """A network whose features are joined by those of the image at full resolution before classes are told.
+
+    Args:
+        network: from images [B, 3, H, W] to features [B, 32, H, W].
+        class_count: C.
+    """
+
+    def __init__(self, network: nn.Module, class_count: int) -> None:
+        """Adds a layer beside the network and two behind it."""
+        super().__init__()
+        self.network = network
+        self.detail = _convolution(3, _DETAIL_CHANNELS)
+        self.head = nn.Sequential(
+            _convolution(2 * _DETAIL_CHANNELS, _DETAIL_CHANNELS), nn.Conv2d(_DETAIL_CHANNELS, class_count, 1)
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Computes logits [B, C, H, W] of images [B, 3, H, W]."""
+        return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
 
 
 class TerrainClassifier(lightning.LightningModule):
@@ -76,8 +99,10 @@ class TerrainClassifier(lightning.LightningModule):
                 encoder_name=encoder,
                 encoder_weights="imagenet" if self.config.pretrained else None,
                 in_channels=3,
-                classes=self.class_count,
+                classes=_DETAIL_CHANNELS if self.config.full_resolution else self.class_count,
             )
+            if self.config.full_resolution:
+                network = WithFullResolution(network, self.class_count)
         return network.to(memory_format=torch.channels_last)
 
     def configure_losses(self) -> nn.Module:
@@ -154,3 +179,7 @@ class TerrainClassifier(lightning.LightningModule):
         model = cls(settings, class_count, torch.zeros(3), torch.ones(3))
         model.load_state_dict(tensors)
         return model.eval()
+
+
+def _convolution(channels: int, out: int) -> nn.Module:
+    return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU())

@@ -14,6 +14,8 @@ class ClassifierConfig:
         architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
         encoder: one of its encoders, for example resnet18.
         pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
+        full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
+            it, so that without this every class boundary is guessed from cells twice as large.
         learning_rate: highest rate of the one-cycle schedule.
         weight_decay: of AdamW.
         batch_size: most maps a batch.
@@ -24,6 +26,7 @@ class ClassifierConfig:
     architecture: str = "unet"
     encoder: str = "resnet18"
     pretrained: bool = False
+    full_resolution: bool = True
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
     batch_size: int = 16

@@ -104,3 +104,27 @@ def test_training_stops_when_validation_no_longer_gains(
 def test_a_loss_that_is_no_number_is_one_error() -> None:
     with pytest.raises(ConfigError, match="learning_rate"):
         KeepBest().on_fit_end(SimpleNamespace(), torch.nn.Linear(1, 1))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("full_resolution", "learns"), [(True, True), (False, False)])
+def test_classes_of_single_cells_are_learned_at_full_resolution_alone(
+    full_resolution: bool, learns: bool
+) -> None:
+    # Each cell has a class of its own, told by its own colour; neighbours tell nothing.
+    class_id = torch.randint(0, 4, (8, 32, 32), generator=torch.Generator().manual_seed(0))
+    rgb = (60 + 40 * class_id)[:, None].expand(-1, 3, -1, -1).to(torch.uint8)
+    model = build(full_resolution=full_resolution).train()
+    optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
+    for _ in range(30):
+        optimizer.zero_grad()
+        model.loss(model(rgb), class_id).backward()
+        optimizer.step()
+    accuracy = (model(rgb).argmax(1) == class_id).float().mean()
+    assert (accuracy > 0.95) == learns
+
+
+def test_weights_without_full_resolution_are_read_back() -> None:
+    model = build(full_resolution=False)
+    again = TerrainClassifier.from_tensors({"full_resolution": False}, 4, model.state_dict())
+    with torch.no_grad():
+        assert torch.equal(model(image(32, 32)), again(image(32, 32)))
