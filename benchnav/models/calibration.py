@@ -3,7 +3,7 @@
 Calibration is read off the probability integral transform (PIT) of what was observed: uniform when
 the predicted distributions are right. Where λ was clipped the distribution has an atom, and the PIT
 is drawn uniformly within it, so it is uniform there too. Sources: Gneiting and Raftery (2007),
-"Strictly proper scoring rules" (CRPS); Czado et al. (2009), "Predictive model assessment for count
+"Strictly proper scoring rules" (CRPS, Brier score); Czado et al. (2009), "Predictive model assessment for count
 data" (randomised PIT). Letters in shapes: B maps, H×W cells, C classes, N cells.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import MetricCollection
+from torchmetrics import Metric, MetricCollection
 from torchmetrics.classification import MulticlassAccuracy, MulticlassCalibrationError, MulticlassJaccardIndex
 
 from benchnav import rng
@@ -39,11 +39,13 @@ class ClassQuality:
         accuracy: share of cells whose most likely class is right.
         miou: intersection over union, averaged over the classes that occur.
         ece: expected calibration error of the most likely class, 15 bins.
+        brier: Brier score, the squared distance of the probabilities to the class that is there, 0–2.
     """
 
     accuracy: float
     miou: float
     ece: float
+    brier: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +82,30 @@ class Quality:
     maps: int
     traversability: TraversabilityQuality
     classes: tuple[ClassQuality, ...]
+
+
+class BrierScore(Metric):
+    """Mean over cells of Σ_c (p_c − y_c)², y being 1 at the class that is there (Brier, 1950)."""
+
+    full_state_update = False
+    total: Tensor
+    cells: Tensor
+
+    def __init__(self) -> None:
+        """Starts with no cells."""
+        super().__init__()
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("cells", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
+
+    def update(self, probabilities: Tensor, class_id: Tensor) -> None:
+        """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
+        right = probabilities.gather(1, class_id.unsqueeze(1)).squeeze(1)
+        self.total += (probabilities.square().sum(1) - 2 * right + 1).double().sum()
+        self.cells += class_id.numel()
+
+    def compute(self) -> Tensor:
+        """The score of all cells so far."""
+        return self.total / self.cells
 
 
 def crps(mixture: TraversabilityMixture, observed: Tensor) -> Tensor:
@@ -268,5 +294,6 @@ def _class_metrics(count: int) -> MetricCollection:
             "accuracy": MulticlassAccuracy(count, average="micro"),
             "miou": MulticlassJaccardIndex(count, average="macro"),
             "ece": MulticlassCalibrationError(count, n_bins=_BINS, norm="l1"),
+            "brier": BrierScore(),
         }
     )

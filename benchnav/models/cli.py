@@ -236,10 +236,21 @@ def _save(out: str, checkpoint: "Checkpoint", half_precision: bool) -> None:
 def _table(name: str, dataset: "TerrainDataset", qualities: "Iterable[tuple[str, Quality]]") -> object:
     from rich.table import Table
 
-    columns = ("accuracy", "mIoU", "ECE", "RMSE λ", "RMSE E[λ]", "NLL", "CRPS", "90 % cover", "tail 0.1")
+    columns = (
+        "accuracy",
+        "mIoU",
+        "ECE",
+        "Brier",
+        "RMSE λ",
+        "RMSE E[λ]",
+        "NLL",
+        "CRPS",
+        "90 % cover",
+        "tail 0.1",
+    )
     table = Table("split", "maps", *columns, title=f"{name} on {dataset.id}")
     for split, quality in qualities:
-        classes = [f"{value:.4f}" for item in quality.classes for value in asdict(item).values()] or ["–"] * 3
+        classes = [f"{value:.4f}" for item in quality.classes for value in asdict(item).values()] or ["–"] * 4
         rest = [f"{value:.4f}" for value in asdict(quality.traversability).values()]
         table.add_row(split, str(quality.maps), *classes, *rest)
     return table

@@ -101,6 +101,8 @@ def test_class_metrics_are_those_counted_by_hand() -> None:
     assert classes.accuracy == pytest.approx(0.5)
     assert classes.miou == pytest.approx((0.5 + 0) / 2)
     assert classes.ece == pytest.approx(0.3, abs=1e-4)
+    left, right = 0.2**2 + 0.15**2 + 0.05**2, 0.8**2 + 0.85**2 + 0.05**2
+    assert classes.brier == pytest.approx((left + right) / 2)
 
 
 def test_latent_metrics_read_each_cell_with_its_own_class() -> None:

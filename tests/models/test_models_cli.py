@@ -95,7 +95,8 @@ def test_evaluate_prints_a_table_and_writes_json(
     assert list(found["splits"]) == ["test/std", "test/hs"]
     assert found["dataset"]["digest"] == dataset.digest
     assert set(found["splits"]["test/hs"]) == {
-        "maps", "accuracy", "miou", "ece", "rmse_observed", "rmse_expected", "nll", "crps", "coverage", "tail_rate",
+        "maps", "accuracy", "miou", "ece", "brier",
+        "rmse_observed", "rmse_expected", "nll", "crps", "coverage", "tail_rate",
     }  # fmt: skip
     assert call(monkeypatch, "evaluate", "oracle", "--data", dataset.path, "--splits", "[valid]") == 0
     assert "valid" in capfd.readouterr().out
