@@ -123,6 +123,7 @@ def evaluate(
 
     from benchnav.datagen.store import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
+    from benchnav.models.baseline import nearest_colour_accuracy
     from benchnav.models.calibration import evaluate as evaluate_model
     from benchnav.models.predictor import load_model
 
@@ -131,7 +132,10 @@ def evaluate(
         raise ConfigError(f"Expected `json` in a folder that exists, got {json}. Make {target.parent} first.")
     dataset = TerrainDataset(find_dataset(data))
     qualities = dict(evaluate_model(load_model(checkpoint), dataset, splits or (), seed))
-    Console(width=None if sys.stdout.isatty() else 120).print(_table(checkpoint, dataset, qualities.items()))
+    console = Console(width=None if sys.stdout.isatty() else 124, highlight=False)
+    console.print(_table(checkpoint, dataset, qualities.items()))
+    by_colour = ", ".join(f"{split} {nearest_colour_accuracy(dataset, split):.4f}" for split in qualities)
+    console.print(f"accuracy of the class of the nearest colour: {by_colour}", soft_wrap=True)
     if target:
         _write_json(target, checkpoint, dataset, qualities)
         print(f"wrote {target}")
