@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from benchnav.datagen.block import Block
+from benchnav.datagen.block import BLOCK_MAPS, Block, spans
 from benchnav.datagen.generate import Maps, class_map, complete, reference_time_s
 from benchnav.datagen.geotiff import SLACK, Raster, crs_name, load_rasterio, opened
 from benchnav.datagen.resample import Rule, heights, shares, snapped
@@ -32,7 +32,6 @@ from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.datagen.writer import check_target, named_errors, writing
 from benchnav.errors import ConfigError, DatasetError
 
-_BLOCK_MAPS = 32
 _VALUES_AT_ONCE = 2**21
 _CACHE_MB = 128  # of raster that GDAL keeps; what it would choose grows with the machine
 _MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
@@ -95,10 +94,10 @@ def import_dem(
         stack.enter_context(named_errors(out))
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent))
         made = []
-        for first in range(0, cut.maps, _BLOCK_MAPS):
-            numbers = np.arange(first, min(first + _BLOCK_MAPS, cut.maps))
+        for first, stop in spans(cut.maps, BLOCK_MAPS):
+            numbers = np.arange(first, stop)
             made.append(_make(recipe, split, cut, layers, numbers, Path(folder) / f"{first}.block"))
-            yield int(numbers[-1]) + 1, cut.maps
+            yield stop, cut.maps
         source = _source(cut, layers, made)
         count = len(source["kept"])
         recipe = replace(recipe, splits={split: replace(only, maps=count)})
