@@ -1,72 +1,98 @@
 """Class-wise Gaussian processes: each class's latent traversability as a function of slope.
 
-A batch of C independent sparse variational GPs over slope, whitened, with a Matérn kernel. Where a
-class has no data — it never occurs, or the slope is steeper than any seen — the GP falls back to its
-prior, N(0.5, at least 0.3²), which says that nothing is known. Sources: paper III-B; Hensman et al.
-(2015), "Scalable variational Gaussian process classification". Letters in shapes: C classes, N cells
-a class, M inducing points, G nodes of the table.
+The prior of each class's function is 0.5 on flat ground, falling by 0.03 ± 0.015 a degree, plus a
+Matérn 5/2 process. It says that a robot hardly gains traversability on steeper ground and is likely
+to be stuck at thirty-odd degrees, and no more: where a class has no data — it never occurs, or the
+slope is steeper than any seen — the GP falls back to this trend with a spread that grows with slope.
+The Matérn process keeps a spread of at least 0.3 and a length scale of at most 10°, so that the data
+say nothing sure about slopes ten degrees beyond them.
+
+A batch of C independent sparse variational GPs, fitted to all cells at once in bins of slope. The
+posterior of the inducing values takes natural gradients, for which a Gaussian likelihood needs one
+step; they are not whitened, so that the data hold the function in place while the kernel changes, and
+few steps of Rprop settle the kernel and the noise. Sources: paper III-B; Hensman et al. (2015),
+"Scalable variational Gaussian process classification"; Salimbeni et al. (2018), "Natural gradients in
+practice". Letters in shapes: C classes, M inducing points, B bins of slope, G nodes of the table.
 """
 
-from collections.abc import Iterator
+import math
 from typing import Any
 
 import gpytorch
 import lightning
-import numpy as np
 import torch
-from gpytorch.constraints import GreaterThan, Interval
+from gpytorch.constraints import Interval
 from gpytorch.distributions import MultivariateNormal
-from gpytorch.likelihoods import GaussianLikelihood
-from gpytorch.variational import CholeskyVariationalDistribution, VariationalStrategy
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from gpytorch.variational import NaturalVariationalDistribution, UnwhitenedVariationalStrategy
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader
 
-from benchnav import rng
 from benchnav.errors import ConfigError
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.data import PixelTable
-from benchnav.models.likelihood import CensoredGaussianLikelihood
-from benchnav.models.slope_table import SlopeTable, table_slopes
+from benchnav.models.likelihood import expected_log_prob, sum_bins
+from benchnav.models.pixels import PixelTable
+from benchnav.models.slope_table import STEP_DEG, SlopeTable, table_slopes
 
 _SLOPE_UNIT_DEG = 10.0
-_PRIOR_MEAN = 0.5  # the middle of traversability's range
-_PRIOR_STD, _LEAST_PRIOR_STD = 0.5, 0.3
-_LENGTHSCALE_DEG, _LENGTHSCALE_RANGE_DEG = 10.0, (2.0, 15.0)
-_NOISE_STD = 0.2
-_LEAST_SPAN_DEG = 1.0
+_PRIOR_MEAN = 0.5  # on flat ground: the middle of traversability's range
+_FALL, _FALL_STD = 0.3, 0.15  # a unit of slope
+_PRIOR_STD, _PRIOR_STD_RANGE = 0.5, (0.3, 1.0)
+_LENGTHSCALE_DEG, _LENGTHSCALE_RANGE_DEG = 8.0, (2.0, 10.0)
+_NOISE_STD, _NOISE_STD_RANGE = 0.2, (0.01, 1.0)
+_NOISE_SPREAD = 0.5  # of the logarithm of the noise before any data
+_LEAST_SPAN_DEG = 5.0
+_NATURAL_RATE, _RPROP_STEP, _RPROP_RANGE = 0.9, 0.1, (1e-6, 0.5)
 
 
 class SlopeGP(gpytorch.models.ApproximateGP):
     """C independent sparse GPs over slope in units of 10°.
 
     Args:
-        inducing: slopes of the inducing points, shape [M].
-        class_count: C.
+        inducing: slopes of the inducing points, shape [C, M].
     """
 
-    def __init__(self, inducing: Tensor, class_count: int) -> None:
-        """Starts at the prior."""
-        batch = torch.Size([class_count])
-        posterior = CholeskyVariationalDistribution(len(inducing), batch)
-        points = inducing.view(1, -1, 1).repeat(class_count, 1, 1)
-        strategy = VariationalStrategy(self, points, posterior, learn_inducing_locations=False)
-        # Whitened, zeros and ones are the prior; GPyTorch's own start would draw on the global generator.
+    def __init__(self, inducing: Tensor) -> None:
+        """Builds them; `start` puts them at their prior."""
+        batch = inducing.shape[:1]
+        posterior = NaturalVariationalDistribution(inducing.shape[1], batch)
+        points = inducing.unsqueeze(-1)
+        strategy = UnwhitenedVariationalStrategy(self, points, posterior, learn_inducing_locations=False)
+        # GPyTorch's own start would draw on the global generator.
         strategy.variational_params_initialized.fill_(1)
         super().__init__(strategy)
         shortest, longest = (bound / _SLOPE_UNIT_DEG for bound in _LENGTHSCALE_RANGE_DEG)
-        matern = gpytorch.kernels.MaternKernel(
-            nu=2.5, batch_shape=batch, lengthscale_constraint=Interval(shortest, longest)
+        self.matern = gpytorch.kernels.ScaleKernel(
+            gpytorch.kernels.MaternKernel(
+                nu=2.5, batch_shape=batch, lengthscale_constraint=Interval(shortest, longest)
+            ),
+            batch_shape=batch,
+            outputscale_constraint=Interval(*(std**2 for std in _PRIOR_STD_RANGE)),
         )
-        self.kernel = gpytorch.kernels.ScaleKernel(
-            matern, batch_shape=batch, outputscale_constraint=GreaterThan(_LEAST_PRIOR_STD**2)
-        )
-        matern.lengthscale = _LENGTHSCALE_DEG / _SLOPE_UNIT_DEG
-        self.kernel.outputscale = _PRIOR_STD**2
+        self.matern.base_kernel.lengthscale = _LENGTHSCALE_DEG / _SLOPE_UNIT_DEG
+        self.matern.outputscale = _PRIOR_STD**2
+        self.trend = gpytorch.kernels.LinearKernel(batch_shape=batch)
+        self.trend.variance = _FALL_STD**2
+        self.trend.requires_grad_(False)
 
     def forward(self, x: Tensor) -> MultivariateNormal:
         """The prior at slopes `x`, shape [C, N, 1]."""
-        return MultivariateNormal(torch.full_like(x[..., 0], _PRIOR_MEAN), self.kernel(x))
+        return MultivariateNormal(_PRIOR_MEAN - _FALL * x[..., 0], self.matern(x) + self.trend(x))
+
+    @torch.no_grad()
+    def start(self) -> None:
+        """Puts the posterior of the inducing values at their prior."""
+        strategy = self.variational_strategy
+        mean, precision = self.prior()
+        precision = torch.cholesky_inverse(torch.linalg.cholesky(precision))
+        strategy._variational_distribution.natural_vec.copy_((precision @ mean.unsqueeze(-1)).squeeze(-1))
+        strategy._variational_distribution.natural_mat.copy_(-0.5 * precision)
+
+    def prior(self) -> tuple[Tensor, Tensor]:
+        """Mean [C, M] and covariance [C, M, M] of the inducing values."""
+        strategy = self.variational_strategy
+        prior = self(strategy.inducing_points, prior=True)
+        eye = torch.eye(prior.mean.shape[-1]).to(prior.mean)
+        return prior.mean, prior.covariance_matrix + strategy.jitter_val * eye
 
 
 class LatentGPs(lightning.LightningModule):
@@ -75,50 +101,65 @@ class LatentGPs(lightning.LightningModule):
     Args:
         config: what they are.
         class_count: C.
-        steepest_deg: steepest slope of the training data; inducing points lie up to there.
+        steepest_deg: steepest slope of each class's training data, shape [C]; inducing points lie up to
+            there.
     """
 
-    def __init__(self, config: LatentGPConfig, class_count: int, steepest_deg: float) -> None:
+    def __init__(self, config: LatentGPConfig, class_count: int, steepest_deg: Tensor) -> None:
         """Builds the GPs at their prior, in float64."""
         super().__init__()
-        self.config, self.class_count, self.steepest_deg = config, class_count, steepest_deg
-        reach = max(steepest_deg, _LEAST_SPAN_DEG) / _SLOPE_UNIT_DEG
-        self.gp = SlopeGP(torch.linspace(0, reach, config.inducing_points), class_count)
-        self.likelihood = self.configure_likelihood()
-        self.double()
-
-    def configure_likelihood(self) -> GaussianLikelihood:
-        """The censored or the plain Gaussian, with noise learned for each class."""
-        kind = CensoredGaussianLikelihood if self.config.likelihood == "censored" else GaussianLikelihood
-        likelihood = kind(batch_shape=torch.Size([self.class_count]))
-        likelihood.noise = _NOISE_STD**2
-        return likelihood
-
-    def configure_optimizers(self) -> OptimizerLRScheduler:
-        """Adam, its rate falling to 0 along a cosine over all steps."""
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.config.learning_rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            optimizer, int(self.trainer.estimated_stepping_batches)
+        self.automatic_optimization = False
+        self.config, self.class_count = config, class_count
+        self.steepest_deg = [round(slope, 4) for slope in steepest_deg.tolist()]
+        reach = torch.tensor(self.steepest_deg, dtype=torch.float64)
+        places = torch.linspace(0, 1, config.inducing_points, dtype=torch.float64)
+        self.gp = SlopeGP(reach.clamp(min=_LEAST_SPAN_DEG).unsqueeze(-1) * places / _SLOPE_UNIT_DEG)
+        self.likelihood = gpytorch.likelihoods.GaussianLikelihood(
+            batch_shape=torch.Size([class_count]),
+            noise_constraint=Interval(*(std**2 for std in _NOISE_STD_RANGE)),
         )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        self.likelihood.noise = _NOISE_STD**2
+        self.double()
+        self.gp.start()
+
+    def configure_optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
+        """Natural gradients for the inducing values, Rprop for kernel and noise."""
+        natural = gpytorch.optim.NGD(self.gp.variational_parameters(), num_data=1, lr=_NATURAL_RATE)
+        others = [*self.gp.hyperparameters(), *self.likelihood.parameters()]
+        return natural, torch.optim.Rprop(others, lr=_RPROP_STEP, step_sizes=_RPROP_RANGE)
 
     def forward(self, slope_deg: Tensor) -> MultivariateNormal:
         """The latent functions at slopes of each class, shape [C, N]."""
         return self.gp((slope_deg.double() / _SLOPE_UNIT_DEG).unsqueeze(-1))
 
-    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        """The negative evidence lower bound an observation, summed over classes.
+    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
+        """Takes one step up the evidence lower bound of each class, over all its cells.
 
-        A batch holds `slope_deg` and `traversability` of shape [C, b], and `count` [C], the cells that
-        each class has in all. A class without any is left at its prior.
+        A class without any is left at its prior. A batch is what `sum_bins` gives.
         """
-        fit = self.likelihood.expected_log_prob(batch["traversability"].double(), self(batch["slope_deg"]))
+        bound = self.bound(batch)
+        optimizers = self.optimizers()
+        assert isinstance(optimizers, list)
+        natural, others = optimizers
+        natural.zero_grad()
+        others.zero_grad()
+        self.manual_backward(-bound.sum())
+        natural.step()
+        others.optimizer.step()  # past Lightning, which would count a second step
+        loss = -bound.detach().sum() / batch["count"].sum()
+        self.log("loss", loss, on_step=False, on_epoch=True, batch_size=1)
+
+    def bound(self, bins: dict[str, Tensor]) -> Tensor:
+        """The evidence lower bound of each class's cells and its noise, shape [C]; 0 without cells.
+
+        Args:
+            bins: from `sum_bins`.
+        """
+        latent, noise = self(bins["slope_deg"]), self.likelihood.noise
+        fit = expected_log_prob(bins, latent.mean, latent.variance, noise).sum(-1)
+        surprise = (0.5 * noise.squeeze(-1).log() - math.log(_NOISE_STD)) / _NOISE_SPREAD
         divergence = self.gp.variational_strategy.kl_divergence()
-        seen = batch["count"] > 0
-        bound = torch.where(seen, fit.mean(-1), 0.0) - divergence / batch["count"].clamp(min=1)
-        loss = -bound.sum()
-        self.log("loss", loss.detach() / seen.sum(), on_step=False, on_epoch=True, batch_size=len(bound))
-        return loss
+        return torch.where(bins["count"] > 0, fit - divergence - 0.5 * surprise**2, 0.0)
 
     def tabulate(self) -> SlopeTable:
         """Evaluates mean, spread and noise at the nodes of the table, float32."""
@@ -131,6 +172,40 @@ class LatentGPs(lightning.LightningModule):
         return SlopeTable(
             mean=latent.mean.float(), std=std.float(), noise_std=noise.sqrt().squeeze(-1).float()
         )
+
+    @torch.no_grad()
+    def tabulation_error(self) -> tuple[Tensor, Tensor]:
+        """Bounds how far linear interpolation in the table is off these GPs, at any slope.
+
+        On the step h interpolation of g errs by at most h²/8·max|g''|. In the space H of the kernel k of
+        a class, with features φ(x), f''(x) has the prior standard deviation ‖φ''‖ = 5A/ℓ² and f'(x) the
+        variance ‖φ'‖² = 5A²/(3ℓ²) + τ², for a Matérn 5/2 process of amplitude A and length scale ℓ and a
+        trend of spread τ. Let K = LLᵀ be the prior covariance of the inducing values, m and S mean and
+        covariance of their posterior, μ their prior mean.
+
+        - The posterior mean is linear plus an element of H of norm ‖v‖, v = L⁻¹(m − μ): |mean''| ≤ ‖v‖·‖φ''‖.
+        - The variance is ‖u(x)‖² for a curve u = (σ, Rφ(x)), σ² that of the noise, and ‖R‖ ≤ r with
+          r² = max(1, ‖L⁻¹SL⁻ᵀ‖). From ‖u‖·‖u‖'' + ‖u‖'² = ‖u'‖² + ⟨u, u''⟩ follows
+          |std''| ≤ r²‖φ'‖²/σ + r‖φ''‖.
+
+        Returns:
+            Bounds of mean and standard deviation, float64, each of shape [C], rounding to float32 aside.
+        """
+        mean, covariance = self.gp.prior()
+        root = torch.linalg.cholesky(covariance)
+        posterior = self.gp.variational_strategy.variational_distribution
+        shift = (posterior.mean - mean).unsqueeze(-1)
+        norm = torch.linalg.solve_triangular(root, shift, upper=False).squeeze(-1).norm(dim=-1)
+        half = torch.linalg.solve_triangular(root, posterior.covariance_matrix, upper=False)
+        white = torch.linalg.solve_triangular(root, half.mT, upper=False)
+        stretch = torch.linalg.matrix_norm(white, 2).clamp(min=1)
+        amplitude = self.gp.matern.outputscale.sqrt()
+        reach = self.gp.matern.base_kernel.lengthscale.flatten() * _SLOPE_UNIT_DEG
+        bend = 5 * amplitude / reach**2
+        slope = 5 / 3 * (amplitude / reach) ** 2 + (_FALL_STD / _SLOPE_UNIT_DEG) ** 2
+        noise = self.likelihood.noise.sqrt().flatten()
+        share = STEP_DEG**2 / 8
+        return share * norm * bend, share * (stretch * slope / noise + stretch.sqrt() * bend)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the table and all parameters by name, for a checkpoint."""
@@ -155,7 +230,7 @@ class LatentGPs(lightning.LightningModule):
         """
         try:
             settings = {name: value for name, value in config.items() if name != "steepest_deg"}
-            model = cls(LatentGPConfig(**settings), class_count, float(config["steepest_deg"]))
+            model = cls(LatentGPConfig(**settings), class_count, torch.tensor(config["steepest_deg"]))
         except (KeyError, TypeError) as error:
             raise ConfigError(f"Expected the settings of the GPs, got {sorted(config)}.") from error
         prefix = "state."
@@ -163,58 +238,13 @@ class LatentGPs(lightning.LightningModule):
         return model.eval()
 
 
-class PixelBatches(Dataset[dict[str, Tensor]]):
-    """Cells of a table; indexed by a whole batch at a time.
+def load_batches(config: LatentGPConfig, table: PixelTable) -> DataLoader[dict[str, Tensor]]:
+    """Makes the loader of training batches, each of them all cells.
 
     Args:
+        config: what is trained.
         table: cells by class.
     """
-
-    def __init__(self, table: PixelTable) -> None:
-        """Keeps the table."""
-        self.table = table
-
-    def __getitem__(self, index: Tensor) -> dict[str, Tensor]:
-        """Gives `slope_deg`, `traversability` [C, b] and `count` [C] of the places `index` [C, b]."""
-        return {
-            "slope_deg": self.table.slope_deg.gather(1, index),
-            "traversability": self.table.traversability.gather(1, index),
-            "count": self.table.count,
-        }
-
-
-class PixelSampler(Sampler[Tensor]):
-    """Draws places in a table with replacement, each class on its own, keyed by (seed, epoch).
-
-    Args:
-        count: cells of each class, shape [C].
-        batch_size: draws a class and step.
-        steps: steps an epoch.
-        seed: root seed.
-    """
-
-    def __init__(self, count: Tensor, batch_size: int, steps: int, seed: int) -> None:
-        """Starts at epoch 0."""
-        self.count, self.batch_size, self.steps, self.seed = count, batch_size, steps, seed
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Chooses the epoch that the next iteration gives; the trainer calls this."""
-        self.epoch = epoch
-
-    def __len__(self) -> int:
-        """Steps an epoch."""
-        return self.steps
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """Yields places, int64, shape [C, batch_size]; 0 for a class without cells."""
-        key = rng.stream_key(self.seed, "models", "pixel batches", self.epoch)
-        for step in range(self.steps):
-            drawn = rng.uniform(key, np.array([step]), (len(self.count), self.batch_size))[0]
-            yield (torch.from_numpy(drawn) * self.count.unsqueeze(-1)).long()
-
-
-def load_batches(config: LatentGPConfig, table: PixelTable, seed: int) -> DataLoader[dict[str, Tensor]]:
-    """Makes the loader of training batches."""
-    sampler = PixelSampler(table.count, config.batch_size, config.epoch_steps, seed)
-    return DataLoader(PixelBatches(table), batch_size=None, sampler=sampler, generator=torch.Generator())
+    bins = sum_bins(table, config.likelihood == "censored")
+    # A generator of its own keeps the loader from drawing on PyTorch's global one.
+    return DataLoader([bins] * config.epoch_steps, batch_size=None, generator=torch.Generator())  # type: ignore[arg-type]

@@ -1,8 +1,8 @@
 """The class-wise GPs as tables over slope: what prediction reads instead of computing them again.
 
-Between nodes the tables are linear; for a function of curvature |f''| ≤ κ that is off by at most
-κ·h²/8. At h = 0.1° a GP of length scale ≥ 2° and unit amplitude, κ ≈ 5/(3·4) per square degree,
-is met to 6·10⁻⁴, and the fitted functions, far smoother, to about 10⁻⁵. Letters in shapes: C
+Between nodes the tables are linear; for a function g that is off by at most h²/8·max|g''| on the
+step h = 0.1°. `LatentGPs.tabulation_error` bounds |g''|, and with it the error, from the parameters
+of the GPs: under 10⁻⁴ for those fitted to the shipped maps, and growing with h². Letters in shapes: C
 classes, G nodes, *B any leading dimensions, H×W cells.
 """
 

@@ -8,7 +8,7 @@ import torch
 from benchnav.datagen.create import create
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
-from benchnav.models.data import PixelTable
+from benchnav.models.pixels import PixelTable
 from benchnav.models.slope_table import SlopeTable, table_slopes
 from benchnav.terrain import Grid, Terrain
 
