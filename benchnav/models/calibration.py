@@ -1,34 +1,59 @@
-"""How good predictions are, a scenario at a time: of classes, and of traversability.
+"""How good a model's predictions are, a split at a time: of classes, and of traversability.
 
-Calibration is read off the probability integral transform (PIT) of what was observed: uniform when
-the predicted distributions are right. Where λ was clipped the distribution has an atom, and the PIT
-is drawn uniformly within it, so it is uniform there too. Sources: Gneiting and Raftery (2007),
-"Strictly proper scoring rules" (CRPS, Brier score); Czado et al. (2009), "Predictive model assessment for count
-data" (randomised PIT). Letters in shapes: B maps, H×W cells, C classes, N cells.
+One pass over the maps with sums and counts alone, so that memory does not grow with them. The scores
+themselves stand in `scores` and `uncertainty`. Letters in shapes: B maps, H×W cells, C classes, N
+cells of all maps.
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import Metric, MetricCollection
-from torchmetrics.classification import MulticlassAccuracy, MulticlassCalibrationError, MulticlassJaccardIndex
+from torchmetrics import MetricCollection
+from torchmetrics.classification import (
+    MulticlassAccuracy,
+    MulticlassConfusionMatrix,
+    MulticlassJaccardIndex,
+)
 
 from benchnav import rng
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.predictor import AnyModel, ClassModel, predict
+from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, predict
+from benchnav.models.scores import (
+    LEVEL,
+    PIT_BINS,
+    BrierScore,
+    ReliabilityCurve,
+    calibration_error,
+    coverage,
+    crps,
+    pit,
+    pit_counts,
+    tail_rate,
+)
 from benchnav.models.slope_table import SlopeTable
+from benchnav.models.uncertainty import ErrorRanking, mutual_information, predictive_entropy
 from benchnav.terrain import Terrain
 
-LEVEL = 0.9
 CHUNK_CELLS = 2**17
 
-_BINS = 15
-_QUADRATURE_NODES = 16
+
+@dataclass(frozen=True, kw_only=True)
+class Reliability:
+    """How often the most likely class is right, by its probability, in equal bins of [0, 1].
+
+    Args:
+        cells: how many cells have their most likely class in each bin.
+        confidence: its mean probability; 0 in an empty bin.
+        accuracy: how often it is right; 0 in an empty bin.
+    """
+
+    cells: tuple[int, ...]
+    confidence: tuple[float, ...]
+    accuracy: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,17 +65,33 @@ class ClassQuality:
         miou: intersection over union, averaged over the classes that occur.
         ece: expected calibration error of the most likely class, 15 bins.
         brier: Brier score, the squared distance of the probabilities to the class that is there, 0–2.
+        entropy: mean predictive entropy, in nats.
+        mutual_information: mean mutual information of class and member, in nats; not a number for a
+            model without several members.
+        entropy_auroc: how often the entropy is higher in a wrongly than in a rightly classified cell;
+            not a number where all or none are wrong.
+        mutual_information_auroc: the same of mutual information.
+        confusion: cells by true class (row) and most likely class (column), [C][C].
+        reliability: the curve that the ECE sums up.
+        slope_cells: cells by true class and whole degree of slope, [C][90].
     """
 
     accuracy: float
     miou: float
     ece: float
     brier: float
+    entropy: float
+    mutual_information: float
+    entropy_auroc: float
+    mutual_information_auroc: float
+    confusion: tuple[tuple[int, ...], ...]
+    reliability: Reliability
+    slope_cells: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class TraversabilityQuality:
-    """Quality of predicted distributions of traversability; lower is better but for the last two.
+    """Quality of predicted distributions of traversability; lower is better but for the last three.
 
     Args:
         rmse_observed: root mean square of E[λ] − λ as realised.
@@ -59,6 +100,7 @@ class TraversabilityQuality:
         crps: continuous ranked probability score of λ as realised.
         coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
         tail_rate: share of λ under the VaR at level 0.9; ideally 0.1.
+        pit: cells in 20 equal bins of the randomised PIT; ideally all alike.
     """
 
     rmse_observed: float
@@ -67,6 +109,7 @@ class TraversabilityQuality:
     crps: float
     coverage: float
     tail_rate: float
+    pit: tuple[int, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,90 +127,32 @@ class Quality:
     classes: tuple[ClassQuality, ...]
 
 
-class BrierScore(Metric):
-    """Mean over cells of Σ_c (p_c − y_c)², y being 1 at the class that is there (Brier, 1950)."""
-
-    full_state_update = False
-    total: Tensor
-    cells: Tensor
-
-    def __init__(self) -> None:
-        """Starts with no cells."""
-        super().__init__()
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("cells", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
-
-    def update(self, probabilities: Tensor, class_id: Tensor) -> None:
-        """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
-        right = probabilities.gather(1, class_id.unsqueeze(1)).squeeze(1)
-        self.total += (probabilities.square().sum(1) - 2 * right + 1).double().sum()
-        self.cells += class_id.numel()
-
-    def compute(self) -> Tensor:
-        """The score of all cells so far."""
-        return self.total / self.cells
-
-
-def crps(mixture: TraversabilityMixture, observed: Tensor) -> Tensor:
-    """Continuous ranked probability score: ∫₀¹ (F(x) − 1[observed ≤ x])² dx.
-
-    By Gauss-Legendre quadrature with 16 nodes on each side of the observation, where the integrand is
-    smooth; the error is under 10⁻⁵ for components with standard deviations from 0.05.
+def choose_splits(model: AnyModel, dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
+    """Tells which splits are to be measured, and refuses what cannot be.
 
     Args:
-        mixture: predicted, parameters of shape [*B, K, H, W].
-        observed: λ in [0, 1], shape [*B, H, W].
+        model: any model.
+        dataset: the maps.
+        splits: which splits; every test split when empty.
 
-    Returns:
-        Shape [*B, H, W]; 0 is perfect.
+    Raises:
+        DatasetError: there is no such split, or no test split.
+        CheckpointError: the model was trained on another class table.
     """
-    nodes, shares = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
-    at, above = observed.double(), 1 - observed.double()
-    score = torch.zeros_like(at)
-    for node, share in zip((nodes + 1) / 2, shares / 2, strict=True):
-        score += share * at * mixture.cdf(at * node).double() ** 2
-        score += share * above * (1 - mixture.cdf(at + above * node).double()) ** 2
-    return score.to(observed.dtype)
-
-
-def pit(mixture: TraversabilityMixture, observed: Tensor, generator: torch.Generator) -> Tensor:
-    """Randomised probability integral transform of what was observed.
-
-    Args:
-        mixture: predicted, parameters of shape [*B, K, H, W].
-        observed: λ in [0, 1], shape [*B, H, W].
-        generator: of the draws within the atoms at 0 and 1, on the CPU.
-
-    Returns:
-        Shape [*B, H, W]; uniform on [0, 1] when the prediction is right.
-    """
-    upper = mixture.cdf(observed)
-    atom = mixture.log_prob(observed).exp()
-    lower = torch.where(observed <= 0, 0.0, torch.where(observed >= 1, 1 - atom, upper))
-    drawn = torch.rand(observed.shape, generator=generator).to(observed.device)
-    return lower + drawn * (upper - lower)
-
-
-def coverage(transformed: Tensor, share: float = 0.9) -> float:
-    """Share of observations in the central interval that should hold `share` of them.
-
-    Args:
-        transformed: from `pit`, any shape.
-        share: of the central interval.
-    """
-    return float(((transformed - 0.5).abs() <= share / 2).double().mean())
-
-
-def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
-    """Share of observations under the VaR at `level`; ideally 1 − level.
-
-    Where the VaR is 0 or 1 it lies on an atom, and the draw within the atom decides.
-
-    Args:
-        transformed: from `pit`, any shape.
-        level: α in [0, 1).
-    """
-    return float((transformed < 1 - level).double().mean())
+    chosen = list(dict.fromkeys(splits)) or [name for name in dataset.splits if name.startswith("test/")]
+    if not chosen:
+        raise DatasetError(
+            f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. Name one in `splits`."
+        )
+    for split in chosen:
+        dataset.map_count(split)
+    names = tuple(item.name for item in dataset.recipe.classes)
+    if isinstance(model, ClassModel) and model.class_names != names:
+        raise CheckpointError(
+            f"Expected a model of the classes {', '.join(names)}, got one of {', '.join(model.class_names)}. "
+            "Train it on a dataset with this class table."
+        )
+    return chosen
 
 
 def evaluate(
@@ -188,25 +173,9 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    chosen = list(splits) or [name for name in dataset.splits if name.startswith("test/")]
-    if not chosen:
-        raise DatasetError(
-            f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. Name one in `splits`."
-        )
-    for split in chosen:
-        if split not in dataset.splits:
-            raise DatasetError(
-                f"Expected a split of {dataset.path}, one of {sorted(dataset.splits)}, got {split!r}."
-            )
-    names = tuple(item.name for item in dataset.recipe.classes)
-    if isinstance(model, ClassModel) and model.class_names != names:
-        raise CheckpointError(
-            f"Expected a model of the classes {', '.join(names)}, got one of {', '.join(model.class_names)}. "
-            "Train it on a dataset with this class table."
-        )
-    for split in chosen:
+    for split in choose_splits(model, dataset, splits):
         step = max(1, CHUNK_CELLS // (dataset.grid.height * dataset.grid.width))
-        count = dataset.splits[split]["maps"]
+        count = dataset.map_count(split)
         chunks = (
             dataset.terrain(split, range(start, min(start + step, count))) for start in range(0, count, step)
         )
@@ -221,31 +190,31 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
         chunks: the maps, at least one, a few at a time.
         generator: of the draws within atoms, on the CPU.
     """
-    cells: list[Tensor] = []
-    maps, metrics = 0, MetricCollection({})
+    maps, cells, sums = 0, 0, torch.zeros(6, dtype=torch.float64)
+    histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
+    classes: list[_ClassTally] = []
     for terrain in chunks:
         mixture = predict(model, terrain)
-        cells.append(_score_cells(mixture, terrain, generator))
-        maps += len(terrain)
+        scores, transformed = _score_cells(mixture, terrain, generator)
+        sums += scores.cpu()
+        histogram += pit_counts(transformed)
+        maps, cells = maps + len(terrain), cells + transformed.numel()
         if isinstance(model, ClassModel):
-            metrics = (
-                metrics if len(metrics) else _class_metrics(len(model.class_names)).to(terrain.rgb.device)
-            )
-            metrics.update(mixture.weights, terrain.class_id)
-    error_observed, error_expected, nll, score, transformed = torch.cat(cells, dim=1)
+            classes = classes or [_ClassTally(model, terrain)]
+            classes[0].add(mixture.weights, terrain)
+    squared_observed, squared_expected, nll, score, covered, in_tail = (sums / cells).tolist()
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
-            rmse_observed=float(error_observed.square().mean().sqrt()),
-            rmse_expected=float(error_expected.square().mean().sqrt()),
-            nll=float(nll.mean()),
-            crps=float(score.mean()),
-            coverage=coverage(transformed),
-            tail_rate=tail_rate(transformed),
+            rmse_observed=squared_observed**0.5,
+            rmse_expected=squared_expected**0.5,
+            nll=nll,
+            crps=score,
+            coverage=covered,
+            tail_rate=in_tail,
+            pit=tuple(histogram.tolist()),
         ),
-        classes=(ClassQuality(**{k: float(v) for k, v in metrics.compute().items()}),)
-        if len(metrics)
-        else (),
+        classes=tuple(tally.quality() for tally in classes),
     )
 
 
@@ -272,28 +241,85 @@ def measure_latent(table: SlopeTable, terrain: Terrain) -> dict[str, float]:
     }
 
 
-def _score_cells(mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator) -> Tensor:
-    """Errors, NLL, CRPS and PIT of every cell, float64, shape [5, N]."""
+class _ClassTally:
+    """Counts of a model's class probabilities over maps."""
+
+    def __init__(self, model: ClassModel, first: Terrain) -> None:
+        count, device = len(model.class_names), first.rgb.device
+        self.members: list[EnsembleModel] = []
+        if isinstance(model, EnsembleModel):
+            one = first.select(torch.zeros(1, dtype=torch.int64, device=device))
+            self.members = [model] if len(model.member_probabilities(one.observe())) > 1 else []
+        self.by_class = MetricCollection(
+            {
+                "accuracy": MulticlassAccuracy(count, average="micro"),
+                "miou": MulticlassJaccardIndex(count, average="macro"),
+                "confusion": MulticlassConfusionMatrix(count),
+            }
+        ).to(device)
+        self.brier, self.reliability = BrierScore().to(device), ReliabilityCurve().to(device)
+        self.rankings = [ErrorRanking().to(device) for _ in range(1 + len(self.members))]
+        self.uncertainty = [0.0 for _ in self.rankings]
+        self.cells = 0
+        self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
+
+    def add(self, probabilities: Tensor, terrain: Terrain) -> None:
+        """Adds maps: class probabilities [B, C, H, W] and the truth."""
+        found = probabilities.argmax(1)
+        self.by_class.update(found, terrain.class_id)
+        self.brier.update(probabilities, terrain.class_id)
+        self.reliability.update(probabilities, terrain.class_id)
+        measures = [predictive_entropy(probabilities)]
+        measures += [mutual_information(m.member_probabilities(terrain.observe())) for m in self.members]
+        for place, measure in enumerate(measures):
+            self.rankings[place].update(measure, found != terrain.class_id)
+            self.uncertainty[place] += float(measure.double().sum())
+        self.cells += found.numel()
+        degree = terrain.slope_deg.floor().long().clamp(0, 89)
+        counted = torch.bincount(
+            (90 * terrain.class_id + degree).flatten(), minlength=self.slope_cells.numel()
+        )
+        self.slope_cells += counted.view_as(self.slope_cells)
+
+    def quality(self) -> ClassQuality:
+        by_class, curve = self.by_class.compute(), self.reliability.compute().cpu()
+        uncertainty = [total / self.cells for total in self.uncertainty]
+        auroc = [float(ranking.compute()) for ranking in self.rankings]
+        single = [float("nan")]
+        return ClassQuality(
+            accuracy=float(by_class["accuracy"]),
+            miou=float(by_class["miou"]),
+            ece=calibration_error(curve),
+            brier=float(self.brier.compute()),
+            entropy=uncertainty[0],
+            mutual_information=(uncertainty[1:] or single)[0],
+            entropy_auroc=auroc[0],
+            mutual_information_auroc=(auroc[1:] or single)[0],
+            confusion=tuple(tuple(row) for row in by_class["confusion"].tolist()),
+            reliability=Reliability(
+                cells=tuple(int(cells) for cells in curve[0]),
+                confidence=tuple(curve[1].tolist()),
+                accuracy=tuple(curve[2].tolist()),
+            ),
+            slope_cells=tuple(tuple(row) for row in self.slope_cells.tolist()),
+        )
+
+
+def _score_cells(
+    mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Sums of squared errors, NLL, CRPS, covered and tail cells, float64, shape [6]; and every PIT."""
     observed = terrain.traversability
     mean, std = terrain.traversability_mean.unsqueeze(1), terrain.traversability_std.unsqueeze(1)
     truth = TraversabilityMixture(torch.ones_like(mean), mean, std).mean()
-    expected = mixture.mean()
-    scores = (
-        expected - observed,
-        expected - truth,
-        -mixture.log_prob(observed),
-        crps(mixture, observed),
-        pit(mixture, observed, generator),
-    )
-    return torch.stack([score.double().flatten() for score in scores])
-
-
-def _class_metrics(count: int) -> MetricCollection:
-    return MetricCollection(
-        {
-            "accuracy": MulticlassAccuracy(count, average="micro"),
-            "miou": MulticlassJaccardIndex(count, average="macro"),
-            "ece": MulticlassCalibrationError(count, n_bins=_BINS, norm="l1"),
-            "brier": BrierScore(),
-        }
-    )
+    expected, transformed = mixture.mean(), pit(mixture, observed, generator)
+    cells = transformed.numel()
+    sums = [
+        (expected - observed).double().square().sum(),
+        (expected - truth).double().square().sum(),
+        -mixture.log_prob(observed).double().sum(),
+        crps(mixture, observed).double().sum(),
+        torch.as_tensor(coverage(transformed) * cells, device=observed.device),
+        torch.as_tensor(tail_rate(transformed, LEVEL) * cells, device=observed.device),
+    ]
+    return torch.stack([total.double() for total in sums]), transformed

@@ -1,67 +1,25 @@
 import math
+from dataclasses import astuple, replace
 
 import pytest
 import torch
-from scipy.special import ndtr
+from scipy.stats import mannwhitneyu
 
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.calibration import coverage, crps, evaluate, measure, measure_latent, pit, tail_rate
-from benchnav.models.predictor import FusedModel, Oracle
+from benchnav.models.calibration import choose_splits, evaluate, measure, measure_latent
+from benchnav.models.predictor import Oracle
+from benchnav.models.scores import crps
+from benchnav.models.uncertainty import mutual_information, predictive_entropy
 from benchnav.terrain import Observation
 
+from .stub import ColourModel
 from .support import linear_table, make_terrain
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
-
-
-def single(mean: float, std: float, shape: tuple[int, int] = (200, 200)) -> TraversabilityMixture:
-    ones = torch.ones(1, *shape, dtype=torch.float64)
-    return TraversabilityMixture(ones, mean * ones, std * ones)
-
-
-def test_crps_is_the_closed_form_of_a_gaussian_far_from_the_bounds() -> None:
-    mixture = single(0.5, 0.05, (1, 101))
-    observed = torch.linspace(0.3, 0.7, 101, dtype=torch.float64)[None]
-    z = ((observed - 0.5) / 0.05).numpy()
-    density = torch.exp(-0.5 * torch.from_numpy(z) ** 2) / math.sqrt(2 * math.pi)
-    exact = 0.05 * (torch.from_numpy(z * (2 * ndtr(z) - 1)) + 2 * density - 1 / math.sqrt(math.pi))
-    torch.testing.assert_close(crps(mixture, observed), exact, rtol=0, atol=1e-5)
-
-
-def test_crps_of_clipped_mixtures_agrees_with_sampling() -> None:
-    weights = torch.tensor([0.6, 0.4], dtype=torch.float64).view(2, 1, 1).expand(2, 1, 4)
-    means = torch.tensor([0.9, 0.1], dtype=torch.float64).view(2, 1, 1).expand(2, 1, 4)
-    mixture = TraversabilityMixture(weights, means, torch.full((2, 1, 4), 0.2, dtype=torch.float64))
-    observed = torch.tensor([[0.0, 0.3, 0.9, 1.0]], dtype=torch.float64)
-    first, second = mixture.sample(400_000, generator()), mixture.sample(400_000, generator(1))
-    sampled = (first - observed).abs().mean(0) - 0.5 * (first - second).abs().mean(0)
-    torch.testing.assert_close(crps(mixture, observed), sampled, rtol=0, atol=2e-3)
-
-
-@pytest.mark.parametrize("mean", [0.5, 0.95, 0.05, 1.2])
-def test_what_is_drawn_from_the_prediction_is_calibrated(mean: float) -> None:
-    mixture = single(mean, 0.15)
-    transformed = pit(mixture, mixture.sample(1, generator())[0], generator(1))
-    assert coverage(transformed) == pytest.approx(0.9, abs=0.006)
-    assert tail_rate(transformed) == pytest.approx(0.1, abs=0.006)
-    assert float(transformed.mean()) == pytest.approx(0.5, abs=0.006)
-
-
-def test_tail_rate_counts_what_lies_under_the_var() -> None:
-    mixture = single(0.5, 0.15)
-    observed = single(0.45, 0.25).sample(1, generator())[0]
-    share = float((observed < mixture.var(0.9)).double().mean())
-    assert tail_rate(pit(mixture, observed, generator(1))) == pytest.approx(share, abs=1e-9)
-    assert share > 0.2
-
-
-def test_a_prediction_too_narrow_covers_too_little() -> None:
-    transformed = pit(single(0.5, 0.05), single(0.5, 0.15).sample(1, generator())[0], generator(1))
-    assert coverage(transformed) < 0.5
 
 
 def test_the_oracle_is_calibrated_and_has_no_class_metrics() -> None:
@@ -78,6 +36,29 @@ def test_the_oracle_is_calibrated_and_has_no_class_metrics() -> None:
     assert figures.nll == pytest.approx(float(by_hand), rel=1e-5)
     error = (truth.mean() - terrain.traversability).square().mean().sqrt()
     assert figures.rmse_observed == pytest.approx(float(error), rel=1e-5)
+    assert figures.crps == pytest.approx(float(crps(truth, terrain.traversability).mean()), rel=1e-5)
+    cells = terrain.traversability.numel()
+    assert sum(figures.pit) == cells
+    assert sum(figures.pit[1:-1]) / cells == pytest.approx(figures.coverage, abs=1e-4)
+    assert sum(figures.pit[:2]) / cells == pytest.approx(figures.tail_rate, abs=1e-4)
+
+
+def test_a_model_off_by_a_constant_is_off_by_it_in_truth() -> None:
+    class Shifted:
+        """Says N(0.4, 0.01) of ground that is N(0.5, 0.01)."""
+
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            ones = torch.ones(len(observation.rgb), 1, *observation.grid.shape)
+            return TraversabilityMixture(ones, 0.4 * ones, 0.01 * ones)
+
+    drawn = make_terrain(batch=3)
+    level = torch.full_like(drawn.traversability, 0.5)
+    terrain = replace(drawn, traversability_mean=level, traversability_std=0.02 * level, traversability=level)
+    figures = measure(Shifted(), [terrain], generator()).traversability
+    assert figures.rmse_expected == pytest.approx(0.1, abs=1e-5)
+    assert figures.rmse_observed == pytest.approx(0.1, abs=1e-5)
+    assert figures.coverage == figures.tail_rate == 0
+    assert figures.pit[-1] == level.numel()
 
 
 def test_class_metrics_are_those_counted_by_hand() -> None:
@@ -103,6 +84,65 @@ def test_class_metrics_are_those_counted_by_hand() -> None:
     assert classes.ece == pytest.approx(0.3, abs=1e-4)
     left, right = 0.2**2 + 0.15**2 + 0.05**2, 0.8**2 + 0.85**2 + 0.05**2
     assert classes.brier == pytest.approx((left + right) / 2)
+    half = terrain.class_id.numel() // 2 * len(chunks)
+    assert classes.confusion == ((half, 0, 0), (half, 0, 0), (0, 0, 0))
+    assert classes.reliability.cells[12] == 2 * half
+    assert classes.reliability.accuracy[12] == 0.5
+    assert classes.reliability.confidence[12] == pytest.approx(0.8)
+    nats = -sum(p * math.log(p) for p in (0.8, 0.15, 0.05))
+    assert classes.entropy == pytest.approx(nats, rel=1e-5)
+    assert classes.entropy_auroc == 0.5
+    assert math.isnan(classes.mutual_information)
+    assert math.isnan(classes.mutual_information_auroc)
+
+
+def test_uncertainty_is_ranked_over_all_maps(dataset: TerrainDataset) -> None:
+    model, terrain = ColourModel(), dataset.terrain("test/hs")
+    chunks = [terrain.select(torch.tensor([index])) for index in range(len(terrain))]
+    (classes,) = measure(model, chunks, generator()).classes
+    members = model.member_probabilities(terrain.observe())
+    wrong = members.mean(0).argmax(1) != terrain.class_id
+    for values, mean, auroc in (
+        (predictive_entropy(members.mean(0)), classes.entropy, classes.entropy_auroc),
+        (mutual_information(members), classes.mutual_information, classes.mutual_information_auroc),
+    ):
+        exact = mannwhitneyu(values[wrong].numpy(), values[~wrong].numpy()).statistic
+        exact /= int(wrong.sum()) * int((~wrong).sum())
+        assert mean == pytest.approx(float(values.mean()), rel=1e-5)
+        assert auroc == pytest.approx(exact, abs=1e-3)
+
+
+def test_one_member_has_no_mutual_information(dataset: TerrainDataset) -> None:
+    quality = measure(ColourModel((40.0,)), [dataset.terrain("valid")], generator())
+    assert math.isnan(quality.classes[0].mutual_information)
+    assert quality.classes[0].entropy > 0
+
+
+def test_slopes_are_counted_by_true_class() -> None:
+    terrain = make_terrain(batch=1, classes=10)
+    terrain.slope_deg[:] = 12.5
+    terrain.slope_deg[0, 0, :2] = torch.tensor([0.0, 90.0])
+    terrain.class_id[0, 0, :2] = torch.tensor([4, 6])
+    cells = torch.tensor(measure(ColourModel(), [terrain], generator()).classes[0].slope_cells)
+    assert cells.shape == (10, 90)
+    assert cells.sum(1).tolist() == terrain.class_id.flatten().bincount(minlength=10).tolist()
+    assert cells[4, 0] == cells[6, 89] == 1
+    assert int(cells[:, 12].sum()) == terrain.class_id.numel() - 2
+
+
+def test_measures_do_not_depend_on_how_maps_are_read(dataset: TerrainDataset) -> None:
+    terrain = dataset.terrain("valid")
+    whole = measure(ColourModel(), [terrain], generator())
+    parts = [terrain.select(torch.arange(4)[part]) for part in (slice(0, 1), slice(1, 4))]
+    pieces = measure(ColourModel(), parts, generator())
+    assert pieces.maps == whole.maps == 4
+    one, other = pieces.classes[0], whole.classes[0]
+    assert one.confusion == other.confusion
+    assert astuple(one)[:8] == pytest.approx(astuple(other)[:8], rel=1e-6)
+    named = ("rmse_observed", "rmse_expected", "nll", "crps")
+    assert [getattr(pieces.traversability, name) for name in named] == pytest.approx(
+        [getattr(whole.traversability, name) for name in named], rel=1e-6
+    )
 
 
 def test_latent_metrics_read_each_cell_with_its_own_class() -> None:
@@ -133,6 +173,11 @@ def test_a_split_that_is_not_there_is_refused(dataset: TerrainDataset) -> None:
 
 
 def test_a_model_of_other_classes_is_refused(dataset: TerrainDataset) -> None:
-    model = FusedModel(torch.nn.Identity(), linear_table(), ("a", "b", "c"))
+    model = ColourModel()
+    model.class_names = ("a", "b", "c")
     with pytest.raises(CheckpointError, match="class table"):
-        dict(evaluate(model, dataset))
+        choose_splits(model, dataset)
+
+
+def test_a_split_named_twice_is_measured_once(dataset: TerrainDataset) -> None:
+    assert choose_splits(Oracle(), dataset, ["valid", "test/std", "valid"]) == ["valid", "test/std"]
