@@ -27,7 +27,8 @@ from benchnav.datagen.scenario import Recipe, load_recipe, recipe_from_dict
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.calibration import pit
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import FusedModel, find_checkpoint
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import find_checkpoint
 from benchnav.terrain import Observation
 
 DOCS, MODEL = Path(__file__).parent, "paper-v1"
@@ -409,7 +410,8 @@ def main() -> None:
     """Measures, prints and writes the tables, and draws the figures."""
     torch.set_num_threads(1)
     recipe, checkpoint = load_recipe("shift-v1"), load_checkpoint(find_checkpoint(MODEL))
-    model, steepest = FusedModel.from_checkpoint(checkpoint), checkpoint.part("gp").config["steepest_deg"]
+    model = FusedModel.from_checkpoint(checkpoint)
+    steepest = max(checkpoint.part("gp").config["steepest_deg"])
     ladder, pairs = measure_ladder(model, recipe), measure_pairs(model, recipe)
     changed = {name: pair for name, pair in pairs.items() if name != "std"}
     tables = {

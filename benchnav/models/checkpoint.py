@@ -1,17 +1,19 @@
 """Checkpoints: a trained model as a folder of data that runs no code when it is read.
 
-`config.json` says what the model is and what it was trained on; each part, `classifier` or `gp`, has
-its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`. A checkpoint is written to a
-folder beside its own and renamed, so that its name never holds half of one.
+`config.json` says what the model is and how each of its parts came to be; a part, such as `classifier`
+or `gp`, has its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`. A checkpoint is
+written to a folder beside its own and renamed, so that its name never holds half of one.
 """
 
 import hashlib
 import json
 import os
+import platform
 import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -24,26 +26,42 @@ import benchnav
 from benchnav.errors import CheckpointError
 
 FORMAT = "benchnav-checkpoint"
-FORMAT_VERSION = (1, 0)
+FORMAT_VERSION = (2, 0)
 CONFIG = "config.json"
+FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
+
+_PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
+
+
+def _versions() -> dict[str, str]:
+    found = {name: version(name) for name in _PACKAGES}
+    return {"benchnav": benchnav.__version__, "python": platform.python_version(), **found}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One trained half of a model.
+    """One trained part of a model.
 
     Args:
         config: settings it is rebuilt from, plain data.
         tensors: weights and tables by name.
         seed: root seed of its training.
         metrics: what was measured after training.
+        data_id: name of what it was trained on: a dataset, or a file of slip logs.
+        data_digest: content digest of what it was trained on.
+        half_precision: store kernels as float16; they are read as float32.
+        versions: of the packages that trained it.
     """
 
     config: dict[str, Any]
     tensors: dict[str, Tensor]
     seed: int
     metrics: dict[str, float]
+    data_id: str
+    data_digest: str
+    half_precision: bool = False
+    versions: Mapping[str, str] = field(default_factory=_versions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,43 +70,49 @@ class Checkpoint:
 
     Args:
         class_names: names of the C classes, in the order of their ids.
-        dataset_id: name of the dataset it was trained on.
-        dataset_digest: content digest of what it was trained on.
-        parts: its halves by name, `classifier`, `gp` or both.
-        package_version: version of benchnav that trained it.
+        parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
+        model: registered name of the family that rebuilds the model.
     """
 
     class_names: tuple[str, ...]
-    dataset_id: str
-    dataset_digest: str
     parts: Mapping[str, Part] = field(default_factory=dict)
-    package_version: str = benchnav.__version__
+    model: str = FUSED
 
     def part(self, name: str) -> Part:
-        """Gives a half.
+        """Gives a part.
 
         Raises:
             CheckpointError: it has not been trained.
         """
         if name not in self.parts:
             raise CheckpointError(
-                f"Expected a checkpoint with a {name!r} half, got one with {sorted(self.parts)}. "
+                f"Expected a checkpoint with a part {name!r}, got one with {sorted(self.parts)}. "
                 f"Train it with `benchnav-train {name}` into the same folder."
             )
         return self.parts[name]
 
     def with_part(self, name: str, part: Part) -> "Checkpoint":
-        """Gives a copy in which one half is replaced."""
+        """Gives a copy in which one part is added or replaced."""
         return replace(self, parts={**self.parts, name: part})
 
 
-def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, half_precision: bool = True) -> None:
+def member_name(index: int) -> str:
+    """Name of the part that holds a classifier: the members of an ensemble are counted from 0."""
+    return f"{CLASSIFIER}-{index + 1}" if index else CLASSIFIER
+
+
+def member_names(checkpoint: Checkpoint) -> list[str]:
+    """Names of the classifiers that are there, the first one in any case."""
+    names = [member_name(index) for index in range(len(checkpoint.parts))]
+    return [name for name in names if name in checkpoint.parts] or [CLASSIFIER]
+
+
+def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
     """Writes a checkpoint, replacing one that is there.
 
     Args:
         folder: its name.
         checkpoint: what to write.
-        half_precision: store the classifier's kernels as float16; they are read as float32.
 
     Raises:
         CheckpointError: it cannot be written, or the name is that of something else.
@@ -103,7 +127,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint, half_precision: 
         folder.parent.mkdir(parents=True, exist_ok=True)
         workplace = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         try:
-            _write(workplace / "new", checkpoint, half_precision)
+            _write(workplace / "new", checkpoint)
             if folder.exists():
                 os.replace(folder, workplace / "old")
             try:
@@ -135,41 +159,42 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
                 tensors=_read_tensors(folder / f"{name}.safetensors", entry["sha256"]),
                 seed=int(entry["seed"]),
                 metrics=dict(entry["metrics"]),
+                data_id=entry.get("data", config.get("dataset"))["id"],
+                data_digest=entry.get("data", config.get("dataset"))["digest"],
+                half_precision=bool(entry.get("half_precision", name == CLASSIFIER)),
+                versions=dict(entry.get("versions", {})),
             )
             for name, entry in config["parts"].items()
         }
         if config["class_count"] != len(config["class_names"]):
             raise ValueError("class_count is not the number of class_names")
         return Checkpoint(
-            class_names=tuple(config["class_names"]),
-            dataset_id=config["dataset"]["id"],
-            dataset_digest=config["dataset"]["digest"],
-            parts=parts,
-            package_version=config["package_version"],
+            class_names=tuple(config["class_names"]), parts=parts, model=config.get("model", FUSED)
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
 
 
-def _write(folder: Path, checkpoint: Checkpoint, half_precision: bool) -> None:
+def _write(folder: Path, checkpoint: Checkpoint) -> None:
     folder.mkdir()
     parts = {}
     for name, part in checkpoint.parts.items():
-        half = half_precision and name == CLASSIFIER
-        tensors = {key: _stored(value, half) for key, value in part.tensors.items()}
+        tensors = {key: _stored(value, part.half_precision) for key, value in part.tensors.items()}
         content = safetensors.torch.save(tensors)
         _write_bytes(folder / f"{name}.safetensors", content)
         parts[name] = {
             "config": part.config,
+            "data": {"id": part.data_id, "digest": part.data_digest},
             "seed": part.seed,
             "metrics": part.metrics,
+            "versions": dict(part.versions),
+            "half_precision": part.half_precision,
             "sha256": hashlib.sha256(content).hexdigest(),
         }
     config = {
         "format": FORMAT,
         "format_version": ".".join(map(str, FORMAT_VERSION)),
-        "package_version": checkpoint.package_version,
-        "dataset": {"id": checkpoint.dataset_id, "digest": checkpoint.dataset_digest},
+        "model": checkpoint.model,
         "class_count": len(checkpoint.class_names),
         "class_names": list(checkpoint.class_names),
         "parts": parts,

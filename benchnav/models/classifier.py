@@ -45,6 +45,28 @@ class WithFullResolution(nn.Module):
         return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
 
 
+class CrossEntropyWithDice(nn.Module):
+    """Cross-entropy plus a soft Dice loss, which weighs rare classes as much as frequent ones.
+
+    Source: Milletari et al. (2016), "V-Net".
+
+    Args:
+        dice: weight of the Dice loss.
+        label_smoothing: of the cross-entropy's targets.
+    """
+
+    def __init__(self, dice: float, label_smoothing: float) -> None:
+        """Sets the two losses up."""
+        super().__init__()
+        self.dice = dice
+        self.cross_entropy = nn.CrossEntropyLoss(label_smoothing=label_smoothing)
+        self.overlap = smp.losses.DiceLoss("multiclass")
+
+    def forward(self, logits: Tensor, class_id: Tensor) -> Tensor:
+        """Computes the loss of logits [B, C, H, W] where the classes are `class_id` [B, H, W]."""
+        return self.cross_entropy(logits, class_id) + self.dice * self.overlap(logits, class_id)
+
+
 class TerrainClassifier(lightning.LightningModule):
     """Predicts the terrain class of every cell from colour.
 
@@ -54,6 +76,7 @@ class TerrainClassifier(lightning.LightningModule):
         colour_mean: of the training maps, 0–255, shape [3].
         colour_std: of the training maps, shape [3].
         seed: root seed of the initial weights.
+        temperature: by which logits are divided once training is over (see `models.temperature`).
     """
 
     colour_mean: Tensor
@@ -66,10 +89,11 @@ class TerrainClassifier(lightning.LightningModule):
         colour_mean: Tensor,
         colour_std: Tensor,
         seed: int = 0,
+        temperature: float = 1.0,
     ) -> None:
         """Builds the network with fresh weights."""
         super().__init__()
-        self.config, self.class_count = config, class_count
+        self.config, self.class_count, self.temperature = config, class_count, temperature
         self.register_buffer("colour_mean", colour_mean.clone().view(3, 1, 1))
         self.register_buffer("colour_std", colour_std.clone().view(3, 1, 1))
         self.network = self.configure_network(seed)
@@ -106,8 +130,10 @@ class TerrainClassifier(lightning.LightningModule):
         return network.to(memory_format=torch.channels_last)
 
     def configure_losses(self) -> nn.Module:
-        """The training loss: cross-entropy, a proper score, so that probabilities are calibrated."""
-        return nn.CrossEntropyLoss()
+        """The training loss: cross-entropy, a proper score, unless more is asked for."""
+        if self.config.dice:
+            return CrossEntropyWithDice(self.config.dice, self.config.label_smoothing)
+        return nn.CrossEntropyLoss(label_smoothing=self.config.label_smoothing)
 
     def configure_metrics(self) -> MetricCollection:
         """What is measured on the validation maps."""
@@ -137,24 +163,28 @@ class TerrainClassifier(lightning.LightningModule):
             rgb: uint8, shape [B, 3, H, W].
 
         Returns:
-            Shape [B, C, H, W].
+            Shape [B, C, H, W]; in evaluation divided by the temperature.
         """
         height, width = rgb.shape[-2:]
         image = (rgb.to(self.colour_mean.dtype) - self.colour_mean) / self.colour_std
         image = nn.functional.pad(image, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
         logits = self.network(image.contiguous(memory_format=torch.channels_last))
-        return logits[..., :height, :width]
+        logits = logits[..., :height, :width]
+        return logits if self.training else logits / self.temperature
 
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
         """Computes the loss of a batch with `rgb` and `class_id`."""
-        return self.loss(self(batch["rgb"]), batch["class_id"])
+        rgb, class_id = batch["rgb"], batch["class_id"].long()
+        loss = self.loss(self(rgb), class_id)
+        self.log("train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(rgb))
+        return loss
 
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
         """Measures a batch with `rgb` and `class_id`."""
-        logits = self(batch["rgb"]).float()
-        loss = self.loss(logits, batch["class_id"])
-        self.metrics.update(logits.argmax(1), batch["class_id"])
-        self.log("valid_loss", loss, on_epoch=True, batch_size=len(logits))
+        logits, class_id = self(batch["rgb"]).float(), batch["class_id"].long()
+        loss = self.loss(logits, class_id)
+        self.metrics.update(logits.argmax(1), class_id)
+        self.log("valid_loss", loss, on_epoch=True, batch_size=len(logits), sync_dist=True)
         self.log_dict(dict(self.metrics.items()), on_epoch=True, batch_size=len(logits))
 
     @classmethod
@@ -164,7 +194,7 @@ class TerrainClassifier(lightning.LightningModule):
         """Rebuilds a trained classifier, downloading nothing.
 
         Args:
-            config: fields of `ClassifierConfig`.
+            config: fields of `ClassifierConfig`, and `temperature`.
             class_count: C.
             tensors: a state dict.
 
@@ -173,10 +203,12 @@ class TerrainClassifier(lightning.LightningModule):
             RuntimeError: the tensors do not fit them.
         """
         try:
-            settings = ClassifierConfig(**{**config, "pretrained": False})
-        except TypeError as error:
+            settings = {name: value for name, value in config.items() if name != "temperature"}
+            built = ClassifierConfig(**{**settings, "pretrained": False})
+            temperature = float(config.get("temperature", 1.0))
+        except (TypeError, ValueError) as error:
             raise ConfigError(f"Expected the settings of a classifier, got {sorted(config)}.") from error
-        model = cls(settings, class_count, torch.zeros(3), torch.ones(3))
+        model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=temperature)
         model.load_state_dict(tensors)
         return model.eval()
 

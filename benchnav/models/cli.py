@@ -1,54 +1,53 @@
-"""The command `benchnav-train`: train the halves of a model and measure the whole."""
+"""The command `benchnav-train`: train models and measure them."""
 
-import os
 import sys
-import tempfile
-from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from benchnav.command import Command, run
-from benchnav.models.config import ClassifierConfig, LatentGPConfig
+from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig
+from benchnav.models.evaluate import evaluate
 
 if TYPE_CHECKING:
     from benchnav.datagen.store import TerrainDataset
-    from benchnav.models.calibration import Quality
-    from benchnav.models.checkpoint import Checkpoint, Part
+    from benchnav.models.checkpoint import Part
+    from benchnav.models.fitting import FitOptions
+    from benchnav.models.target import Target
 
-Precision = Literal["bf16-mixed", "32-true", "16-mixed"]
-Device = Literal["auto", "cpu", "cuda"]
-
-_DEFAULT_CLASSIFIER, _DEFAULT_GP = ClassifierConfig(), LatentGPConfig()
+_HELD_OUT = 0.1  # of slip logs
+_DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
+Config = TypeVar("Config", ClassifierConfig, MDNConfig)
 
 
 def train_classifier(
     data: str,
     out: str,
     classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
+    members: int = 1,
     seed: int = 0,
-    precision: Precision = "bf16-mixed",
-    device: Device = "auto",
+    trainer: dict[str, Any] | None = None,
     half_precision: bool = True,
+    resume: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Train the terrain classifier.
+    """Train the terrain classifier, or an ensemble of them.
 
     Args:
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder; a GP half in it that was trained on the same maps is kept.
+        out: Checkpoint folder; Gaussian processes in it for the same classes are kept. Logs go to OUT.training.
         classifier: Settings of the classifier.
+        members: How many to train, with the seeds SEED, SEED + 1, …; their probabilities are averaged.
         seed: Root seed of weights, order and augmentation.
-        precision: Arithmetic of training.
-        device: Where to train.
+        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
         half_precision: Store the weights as float16.
-        overwrite: Replace a classifier, or a checkpoint of other maps, that is there.
+        resume: Go on with a training that was interrupted; whole epochs are kept.
+        overwrite: Replace classifiers, or a checkpoint of other classes, that are there.
     """
-    dataset, checkpoint = _start(data, out, {"classifier"}, overwrite)
-    checkpoint = checkpoint.with_part(
-        "classifier", _fit_classifier(classifier, dataset, seed, precision, device)
-    )
-    _save(out, checkpoint, half_precision)
+    dataset = _open_dataset(data)
+    classifier, options = _options(out, classifier, trainer, resume)
+    target = _open_target(out, dataset, _members(members), options, overwrite)
+    _train_members(target, classifier, dataset, members, seed, options, half_precision)
 
 
 def train_gp(
@@ -56,21 +55,30 @@ def train_gp(
     out: str,
     gp: LatentGPConfig = _DEFAULT_GP,
     seed: int = 0,
-    device: Device = "auto",
+    trainer: dict[str, Any] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Train the class-wise Gaussian processes.
 
     Args:
-        data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder; a classifier half in it that was trained on the same maps is kept.
+        data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv or .parquet with
+            the columns class, slope_deg and traversability.
+        out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
+            their class table.
         gp: Settings of the GPs.
-        seed: Root seed of subsample and batches.
-        device: Where to train.
-        overwrite: Replace GPs, or a checkpoint of other maps, that are there.
+        seed: Root seed of the subsample.
+        trainer: Settings of Lightning's trainer, of which the accelerator alone counts.
+        overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
-    dataset, checkpoint = _start(data, out, {"gp"}, overwrite)
-    _save(out, checkpoint.with_part("gp", _fit_gp(gp, dataset, seed, device)), True)
+    from benchnav.models.fitting import FitOptions
+
+    options = FitOptions(trainer=trainer or {})
+    if data.endswith((".csv", ".parquet")):
+        _train_gp_on_logs(data, out, gp, seed, options, overwrite)
+        return
+    dataset = _open_dataset(data)
+    target = _open_target(out, dataset, ["gp"], options, overwrite)
+    target.add("gp", _fit_gp(gp, dataset, seed, options))
 
 
 def train_all(
@@ -78,209 +86,233 @@ def train_all(
     out: str,
     classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
     gp: LatentGPConfig = _DEFAULT_GP,
+    members: int = 1,
     seed: int = 0,
-    precision: Precision = "bf16-mixed",
-    device: Device = "auto",
+    trainer: dict[str, Any] | None = None,
     half_precision: bool = True,
+    resume: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Train a whole model: Gaussian processes and classifier.
+    """Train a whole model: Gaussian processes and classifiers.
 
     Args:
         data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder.
+        out: Checkpoint folder. Logs go to OUT.training.
         classifier: Settings of the classifier.
         gp: Settings of the GPs.
+        members: How many classifiers to train; their probabilities are averaged.
         seed: Root seed.
-        precision: Arithmetic of the classifier's training.
-        device: Where to train.
-        half_precision: Store the classifier's weights as float16.
+        trainer: Settings of Lightning's trainer for the classifiers; of the GPs' the accelerator.
+        half_precision: Store the classifiers' weights as float16.
+        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
         overwrite: Replace a checkpoint that is there.
     """
-    dataset, checkpoint = _start(data, out, {"classifier", "gp"}, overwrite)
-    if not _is_done(checkpoint, gp, seed):
-        checkpoint = checkpoint.with_part("gp", _fit_gp(gp, dataset, seed, device))
-        _save(out, checkpoint, half_precision)
-    checkpoint = checkpoint.with_part(
-        "classifier", _fit_classifier(classifier, dataset, seed, precision, device)
-    )
-    _save(out, checkpoint, half_precision)
+    dataset = _open_dataset(data)
+    classifier, options = _options(out, classifier, trainer, resume)
+    target = _open_target(out, dataset, ["gp", *_members(members)], options, overwrite)
+    if not target.holds("gp", asdict(gp), seed):
+        target.add("gp", _fit_gp(gp, dataset, seed, options))
+    _train_members(target, classifier, dataset, members, seed, options, half_precision)
 
 
-def evaluate(
-    checkpoint: str, data: str, splits: list[str] | None = None, json: str = "", seed: int = 0
+def train_mdn(
+    data: str,
+    out: str,
+    mdn: MDNConfig = _DEFAULT_MDN,
+    seed: int = 0,
+    trainer: dict[str, Any] | None = None,
+    half_precision: bool = True,
+    resume: bool = False,
+    overwrite: bool = False,
 ) -> None:
-    """Measure a model on the test splits of a dataset.
+    """Train a mixture-density network, which needs no terrain classes.
 
     Args:
-        checkpoint: Checkpoint folder, or name of a registered model such as oracle.
-        data: Path or id of a dataset.
-        splits: Which splits, for example [test/std,valid]; every test split when not given.
-        json: File to write the figures to as well.
-        seed: Root seed of the draws that place clipped values within their atoms.
+        data: Path or id of a dataset with splits train and valid.
+        out: Checkpoint folder. Logs go to OUT.training.
+        mdn: Settings of the network.
+        seed: Root seed of weights, order and augmentation.
+        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
+        half_precision: Store the weights as float16.
+        resume: Go on with a training that was interrupted; whole epochs are kept.
+        overwrite: Replace a checkpoint that is there.
     """
-    from rich.console import Console
+    from benchnav.models.checkpoint import Checkpoint, Part
+    from benchnav.models.mdn import MDN, fit_mdn
+    from benchnav.models.target import open_target
+    from benchnav.models.training import training_digest
 
+    dataset = _open_dataset(data)
+    mdn, options = _options(out, mdn, trainer, resume)
+    fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=MDN)
+    target = open_target(Path(out), fresh, [MDN], training_digest(dataset), options, overwrite)
+    if target.holds(MDN, asdict(mdn), seed):
+        return
+    network, metrics = fit_mdn(mdn, dataset, seed, options)
+    _say(
+        f"mdn: best epoch {metrics['epoch']:.0f}, validation NLL {metrics['valid_loss']:.4f}, "
+        f"RMSE {metrics['valid_rmse']:.4f}"
+    )
+    part = Part(
+        config=asdict(mdn),
+        tensors=dict(network.state_dict()),
+        seed=seed,
+        metrics=metrics,
+        data_id=dataset.id,
+        data_digest=training_digest(dataset),
+        half_precision=half_precision,
+    )
+    target.add(MDN, part)
+
+
+def _open_dataset(data: str) -> "TerrainDataset":
     from benchnav.datagen.store import TerrainDataset, find_dataset
-    from benchnav.errors import ConfigError
-    from benchnav.models.baseline import nearest_colour_accuracy
-    from benchnav.models.calibration import evaluate as evaluate_model
-    from benchnav.models.predictor import load_model
-
-    target = Path(json) if json else None
-    if target and not target.parent.is_dir():
-        raise ConfigError(f"Expected `json` in a folder that exists, got {json}. Make {target.parent} first.")
-    dataset = TerrainDataset(find_dataset(data))
-    qualities = dict(evaluate_model(load_model(checkpoint), dataset, splits or (), seed))
-    console = Console(width=None if sys.stdout.isatty() else 124, highlight=False)
-    console.print(_table(checkpoint, dataset, qualities.items()))
-    by_colour = ", ".join(f"{split} {nearest_colour_accuracy(dataset, split):.4f}" for split in qualities)
-    console.print(f"accuracy of the class of the nearest colour: {by_colour}", soft_wrap=True)
-    if target:
-        _write_json(target, checkpoint, dataset, qualities)
-        print(f"wrote {target}")
-
-
-def _start(data: str, out: str, names: set[str], overwrite: bool) -> "tuple[TerrainDataset, Checkpoint]":
-    """Opens the dataset and the checkpoint that training goes into; refuses before any work is done."""
-    from benchnav.datagen.store import TerrainDataset, find_dataset
-    from benchnav.errors import CheckpointError, DatasetError
-    from benchnav.models.checkpoint import Checkpoint, load_checkpoint
+    from benchnav.errors import DatasetError
 
     dataset = TerrainDataset(find_dataset(data))
-    missing = [split for split in ("train", "valid") if split not in dataset.splits]
-    if missing:
+    if not {"train", "valid"} <= set(dataset.splits):
         raise DatasetError(
             f"Expected splits train and valid in {dataset.path} to train on, got {sorted(dataset.splits)}. "
             "Make a dataset with them, for example `benchnav-datagen create paper-v1`."
         )
-    fresh = Checkpoint(
-        class_names=tuple(item.name for item in dataset.recipe.classes),
-        dataset_id=dataset.id,
-        dataset_digest=",".join(f"{name}:{dataset.splits[name]['digest']}" for name in ("train", "valid")),
-    )
-    if not Path(out).exists():
-        # Whether a checkpoint can be written there shows now rather than after the training.
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
-        os.rmdir(tempfile.mkdtemp(dir=Path(out).parent))
-        return dataset, fresh
-    if not (Path(out) / "config.json").is_file():
-        raise CheckpointError(
-            f"Expected `out` to be a new folder or a checkpoint, got {out}, which is something else."
-        )
-    if overwrite and len(names) > 1:
-        return dataset, fresh
-    there = load_checkpoint(out)
-    fits = (there.dataset_digest, there.class_names) == (fresh.dataset_digest, fresh.class_names)
-    if overwrite:
-        return dataset, there if fits else fresh
-    if not fits:
-        raise CheckpointError(
-            f"Expected checkpoint {out} to be of the maps of {dataset.path}, got one of other maps, of "
-            f"dataset {there.dataset_id}. Choose another `out`, or pass --overwrite to replace it."
-        )
-    # GPs alone are what an interrupted training of both halves leaves, to be gone on from.
-    if (names & set(there.parts)) - ({"gp"} if len(names) > 1 else set()):
-        raise CheckpointError(
-            f"Expected `out` without a trained {' or '.join(sorted(names))}, got {out} with "
-            f"{' and '.join(sorted(there.parts))}. Choose another `out`, or pass --overwrite to "
-            "replace it."
-        )
-    return dataset, there
+    return dataset
 
 
-def _is_done(checkpoint: "Checkpoint", gp: LatentGPConfig, seed: int) -> bool:
-    """Tells whether an interrupted training of both halves has left its GPs there."""
-    part = checkpoint.parts.get("gp")
-    return part is not None and part.seed == seed and asdict(gp).items() <= part.config.items()
+def _options(
+    out: str, config: Config, trainer: dict[str, Any] | None, resume: bool
+) -> "tuple[Config, FitOptions]":
+    """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
+    from benchnav.models.fitting import FitOptions
+
+    settings = dict(trainer or {})
+    if "max_epochs" in settings:
+        config = replace(config, max_epochs=settings.pop("max_epochs"))
+    return config, FitOptions(folder=Path(f"{out}.training"), resume=resume, trainer=settings)
+
+
+def _members(count: int) -> list[str]:
+    from benchnav.errors import ConfigError
+    from benchnav.models.checkpoint import member_name
+
+    if count < 1:
+        raise ConfigError(f"Expected `members` ≥ 1, got {count}.")
+    return [member_name(index) for index in range(count)]
+
+
+def _open_target(
+    out: str, dataset: "TerrainDataset", parts: list[str], options: "FitOptions", overwrite: bool
+) -> "Target":
+    from benchnav.models.checkpoint import Checkpoint
+    from benchnav.models.target import open_target
+    from benchnav.models.training import training_digest
+
+    fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes))
+    return open_target(Path(out), fresh, parts, training_digest(dataset), options, overwrite)
+
+
+def _train_members(
+    target: "Target",
+    config: ClassifierConfig,
+    dataset: "TerrainDataset",
+    members: int,
+    seed: int,
+    options: "FitOptions",
+    half_precision: bool,
+) -> None:
+    for index, part in enumerate(_members(members)):
+        if not target.holds(part, asdict(config), seed + index):
+            trained = _fit_classifier(config, dataset, seed + index, options, part)
+            target.add(part, replace(trained, half_precision=half_precision))
 
 
 def _fit_classifier(
-    config: ClassifierConfig, dataset: "TerrainDataset", seed: int, precision: str, device: str
+    config: ClassifierConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions", part: str
 ) -> "Part":
     from benchnav.models.checkpoint import Part
-    from benchnav.models.training import fit_classifier
+    from benchnav.models.training import fit_classifier, training_digest
 
-    model, metrics = fit_classifier(config, dataset, seed, precision, device)
-    print(
-        f"classifier: best epoch {metrics['epoch']:.0f}, validation accuracy "
-        f"{metrics['valid_accuracy']:.4f}, mIoU {metrics['valid_miou']:.4f}, loss {metrics['valid_loss']:.4f}"
+    model, metrics = fit_classifier(config, dataset, seed, options, part)
+    _say(
+        f"{part}: best epoch {metrics['epoch']:.0f}, validation accuracy {metrics['valid_accuracy']:.4f}, "
+        f"mIoU {metrics['valid_miou']:.4f}, loss {metrics['valid_loss']:.4f}, "
+        f"temperature {model.temperature:.3f}"
     )
-    return Part(config=asdict(config), tensors=dict(model.state_dict()), seed=seed, metrics=metrics)
+    return Part(
+        config={**asdict(config), "temperature": model.temperature},
+        tensors=dict(model.state_dict()),
+        seed=seed,
+        metrics=metrics,
+        data_id=dataset.id,
+        data_digest=training_digest(dataset),
+    )
 
 
-def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, device: str) -> "Part":
+def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions") -> "Part":
     from benchnav.models.calibration import measure_latent
     from benchnav.models.checkpoint import Part
-    from benchnav.models.data import read_pixels
-    from benchnav.models.training import fit_gps
+    from benchnav.models.pixels import read_pixels
+    from benchnav.models.training import fit_gps, training_digest
 
     table = read_pixels(dataset, "train", config.max_points, seed)
-    model = fit_gps(config, table, seed, device)
-    metrics = {
-        f"valid_{name}": value
-        for name, value in measure_latent(model.tabulate(), dataset.terrain("valid")).items()
-    }
-    print(
-        f"gps: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
+    model = fit_gps(config, table, options)
+    measured = measure_latent(model.tabulate(), dataset.terrain("valid"))
+    metrics = {f"valid_{name}": value for name, value in measured.items()}
+    _say(
+        f"gp: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
         f"noise {metrics['valid_noise_error']:.1%}, NLL {metrics['valid_nll']:.4f}"
     )
-    settings = {**asdict(config), "steepest_deg": model.steepest_deg}
-    return Part(config=settings, tensors=model.to_tensors(), seed=seed, metrics=metrics)
-
-
-def _save(out: str, checkpoint: "Checkpoint", half_precision: bool) -> None:
-    from benchnav.models.checkpoint import save_checkpoint
-
-    save_checkpoint(out, checkpoint, half_precision)
-    size = sum(path.stat().st_size for path in Path(out).iterdir())
-    print(f"wrote {out} with {' and '.join(sorted(checkpoint.parts))} ({size / 1e6:.1f} MB)")
-
-
-def _table(name: str, dataset: "TerrainDataset", qualities: "Iterable[tuple[str, Quality]]") -> object:
-    from rich.table import Table
-
-    columns = (
-        "accuracy",
-        "mIoU",
-        "ECE",
-        "Brier",
-        "RMSE λ",
-        "RMSE E[λ]",
-        "NLL",
-        "CRPS",
-        "90 % cover",
-        "tail 0.1",
+    return Part(
+        config={**asdict(config), "steepest_deg": model.steepest_deg},
+        tensors=model.to_tensors(),
+        seed=seed,
+        metrics=metrics,
+        data_id=dataset.id,
+        data_digest=training_digest(dataset),
     )
-    table = Table("split", "maps", *columns, title=f"{name} on {dataset.id}")
-    for split, quality in qualities:
-        classes = [f"{value:.4f}" for item in quality.classes for value in asdict(item).values()] or ["–"] * 4
-        rest = [f"{value:.4f}" for value in asdict(quality.traversability).values()]
-        table.add_row(split, str(quality.maps), *classes, *rest)
-    return table
 
 
-def _write_json(target: Path, name: str, dataset: "TerrainDataset", qualities: "dict[str, Quality]") -> None:
-    import json
+def _train_gp_on_logs(
+    data: str, out: str, config: LatentGPConfig, seed: int, options: "FitOptions", overwrite: bool
+) -> None:
+    from benchnav.models.checkpoint import CONFIG, Checkpoint, Part, load_checkpoint
+    from benchnav.models.pixels import hold_out, pixel_nll
+    from benchnav.models.slip_logs import read_slip_logs
+    from benchnav.models.target import open_target
+    from benchnav.models.training import fit_gps
 
-    from benchnav.errors import ConfigError
+    logs = read_slip_logs(data)
+    there = (Path(out) / CONFIG).is_file()
+    names = load_checkpoint(out).class_names if there else logs.class_names
+    table = logs.pixels(names, config.max_points, seed)
+    target = open_target(
+        Path(out), Checkpoint(class_names=names), ["gp"], f"file:{logs.digest}", options, overwrite
+    )
+    metrics = {}
+    if int(table.count.max()) >= 1 / _HELD_OUT:
+        kept, held = hold_out(table, _HELD_OUT, seed)
+        metrics["held_out_nll"] = pixel_nll(held, fit_gps(config, kept, options).tabulate())
+        _say(
+            f"gp: NLL of {int(held.count.sum())} rows held out {metrics['held_out_nll']:.4f}; now with all rows"
+        )
+    model = fit_gps(config, table, options)
+    seen = ", ".join(f"{name} {count}" for name, count in zip(names, table.count.tolist(), strict=True))
+    _say(f"gp: rows learned from: {seen}")
+    part = Part(
+        config={**asdict(config), "steepest_deg": model.steepest_deg},
+        tensors=model.to_tensors(),
+        seed=seed,
+        metrics=metrics,
+        data_id=Path(data).name,
+        data_digest=f"file:{logs.digest}",
+    )
+    target.add("gp", part)
 
-    report = {
-        "model": name,
-        "dataset": {"id": dataset.id, "digest": dataset.digest},
-        "splits": {
-            split: {
-                "maps": quality.maps,
-                **{key: value for item in quality.classes for key, value in asdict(item).items()},
-                **asdict(quality.traversability),
-            }
-            for split, quality in qualities.items()
-        },
-    }
-    try:
-        target.write_text(json.dumps(report, indent=1) + "\n")
-    except OSError as error:
-        raise ConfigError(f"Could not write {target}: {error.strerror}. Choose another `json`.") from error
+
+def _say(line: str) -> None:
+    from benchnav.models.fitting import is_first_process
+
+    if is_first_process():
+        print(line)
 
 
 def main() -> None:
@@ -289,6 +321,7 @@ def main() -> None:
         "classifier": Command(train_classifier),
         "gp": Command(train_gp),
         "all": Command(train_all),
+        "mdn": Command(train_mdn),
         "evaluate": Command(evaluate, ("checkpoint",)),
     }
     sys.exit(run("benchnav-train", "Train and measure models of traversability.", commands))

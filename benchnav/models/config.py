@@ -16,6 +16,10 @@ class ClassifierConfig:
         pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
         full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
             it, so that without this every class boundary is guessed from cells twice as large.
+        dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a proper score.
+        label_smoothing: probability spread over all classes in the targets of the cross-entropy.
+        jitter: largest relative change of brightness, contrast and saturation of a training map. At 0
+            low light stays unseen in training.
         learning_rate: highest rate of the one-cycle schedule.
         weight_decay: of AdamW.
         batch_size: most maps a batch.
@@ -27,17 +31,22 @@ class ClassifierConfig:
     encoder: str = "resnet18"
     pretrained: bool = False
     full_resolution: bool = True
+    dice: float = 0.0
+    label_smoothing: float = 0.0
+    jitter: float = 0.0
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
     batch_size: int = 16
-    max_epochs: int = 40
+    max_epochs: int = 20
     patience: int = 10
 
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
         _check_rate("learning_rate", self.learning_rate)
-        if not 0 <= self.weight_decay < 1:
-            raise ConfigError(f"Expected `weight_decay` in [0, 1), got {self.weight_decay}.")
+        if not self.dice >= 0:
+            raise ConfigError(f"Expected `dice` ≥ 0, got {self.dice}.")
+        for name in ("label_smoothing", "jitter", "weight_decay"):
+            _check_share(name, getattr(self, name))
         _check_least(
             batch_size=(self.batch_size, 2), max_epochs=(self.max_epochs, 1), patience=(self.patience, 1)
         )
@@ -51,37 +60,80 @@ class LatentGPConfig:
         likelihood: censored, which fits observations clipped to [0, 1], or gaussian.
         inducing_points: how many, evenly over the slopes of the training data.
         epochs: equal parts of training, after each of which progress is shown.
-        epoch_steps: steps of Adam an epoch.
-        batch_size: cells a class and step, drawn with replacement.
-        learning_rate: at the start; falls to 0 along a cosine.
+        epoch_steps: steps an epoch, each over all cells.
         max_points: most cells of a class to learn from.
     """
 
     likelihood: Literal["censored", "gaussian"] = "censored"
     inducing_points: int = 16
-    epochs: int = 10
-    epoch_steps: int = 60
-    batch_size: int = 1024
-    learning_rate: float = 0.05
+    epochs: int = 4
+    epoch_steps: int = 10
     max_points: int = 10_000
 
     def __post_init__(self) -> None:
         """Refuses settings that cannot train."""
         if self.likelihood not in ("censored", "gaussian"):
             raise ConfigError(f"Expected `likelihood` censored or gaussian, got {self.likelihood!r}.")
-        _check_rate("learning_rate", self.learning_rate)
         _check_least(
             inducing_points=(self.inducing_points, 2),
             epochs=(self.epochs, 1),
             epoch_steps=(self.epoch_steps, 1),
-            batch_size=(self.batch_size, 1),
             max_points=(self.max_points, 1),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class MDNConfig:
+    """What the mixture-density network is and how it is trained.
+
+    Args:
+        components: K, Gaussians of a cell's mixture.
+        hidden: channels of the layers in which slope joins what the image tells of a cell.
+        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
+        encoder: one of its encoders, for example resnet18.
+        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
+        jitter: largest relative change of brightness, contrast and saturation of a training map.
+        learning_rate: highest rate of the one-cycle schedule.
+        weight_decay: of AdamW.
+        batch_size: most maps a batch.
+        max_epochs: length of the schedule.
+        patience: epochs without a better validation loss after which training stops.
+    """
+
+    components: int = 3
+    hidden: int = 64
+    architecture: str = "unet"
+    encoder: str = "resnet18"
+    pretrained: bool = False
+    jitter: float = 0.0
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-3
+    batch_size: int = 16
+    max_epochs: int = 15
+    patience: int = 10
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that cannot train."""
+        _check_rate("learning_rate", self.learning_rate)
+        for name in ("jitter", "weight_decay"):
+            _check_share(name, getattr(self, name))
+        _check_least(
+            components=(self.components, 1),
+            hidden=(self.hidden, 1),
+            batch_size=(self.batch_size, 2),
+            max_epochs=(self.max_epochs, 1),
+            patience=(self.patience, 1),
         )
 
 
 def _check_rate(name: str, value: float) -> None:
     if not 0 < value < 1:
         raise ConfigError(f"Expected `{name}` in (0, 1), got {value}.")
+
+
+def _check_share(name: str, value: float) -> None:
+    if not 0 <= value < 1:
+        raise ConfigError(f"Expected `{name}` in [0, 1), got {value}.")
 
 
 def _check_least(**limits: tuple[int, int]) -> None:

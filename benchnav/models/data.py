@@ -1,18 +1,19 @@
-"""Training data in memory: whole maps for the classifier, tables of cells for the class-wise GPs.
+"""Training data in whole maps, held in memory.
 
-What a batch holds is a pure function of (seed, epoch, place in the epoch): order, augmentation and
-subsampling come from named random streams. Letters in shapes: B maps, H×W cells, C classes, N cells
-a class.
+What a batch holds is a pure function of (seed, epoch, place in the epoch): order and augmentation
+come from named random streams, so a training that is resumed sees what it would have seen. Letters
+in shapes: B maps in memory, b maps in a batch, H×W cells.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Any
 
 import lightning
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
+from torchvision.transforms.v2 import functional as photometry
 
 from benchnav import rng
 from benchnav.datagen.store import TerrainDataset
@@ -23,40 +24,52 @@ TRAIN, VALID = "train", "valid"
 _SYMMETRIES = tuple(range(8))  # of the square: four rotations, each as it is or mirrored
 _SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
 
-MapKey = tuple[Tensor, Tensor]
+MapKey = tuple[Tensor, Tensor, Tensor]
 Batch = dict[str, Tensor]
 
 
 class MapDataset(Dataset[Batch]):
-    """Maps and their classes; indexed by a whole batch at a time.
+    """Maps by field; indexed by a whole batch at a time.
 
     Args:
-        rgb: uint8, shape [B, 3, H, W].
-        class_id: uint8, shape [B, H, W].
+        fields: by name, each of shape [B, *, H, W]; `rgb` (uint8, [B, 3, H, W]) is among them.
     """
 
-    def __init__(self, rgb: Tensor, class_id: Tensor) -> None:
+    def __init__(self, fields: dict[str, Tensor]) -> None:
         """Keeps the tensors."""
-        self.rgb, self.class_id = rgb, class_id
+        self.fields = fields
 
     def __len__(self) -> int:
         """Number of maps."""
-        return len(self.rgb)
+        return len(self.fields["rgb"])
 
     def __getitem__(self, key: MapKey) -> Batch:
-        """Gives `rgb` (uint8, [b, 3, H, W]) and `class_id` (int64, [b, H, W]) of the maps in `key`.
+        """Gives every field of the maps in `key`, shape [b, *, H, W].
 
         Args:
-            key: indices of maps, and the symmetry to apply to each, both int64 of shape [b].
+            key: indices of maps and the symmetry to apply to each, both int64 of shape [b], and the
+                factors of `apply_jitter`, shape [b, 3].
         """
-        index, symmetry = key
-        rgb, class_id = self.rgb[index], self.class_id[index]
-        turned_rgb, turned_class = torch.empty_like(rgb), torch.empty_like(class_id)
-        for which in symmetry.unique().tolist():
-            chosen = symmetry == which
-            turned_rgb[chosen] = apply_symmetry(rgb[chosen], which)
-            turned_class[chosen] = apply_symmetry(class_id[chosen], which)
-        return {"rgb": turned_rgb, "class_id": turned_class.long()}
+        index, symmetry, factors = key
+        batch = {name: _turn(values[index], symmetry) for name, values in self.fields.items()}
+        return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
+
+
+def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
+    """Changes brightness, contrast and saturation of each image, in this order.
+
+    Args:
+        rgb: uint8, shape [b, 3, H, W].
+        factors: of the three, each 1 where nothing is to change, shape [b, 3].
+    """
+    if bool((factors == 1).all()):
+        return rgb
+    changed = []
+    for image, (brightness, contrast, saturation) in zip(rgb, factors.tolist(), strict=True):
+        image = photometry.adjust_brightness(image, brightness)
+        image = photometry.adjust_contrast(image, contrast)
+        changed.append(photometry.adjust_saturation(image, saturation))
+    return torch.stack(changed)
 
 
 def apply_symmetry(maps: Tensor, which: int) -> Tensor:
@@ -70,6 +83,14 @@ def apply_symmetry(maps: Tensor, which: int) -> Tensor:
     return turned.flip(-1) if which % 2 else turned
 
 
+def _turn(maps: Tensor, symmetry: Tensor) -> Tensor:
+    turned = torch.empty_like(maps)
+    for which in symmetry.unique().tolist():
+        chosen = symmetry == which
+        turned[chosen] = apply_symmetry(maps[chosen], which)
+    return turned
+
+
 class MapSampler(Sampler[MapKey]):
     """Cuts the maps into batches of nearly equal size, in an order keyed by (seed, epoch).
 
@@ -78,15 +99,25 @@ class MapSampler(Sampler[MapKey]):
         batch_size: most maps a batch.
         seed: root seed.
         symmetries: which symmetries to draw from; (0,) leaves maps as they are.
+        jitter: largest relative change of brightness, contrast and saturation.
         shuffle: whether to change the order each epoch.
+        share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
     """
 
     def __init__(
-        self, maps: int, batch_size: int, seed: int, symmetries: tuple[int, ...], shuffle: bool
+        self,
+        maps: int,
+        batch_size: int,
+        seed: int = 0,
+        *,
+        symmetries: tuple[int, ...] = (0,),
+        jitter: float = 0.0,
+        shuffle: bool = False,
+        share: tuple[int, int] = (0, 1),
     ) -> None:
         """Starts at epoch 0."""
         self.maps, self.batch_size, self.seed = maps, batch_size, seed
-        self.symmetries, self.shuffle = symmetries, shuffle
+        self.symmetries, self.jitter, self.shuffle, self.share = symmetries, jitter, shuffle, share
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -99,46 +130,65 @@ class MapSampler(Sampler[MapKey]):
 
     def __iter__(self) -> Iterator[MapKey]:
         """Yields the batches of the epoch."""
-        epoch = np.array([self.epoch])
         order, symmetry = np.arange(self.maps), np.zeros(self.maps, dtype=np.int64)
+        factors = np.ones((self.maps, 3))
         if self.shuffle:
-            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, self.maps)[0]
-            drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (self.maps,))[0]
+            epoch = np.array([self.epoch])
+            order = rng.permutation(self._key("order"), epoch, self.maps)[0]
+            drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
             symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        pieces = (np.array_split(values, len(self)) for values in (order, symmetry))
-        for index, which in zip(*pieces, strict=True):
-            yield torch.from_numpy(index), torch.from_numpy(which)
+        if self.jitter:
+            drawn = rng.uniform(self._key("jitter"), np.array([self.epoch]), (self.maps, 3))[0]
+            factors = 1 + self.jitter * (2 * drawn - 1)
+        first, step = self.share
+        pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
+        for batch in zip(*pieces, strict=True):
+            start = min(first, len(batch[0]) - 1)  # no process is left without a map
+            index, which, how = (torch.from_numpy(values[start::step]) for values in batch)
+            yield index, which, how
+
+    def _key(self, what: str) -> int:
+        return rng.stream_key(self.seed, "models", f"map {what}")
 
 
 class MapData(lightning.LightningDataModule):
-    """The maps of the splits `train` and `valid`, for the classifier.
+    """The maps of the splits `train` and `valid`.
 
-    Training maps are turned and mirrored at random together with their classes. That stays physical:
-    the light comes from a random direction.
+    Training maps are turned and mirrored at random, all fields alike. That stays physical: the light
+    comes from a random direction. Where processes train together, each takes its part of every batch.
 
     Args:
         dataset: where they are.
         batch_size: most maps a batch.
         seed: root seed of order and augmentation.
+        jitter: largest relative change of brightness, contrast and saturation of a training map.
+        fields: which fields to read beside `rgb`.
 
     Raises:
         DatasetError: a split is missing, or there are fewer than two maps to train on.
     """
 
-    def __init__(self, dataset: TerrainDataset, batch_size: int, seed: int) -> None:
+    def __init__(
+        self,
+        dataset: TerrainDataset,
+        batch_size: int,
+        seed: int,
+        jitter: float = 0.0,
+        fields: tuple[str, ...] = ("class_id",),
+    ) -> None:
         """Reads the maps into memory."""
         super().__init__()
         if batch_size < 2:
             raise ConfigError(f"Expected `batch_size` ≥ 2, got {batch_size}.")
-        self.batch_size, self.seed = batch_size, seed
-        self.train, self.valid = (_read_maps(dataset, split) for split in (TRAIN, VALID))
+        self.batch_size, self.seed, self.jitter = batch_size, seed, jitter
+        self.train, self.valid = (_read_maps(dataset, split, fields) for split in (TRAIN, VALID))
         if len(self.train) < 2:
             raise DatasetError(f"Expected at least 2 training maps in {dataset.path}, got {len(self.train)}.")
 
     def colour_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
         counts = torch.stack(
-            [channel.flatten().bincount(minlength=256) for channel in self.train.rgb.unbind(1)]
+            [channel.flatten().bincount(minlength=256) for channel in self.train.fields["rgb"].unbind(1)]
         )
         share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
         mean = (share * level).sum(1)
@@ -147,109 +197,21 @@ class MapData(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
-        square = self.train.rgb.shape[-1] == self.train.rgb.shape[-2]
-        symmetries = _SYMMETRIES if square else _SYMMETRIES_OF_RECTANGLE
-        return _load(self.train, MapSampler(len(self.train), self.batch_size, self.seed, symmetries, True))
+        height, width = self.train.fields["rgb"].shape[-2:]
+        symmetries = _SYMMETRIES if height == width else _SYMMETRIES_OF_RECTANGLE
+        return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Batches as stored, in order."""
-        return _load(self.valid, MapSampler(len(self.valid), self.batch_size, self.seed, (0,), False))
+        return self._load(self.valid)
+
+    def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
+        share = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        sampler = MapSampler(len(maps), self.batch_size, self.seed, share=share, **order)
+        # A generator of its own keeps the loader from drawing on PyTorch's global one.
+        return DataLoader(maps, batch_size=None, sampler=sampler, generator=torch.Generator())
 
 
-@dataclass(frozen=True, kw_only=True)
-class PixelTable:
-    """Cells by class: what the GPs learn from. Rows are padded with zeros to one length.
-
-    Args:
-        slope_deg: float32, shape [C, N].
-        traversability: observed λ in [0, 1], float32, shape [C, N].
-        count: how many of a row's entries hold data, int64, shape [C].
-    """
-
-    slope_deg: Tensor
-    traversability: Tensor
-    count: Tensor
-
-    @classmethod
-    def group(
-        cls,
-        class_id: Tensor,
-        slope_deg: Tensor,
-        traversability: Tensor,
-        class_count: int,
-        max_points: int = 10_000,
-        seed: int = 0,
-    ) -> "PixelTable":
-        """Groups logged cells by class, keeping at most some of each, drawn without replacement.
-
-        Args:
-            class_id: integers in [0, C), any shape.
-            slope_deg: slopes in [0, 90], shape of `class_id`.
-            traversability: observed λ in [0, 1], shape of `class_id`.
-            class_count: C.
-            max_points: most cells to keep of a class.
-            seed: root seed of the draw.
-
-        Raises:
-            ConfigError: the columns differ in length or hold values out of range.
-        """
-        ids, slopes, observed = (column.flatten() for column in (class_id, slope_deg, traversability))
-        _check_columns(ids, slopes, observed, class_count, max_points)
-        key = rng.stream_key(seed, "models", "pixels")
-        rows = [_draw_rows(ids, c, key, max_points) for c in range(class_count)]
-        count = torch.tensor([len(row) for row in rows])
-        table = torch.zeros(2, class_count, int(count.max()))
-        for c, row in enumerate(rows):
-            table[0, c, : len(row)], table[1, c, : len(row)] = slopes[row], observed[row]
-        return cls(slope_deg=table[0], traversability=table[1], count=count)
-
-
-def read_pixels(dataset: TerrainDataset, split: str, max_points: int = 10_000, seed: int = 0) -> PixelTable:
-    """Reads the cells of a split, by class.
-
-    Args:
-        dataset: where they are.
-        split: name of a split.
-        max_points: most cells to keep of a class.
-        seed: root seed of the draw.
-
-    Raises:
-        DatasetError: there is no such split.
-    """
-    names = ("class_id", "slope_deg", "traversability")
-    maps = dataset.read(split, fields=names)
-    class_id, slope_deg, traversability = (torch.from_numpy(maps[name]) for name in names)
-    classes = len(dataset.recipe.classes)
-    return PixelTable.group(class_id, slope_deg, traversability, classes, max_points, seed)
-
-
-def _read_maps(dataset: TerrainDataset, split: str) -> MapDataset:
-    maps = dataset.read(split, fields=("rgb", "class_id"))
-    return MapDataset(torch.from_numpy(maps["rgb"]), torch.from_numpy(maps["class_id"]))
-
-
-def _load(maps: MapDataset, sampler: MapSampler) -> DataLoader[Batch]:
-    # A generator of its own keeps the loader from drawing on PyTorch's global one.
-    return DataLoader(maps, batch_size=None, sampler=sampler, generator=torch.Generator())
-
-
-def _draw_rows(ids: Tensor, class_id: int, key: int, most: int) -> Tensor:
-    rows = (ids == class_id).nonzero().flatten()
-    if len(rows) <= most:
-        return rows
-    drawn = np.argpartition(rng.uniform(key, np.array([class_id]), (len(rows),))[0], most)[:most]
-    return rows[torch.from_numpy(np.sort(drawn))]
-
-
-def _check_columns(ids: Tensor, slopes: Tensor, observed: Tensor, class_count: int, max_points: int) -> None:
-    if not len(ids) == len(slopes) == len(observed) > 0:
-        raise ConfigError(
-            "Expected `class_id`, `slope_deg` and `traversability` of one length > 0, "
-            f"got {len(ids)}, {len(slopes)} and {len(observed)}."
-        )
-    if max_points < 1:
-        raise ConfigError(f"Expected `max_points` ≥ 1, got {max_points}.")
-    limits = {"class_id": (ids, class_count - 1), "slope_deg": (slopes, 90), "traversability": (observed, 1)}
-    for name, (column, most) in limits.items():
-        if not bool(((column >= 0) & (column <= most)).all()):
-            raise ConfigError(f"Expected `{name}` within [0, {most}], got values outside it.")
+def _read_maps(dataset: TerrainDataset, split: str, fields: tuple[str, ...]) -> MapDataset:
+    read = dataset.read(split, fields=("rgb", *fields))
+    return MapDataset({name: torch.from_numpy(values) for name, values in read.items()})

@@ -1,9 +1,11 @@
-"""What a model is, how it is found by name, and the two that come with the package.
+"""What a model is, and how it is found by name or by checkpoint.
 
 A model sees an `Observation` and gives a `TraversabilityMixture`; the oracle alone is given the
-Terrain. A user's own model is registered with `register_model` or by an entry point of the group
-`benchnav.models`. Source: paper III-B, equation (1). Letters in shapes: B maps, H×W cells, C
-classes, K components.
+Terrain. Models are found by name through `register_model` or an entry point of the group
+`benchnav.models`; what stands there is either called without arguments and makes a model, or is a
+family, with `from_checkpoint`, for checkpoints that bear its name. The package's own models use the
+same group. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes, K
+components.
 """
 
 import difflib
@@ -13,25 +15,24 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from benchnav.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.checkpoint import CLASSIFIER, CONFIG, GP, Checkpoint, load_checkpoint
-from benchnav.models.slope_table import SlopeTable
+from benchnav.models.checkpoint import CONFIG, Checkpoint, load_checkpoint
 from benchnav.terrain import Observation, Terrain
 
-CHUNK_CELLS = 2**17
+GROUP = "benchnav.models"
 
 
 class Model(Protocol):
-    """The contract of a traversability model."""
+    """The contract of a traversability model, which `benchnav.models.contract.check_model` tries."""
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """Predicts the distribution of traversability in every cell.
 
         Args:
-            observation: B maps; nothing else is to be known of them.
+            observation: B maps of any size; nothing else is to be known of them.
 
         Returns:
             Mixture with parameters of shape [B, K, H, W], on the observation's device.
@@ -50,6 +51,28 @@ class ClassModel(Model, Protocol):
     class_names: tuple[str, ...]
 
 
+@runtime_checkable
+class EnsembleModel(ClassModel, Protocol):
+    """A model whose class probabilities are the average of its members'."""
+
+    def member_probabilities(self, observation: Observation) -> Tensor:
+        """Class probabilities of each member, shape [M, B, C, H, W]; M = 1 for a single classifier."""
+        ...
+
+
+@runtime_checkable
+class ModelFamily(Protocol):
+    """Models of one make that are kept in checkpoints under its name."""
+
+    def from_checkpoint(self, checkpoint: Checkpoint) -> Model:
+        """Rebuilds a model.
+
+        Raises:
+            CheckpointError: a part is missing, or its tensors do not fit its settings.
+        """
+        ...
+
+
 class Oracle:
     """Knows the true distribution; crossed with a planner it shows what is left without model error."""
 
@@ -59,111 +82,61 @@ class Oracle:
         return TraversabilityMixture(torch.ones_like(mean), mean.clone(), std.clone())
 
 
-class FusedModel:
-    """The paper's model: class probabilities of a classifier times the GPs of the classes.
-
-    P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class. Its `single-class` option is
-    `TraversabilityMixture.most_likely` of the prediction.
-
-    Args:
-        classifier: from uint8 images [B, 3, H, W] to logits [B, C, H, W].
-        table: the GPs over slope.
-        class_names: names of the C classes.
-    """
-
-    def __init__(self, classifier: nn.Module, table: SlopeTable, class_names: tuple[str, ...]) -> None:
-        """Sets the classifier to evaluation."""
-        if len(class_names) != len(table.mean):
-            raise ConfigError(f"Expected a GP for each of {len(class_names)} classes, got {len(table.mean)}.")
-        self.classifier, self.table, self.class_names = classifier.eval(), table, class_names
-
-    def predict(self, observation: Observation) -> TraversabilityMixture:
-        """Predicts on the observation's device, to which the classifier is moved.
-
-        Args:
-            observation: B maps of any size.
-
-        Returns:
-            Mixture with float32 parameters of shape [B, C, H, W].
-        """
-        device, (height, width) = observation.rgb.device, observation.grid.shape
-        self.classifier.to(device)
-        batch, classes = len(observation.rgb), len(self.class_names)
-        weights = torch.empty(batch, classes, height, width, device=device)
-        step = max(1, CHUNK_CELLS // (height * width))
-        with torch.inference_mode():
-            for start in range(0, batch, step):
-                logits = self.classifier(observation.rgb[start : start + step])
-                if logits.shape[1] != classes:
-                    raise ConfigError(f"Expected {classes} classes of the classifier, got {logits.shape[1]}.")
-                weights[start : start + step] = logits.float().softmax(1)
-        means, stds = self.table.lookup(observation.slope_deg.float())
-        return TraversabilityMixture(weights, means, stds)
-
-    @classmethod
-    def from_checkpoint(cls, checkpoint: Checkpoint) -> "FusedModel":
-        """Rebuilds the model from a checkpoint with both halves.
-
-        Raises:
-            CheckpointError: a half is missing, or its tensors do not fit its settings.
-        """
-        from benchnav.models.classifier import TerrainClassifier
-
-        parts = {name: checkpoint.part(name) for name in (CLASSIFIER, GP)}
-        names, tensors = checkpoint.class_names, parts[GP].tensors
-        try:
-            classifier = TerrainClassifier.from_tensors(
-                parts[CLASSIFIER].config, len(names), parts[CLASSIFIER].tensors
-            )
-            table = SlopeTable(**{name: tensors[name] for name in ("mean", "std", "noise_std")})
-            return cls(classifier, table, names)
-        except (BenchnavError, KeyError, RuntimeError) as error:
-            raise CheckpointError(
-                f"Expected tensors that fit the checkpoint's settings, got: {error}. Train the model again."
-            ) from error
-
-
 AnyModel = Model | Oracle
-Factory = Callable[[], AnyModel]
+Registered = Callable[[], AnyModel] | ModelFamily
 
-_FACTORIES: dict[str, Factory] = {"oracle": Oracle}
+_REGISTERED: dict[str, Registered] = {}
 
 
-def register_model(name: str, factory: Factory) -> None:
-    """Makes a model known by name in this process.
+def register_model(name: str, model: Registered) -> None:
+    """Makes a model or a family known by name in this process.
 
     Args:
-        name: what suites and commands call it.
-        factory: makes the model.
+        name: what suites, commands and checkpoints call it.
+        model: makes a model when called without arguments, or has `from_checkpoint`.
     """
-    _FACTORIES[name] = factory
+    _REGISTERED[name] = model
 
 
 def model_names() -> list[str]:
-    """Names that `load_model` knows, besides checkpoints."""
-    return sorted({*_FACTORIES, *(point.name for point in entry_points(group="benchnav.models"))})
+    """Registered names of models and families."""
+    return sorted({*_REGISTERED, *(point.name for point in entry_points(group=GROUP))})
 
 
-def load_model(source: str | Path, device: torch.device | str = "cpu") -> AnyModel:
-    """Finds a model by registered name or by checkpoint.
+def load_model(source: str | Path) -> AnyModel:
+    """Finds a model by registered name or by checkpoint; it predicts on the observation's device.
 
     Args:
         source: a registered name such as `oracle`; or the folder of a checkpoint, by path or by its
             name in `checkpoints/` here or in this checkout.
-        device: where its parameters are put; prediction follows the observation.
 
     Raises:
         ConfigError: there is no such model.
         CheckpointError: the checkpoint cannot be used.
     """
-    name = str(source)
-    if name in _FACTORIES:
-        return _FACTORIES[name]()
-    for point in entry_points(group="benchnav.models", name=name):
-        return point.load()()
-    model = FusedModel.from_checkpoint(load_checkpoint(find_checkpoint(source)))
-    model.classifier.to(device)
-    return model
+    found = _find_registered(str(source))
+    if found is None:
+        return open_checkpoint(load_checkpoint(find_checkpoint(source)))
+    if isinstance(found, ModelFamily):
+        raise ConfigError(
+            f"Expected a model, got {str(source)!r}, which is a family of models. Name a checkpoint of it."
+        )
+    return found()
+
+
+def open_checkpoint(checkpoint: Checkpoint) -> Model:
+    """Rebuilds the model of a checkpoint through the family that it names.
+
+    Raises:
+        CheckpointError: the family is not registered here, or cannot rebuild the model.
+    """
+    family = _find_registered(checkpoint.model)
+    if not isinstance(family, ModelFamily):
+        raise CheckpointError(
+            f"Expected a checkpoint of a model among {', '.join(model_names())}, got one of "
+            f"{checkpoint.model!r}. Install the package that registers it."
+        )
+    return family.from_checkpoint(checkpoint)
 
 
 def find_checkpoint(source: str | Path) -> Path:
@@ -215,6 +188,14 @@ def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
             f"[{shape[0]}, K, {shape[1]}, {shape[2]}], got {got}."
         )
     return mixture
+
+
+def _find_registered(name: str) -> Registered | None:
+    if name in _REGISTERED:
+        return _REGISTERED[name]
+    for point in entry_points(group=GROUP, name=name):
+        return point.load()
+    return None
 
 
 def _cell_shape(weights: Tensor) -> tuple[int, ...]:

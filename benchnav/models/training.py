@@ -1,118 +1,33 @@
-"""Fitting the classifier and the class-wise GPs with Lightning, quietly and leaving no files.
+"""Training the parts of a fused model: the classifier and the class-wise GPs."""
 
-Progress is a bar in a terminal and a line an epoch elsewhere.
-"""
+from dataclasses import asdict
 
-import logging
-import signal
-import sys
-import tempfile
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any
-
-import lightning
-import torch
-from lightning.pytorch.callbacks import Callback, EarlyStopping
-from torch import Tensor
+from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.datagen.store import TerrainDataset
-from benchnav.errors import ConfigError
+from benchnav.models.checkpoint import CLASSIFIER, GP
 from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.config import ClassifierConfig, LatentGPConfig
-from benchnav.models.data import MapData, PixelTable
+from benchnav.models.data import TRAIN, VALID, MapData
+from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit
 from benchnav.models.latent_gp import LatentGPs, load_batches
+from benchnav.models.pixels import PixelTable
+from benchnav.models.temperature import fit_temperature, sample_logits
 
-DEVICES = ("auto", "cpu", "cuda")
-
-
-class KeepBest(Callback):
-    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end."""
-
-    def __init__(self) -> None:
-        """Starts with none."""
-        self.loss = float("inf")
-        self.metrics: dict[str, float] = {}
-        self.weights: dict[str, Tensor] = {}
-
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights when they are the best so far."""
-        measured = _measured(trainer)
-        if measured["valid_loss"] < self.loss:
-            self.loss, self.metrics = measured["valid_loss"], {**measured, "epoch": trainer.current_epoch + 1}
-            self.weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
-
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Puts the best weights back."""
-        if not self.weights:
-            raise ConfigError(
-                "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
-            )
-        module.load_state_dict(self.weights)
+_DEFAULT = FitOptions()
 
 
-class Progress(Callback):
-    """Shows how far training is.
-
-    Args:
-        what: what is trained.
-    """
-
-    def __init__(self, what: str) -> None:
-        """Finds out whether there is a terminal."""
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            TaskProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-        from rich.progress import Progress as Bar
-
-        console = Console(stderr=True)
-        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-        self.what, self.on_terminal = what, console.is_terminal
-        self.bar = Bar(*columns, TimeRemainingColumn(), console=console, disable=not self.on_terminal)
-        self.task = self.bar.add_task(what, total=None)
-
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Shows the bar."""
-        self.bar.update(self.task, total=int(trainer.estimated_stepping_batches))
-        self.bar.start()
-
-    def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
-        """Moves the bar."""
-        self.bar.advance(self.task)
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Says what the epoch brought."""
-        epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-        values = [f"{name.removeprefix('valid_')} {value:.4f}" for name, value in _measured(trainer).items()]
-        if self.on_terminal:
-            self.bar.update(self.task, description=f"{epoch}, {values[0]}")
-        else:
-            print(", ".join([epoch, *values]), file=sys.stderr, flush=True)
-
-    def teardown(self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str) -> None:
-        """Ends the bar, also when training was interrupted."""
-        self.bar.stop()
+def training_digest(dataset: TerrainDataset) -> str:
+    """Content digest of what of a dataset is trained on."""
+    return ",".join(f"{name}:{dataset.splits[name]['digest']}" for name in (TRAIN, VALID))
 
 
 def fit_classifier(
     config: ClassifierConfig,
     dataset: TerrainDataset,
     seed: int = 0,
-    precision: str = "bf16-mixed",
-    device: str = "auto",
+    options: FitOptions = _DEFAULT,
+    part: str = CLASSIFIER,
 ) -> tuple[TerrainClassifier, dict[str, float]]:
     """Trains a classifier on the split `train` until the split `valid` no longer gains.
 
@@ -120,91 +35,53 @@ def fit_classifier(
         config: what to train.
         dataset: the maps.
         seed: root seed of weights, order and augmentation.
-        precision: of Lightning's trainer; bf16-mixed is the fast one on CPUs that know bfloat16.
-        device: auto, cpu or cuda.
+        options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
+        part: name that it will bear.
 
     Returns:
-        The classifier with its best weights, on the CPU, and what was measured on `valid` there.
+        The classifier with its best weights and its temperature, on the CPU, and what was measured on
+        `valid`.
     """
-    data = MapData(dataset, config.batch_size, seed)
+    data = MapData(dataset, config.batch_size, seed, config.jitter)
     model = TerrainClassifier(config, len(dataset.recipe.classes), *data.colour_statistics(), seed)
-    best = KeepBest()
+    settings = {"config": asdict(config), "data": training_digest(dataset), "seed": seed}
     stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
-    with _quiet(), tempfile.TemporaryDirectory() as folder:
-        trainer = _trainer(
-            [best, stopping, Progress("classifier")],
-            folder,
-            device,
-            max_epochs=config.max_epochs,
-            precision=precision,
-        )
-        _fit(trainer, model, datamodule=data)
-    return model.cpu().eval(), best.metrics
+    metrics = fit(
+        model,
+        part,
+        options,
+        settings,
+        [KeepBest(), stopping],
+        {"datamodule": data},
+        max_epochs=config.max_epochs,
+        precision=default_precision(),
+    )
+    model.cpu().eval()
+    model.temperature = fit_temperature(*sample_logits(model, data.valid, seed))
+    return model, metrics
 
 
-def fit_gps(config: LatentGPConfig, table: PixelTable, seed: int = 0, device: str = "auto") -> LatentGPs:
-    """Trains the class-wise GPs on a table of cells.
+def fit_gps(config: LatentGPConfig, table: PixelTable, options: FitOptions = _DEFAULT) -> LatentGPs:
+    """Trains the class-wise GPs on a table of cells, in float64 on one device; nothing is drawn.
 
     Args:
         config: what to train.
         table: cells by class, from maps or from a robot's logs.
-        seed: root seed of the batches.
-        device: auto, cpu or cuda.
+        options: how to train; of the trainer's settings the accelerator alone counts.
 
     Returns:
         The GPs, on the CPU.
     """
-    model = LatentGPs(config, len(table.count), float(table.slope_deg.max()))
-    with _quiet(), tempfile.TemporaryDirectory() as folder:
-        trainer = _trainer([Progress("gps")], folder, device, max_epochs=config.epochs, precision="64-true")
-        _fit(trainer, model, train_dataloaders=load_batches(config, table, seed))
-    return model.cpu().eval()
-
-
-def _fit(trainer: lightning.Trainer, model: lightning.LightningModule, **data: Any) -> None:
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        trainer.fit(model, **data)
-    except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
-        signal.signal(signal.SIGINT, handler)
-        raise KeyboardInterrupt from None
-
-
-def _trainer(callbacks: list[Callback], folder: str, device: str, **settings: Any) -> lightning.Trainer:
-    if device not in DEVICES:
-        raise ConfigError(f"Expected `device` among {', '.join(DEVICES)}, got {device!r}.")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("Expected a CUDA device for `device` cuda, got none. Use cpu or auto.")
-    found = "cuda" if torch.cuda.is_available() else "cpu"  # float64 rules other devices out
-    return lightning.Trainer(
-        accelerator=found if device == "auto" else device,
-        devices=1,
-        callbacks=callbacks,
-        default_root_dir=folder,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        **settings,
+    model = LatentGPs(config, len(table.count), table.steepest_deg)
+    accelerator = {name: value for name, value in options.trainer.items() if name == "accelerator"}
+    fit(
+        model,
+        GP,
+        FitOptions(trainer=accelerator),
+        {},
+        [],
+        {"train_dataloaders": load_batches(config, table)},
+        max_epochs=config.epochs,
+        precision="64-true",
     )
-
-
-def _measured(trainer: lightning.Trainer) -> Mapping[str, float]:
-    return {name: float(value) for name, value in trainer.callback_metrics.items()}
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps Lightning's hints to its developers out of a user's terminal."""
-    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"lightning\..*")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+    return model.cpu().eval()

@@ -171,7 +171,7 @@ def test_models_see_observations_and_planners_the_prediction(
         def plan(self, state, plan_state):  # type: ignore[no-untyped-def]
             return original.plan(state, plan_state)
 
-    monkeypatch.setattr(predictor, "_FACTORIES", {})
+    monkeypatch.setattr(predictor, "_REGISTERED", {})
     monkeypatch.setattr(planners, "_FACTORIES", {})
     predictor.register_model("spy", lambda *_, **__: Spy())
     planners.register("watched", lambda options: Watched())

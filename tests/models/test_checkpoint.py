@@ -9,9 +9,10 @@ import torch
 
 from benchnav.errors import CheckpointError
 from benchnav.models import checkpoint as module
-from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import Part, load_checkpoint, save_checkpoint
 from benchnav.models.classifier import TerrainClassifier
-from benchnav.models.predictor import FusedModel, load_model, predict
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import load_model, predict
 
 from .support import make_terrain
 
@@ -27,17 +28,26 @@ def edit(folder: Path, **changes: object) -> None:
     (folder / "config.json").write_text(json.dumps({**config, **changes}))
 
 
+def full(part: Part) -> Part:
+    return replace(part, half_precision=False)
+
+
 def test_a_round_trip_gives_equal_predictions(folder: Path, tmp_path: Path) -> None:
     there = load_checkpoint(folder)
-    save_checkpoint(tmp_path / "again", there, half_precision=False)
+    save_checkpoint(tmp_path / "again", there.with_part("classifier", full(there.part("classifier"))))
     terrain = make_terrain(classes=10)
     before, after = (predict(load_model(path), terrain) for path in (folder, tmp_path / "again"))
     for name in ("weights", "means", "stds"):
         assert torch.equal(getattr(before, name), getattr(after, name))
     again = load_checkpoint(tmp_path / "again")
     assert again.class_names == there.class_names
-    assert again.dataset_digest == there.dataset_digest
-    assert again.part("classifier").metrics == there.part("classifier").metrics
+    assert again.model == there.model == "fused"
+    for name in ("classifier", "gp"):
+        before, after = (replace(c.part(name), tensors={}, half_precision=False) for c in (there, again))
+        assert before == after
+    assert there.part("gp").data_id == "tiny-v1"
+    assert there.part("gp").data_digest.startswith("train:")
+    assert there.part("gp").versions["torch"] == torch.__version__.partition("+")[0]
 
 
 def test_half_precision_is_small_and_close(folder: Path, tmp_path: Path) -> None:
@@ -45,18 +55,18 @@ def test_half_precision_is_small_and_close(folder: Path, tmp_path: Path) -> None
     sharp = {
         name: value + 1e-5 if value.is_floating_point() else value for name, value in part.tensors.items()
     }
-    exact = load_checkpoint(folder).with_part("classifier", replace(part, tensors=sharp))
-    for name, half in (("half", True), ("full", False)):
-        save_checkpoint(tmp_path / name, exact, half_precision=half)
+    part = replace(part, tensors=sharp)
+    for name, one in (("half", part), ("full", full(part))):
+        save_checkpoint(tmp_path / name, load_checkpoint(folder).with_part("classifier", one))
     sizes = {n: (tmp_path / n / "classifier.safetensors").stat().st_size for n in ("half", "full")}
     assert sizes["half"] < 0.51 * sizes["full"]
     assert sizes["half"] < 30e6
     terrain = make_terrain(classes=10)
-    half, full = (predict(load_model(tmp_path / name), terrain).weights for name in ("half", "full"))
+    half, whole = (predict(load_model(tmp_path / name), terrain).weights for name in ("half", "full"))
     assert half.dtype == torch.float32
-    torch.testing.assert_close(half, full, rtol=0, atol=0.02)
-    assert not torch.equal(half, full)
-    classifier = load_model(tmp_path / "half").classifier  # type: ignore[union-attr]
+    torch.testing.assert_close(half, whole, rtol=0, atol=0.02)
+    assert not torch.equal(half, whole)
+    (classifier,) = load_model(tmp_path / "half").classifiers  # type: ignore[union-attr]
     assert all(p.dtype == torch.float32 for p in classifier.parameters())
 
 
@@ -85,14 +95,14 @@ def test_damaged_tensors_are_refused(folder: Path, name: str, damage: str) -> No
 
 def test_a_damaged_config_is_refused(folder: Path) -> None:
     text = (folder / "config.json").read_text()
-    for spoilt in (text[:-30], "[]", "{}", '{"format": "benchnav-checkpoint", "format_version": "1.0"}'):
+    for spoilt in (text[:-30], "[]", "{}", '{"format": "benchnav-checkpoint", "format_version": "2.0"}'):
         (folder / "config.json").write_text(spoilt)
         with pytest.raises(CheckpointError, match="is damaged"):
             load_checkpoint(folder)
 
 
 def test_a_newer_format_is_refused(folder: Path) -> None:
-    edit(folder, format_version="1.1")
+    edit(folder, format_version="2.1")
     with pytest.raises(CheckpointError, match="pip install --upgrade benchnav"):
         load_checkpoint(folder)
 
@@ -132,9 +142,9 @@ def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pyte
 
     monkeypatch.setattr(module, "_write_bytes", killed)
     with pytest.raises(KeyboardInterrupt):
-        save_checkpoint(folder, replace(there, dataset_id="new"))
+        save_checkpoint(folder, replace(there, model="new"))
     monkeypatch.undo()
-    assert load_checkpoint(folder).dataset_id == there.dataset_id
+    assert load_checkpoint(folder).model == "fused"
     assert os.listdir(folder.parent) == [folder.name]
 
 

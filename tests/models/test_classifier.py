@@ -7,8 +7,10 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import ConfigError
 from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.training import KeepBest, fit_classifier
+from benchnav.models.fitting import FitOptions, KeepBest
+from benchnav.models.training import fit_classifier
 
+CPU = FitOptions(trainer={"precision": "32-true", "accelerator": "cpu"})
 MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
 
 
@@ -72,9 +74,9 @@ def test_training_is_reproducible_and_learns(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     config = ClassifierConfig(max_epochs=4, batch_size=5)
-    first, metrics = fit_classifier(config, dataset, seed=3, precision="32-true", device="cpu")
+    first, metrics = fit_classifier(config, dataset, 3, CPU)
     lines = capfd.readouterr().err.strip().splitlines()
-    second, _ = fit_classifier(config, dataset, seed=3, precision="32-true", device="cpu")
+    second, _ = fit_classifier(config, dataset, 3, CPU)
     for name, value in first.state_dict().items():
         assert torch.equal(value, second.state_dict()[name]), name
     assert metrics["valid_accuracy"] > 0.15
@@ -91,13 +93,14 @@ def test_the_best_epoch_is_kept() -> None:
     best.on_fit_end(trainer, model)  # type: ignore[arg-type]
     assert model.weight.item() == 1
     assert best.metrics == {"valid_loss": 1.0, "epoch": 2}
+    assert trainer.callback_metrics == {"valid_loss": 1.0, "epoch": 2}
 
 
 def test_training_stops_when_validation_no_longer_gains(
     dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
     config = ClassifierConfig(max_epochs=30, batch_size=5, patience=1, learning_rate=0.3)
-    fit_classifier(config, dataset, seed=0, precision="32-true", device="cpu")
+    fit_classifier(config, dataset, 0, CPU)
     assert len(capfd.readouterr().err.strip().splitlines()) < 20
 
 

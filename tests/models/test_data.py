@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from benchnav.datagen.store import TerrainDataset
-from benchnav.errors import ConfigError, DatasetError
-from benchnav.models.data import MapData, MapSampler, PixelTable, apply_symmetry, read_pixels
+from benchnav.errors import DatasetError
+from benchnav.models.data import MapData, MapSampler, apply_jitter, apply_symmetry
 
 from .support import make_dataset
 
@@ -23,19 +25,19 @@ def test_symmetries_of_a_rectangle_keep_its_shape(which: int) -> None:
 def test_image_and_classes_are_turned_together(dataset: TerrainDataset) -> None:
     data = MapData(dataset, 4, seed=0)
     maps = data.train
-    key = (torch.arange(8), torch.arange(8))
+    key = (torch.arange(8), torch.arange(8), torch.ones(8, 3))
     batch = maps[key]
     for place in range(8):
-        assert torch.equal(batch["rgb"][place], apply_symmetry(maps.rgb[place], place))
-        assert torch.equal(batch["class_id"][place], apply_symmetry(maps.class_id[place], place).long())
+        assert torch.equal(batch["rgb"][place], apply_symmetry(maps.fields["rgb"][place], place))
+        assert torch.equal(batch["class_id"][place], apply_symmetry(maps.fields["class_id"][place], place))
 
 
 def test_order_is_keyed_by_seed_and_epoch() -> None:
-    def draw(seed: int, epoch: int) -> tuple[list[int], list[int]]:
-        sampler = MapSampler(50, 50, seed, tuple(range(8)), shuffle=True)
+    def draw(seed: int, epoch: int) -> tuple[list[float], ...]:
+        sampler = MapSampler(50, 50, seed, symmetries=tuple(range(8)), jitter=0.3, shuffle=True)
         sampler.set_epoch(epoch)
-        ((index, which),) = sampler
-        return index.tolist(), which.tolist()
+        ((index, which, factors),) = sampler
+        return index.tolist(), which.tolist(), factors.tolist()
 
     assert draw(0, 3) == draw(0, 3)
     for other in (draw(0, 4), draw(1, 3)):
@@ -44,7 +46,7 @@ def test_order_is_keyed_by_seed_and_epoch() -> None:
 
 
 def test_an_epoch_has_every_map_once_in_batches_of_nearly_one_size() -> None:
-    batches = [index for index, _ in MapSampler(10, 4, 0, (0,), shuffle=True)]
+    batches = [index for index, *_ in MapSampler(10, 4, shuffle=True)]
     assert sorted(torch.cat(batches).tolist()) == list(range(10))
     assert [len(batch) for batch in batches] == [4, 3, 3]
 
@@ -56,9 +58,9 @@ def test_loaders_give_fixed_keys_and_leave_the_global_generator_alone(dataset: T
     assert torch.equal(before, torch.random.get_rng_state())
     assert set(batch) == {"rgb", "class_id"}
     assert batch["rgb"].dtype == torch.uint8
-    assert batch["class_id"].dtype == torch.int64
+    assert batch["class_id"].dtype == torch.uint8
     valid = torch.cat([batch["class_id"] for batch in data.val_dataloader()])
-    assert torch.equal(valid, data.valid.class_id.long())
+    assert torch.equal(valid, data.valid.fields["class_id"])
 
 
 def test_colour_statistics_are_those_of_the_training_maps(dataset: TerrainDataset) -> None:
@@ -74,35 +76,37 @@ def test_a_split_that_is_not_there_is_named(tmp_path) -> None:
         MapData(small, 4, seed=0)
 
 
-def test_pixels_keep_their_class_and_their_pairing(dataset: TerrainDataset) -> None:
-    table = read_pixels(dataset, "train", max_points=50, seed=1)
-    maps = dataset.read("train", fields=["class_id", "slope_deg", "traversability"])
-    for class_id in range(10):
-        here = maps["class_id"] == class_id
-        there = set(zip(maps["slope_deg"][here].tolist(), maps["traversability"][here].tolist(), strict=True))
-        count = int(table.count[class_id])
-        assert count == min(50, here.sum())
-        row = zip(table.slope_deg[class_id].tolist(), table.traversability[class_id].tolist(), strict=True)
-        assert set(list(row)[:count]) <= there
-    again = read_pixels(dataset, "train", max_points=50, seed=1)
-    other = read_pixels(dataset, "train", max_points=50, seed=2)
-    assert torch.equal(table.slope_deg, again.slope_deg)
-    assert not torch.equal(table.slope_deg, other.slope_deg)
+def test_jitter_is_torchvisions_a_map_at_a_time() -> None:
+    rgb = torch.randint(0, 256, (2, 3, 8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    assert torch.equal(apply_jitter(rgb, torch.ones(2, 3)), rgb)
+    changed = apply_jitter(rgb, torch.tensor([[0.5, 1, 1], [1, 1, 0]]))
+    torch.testing.assert_close(changed[0].float(), rgb[0].float() / 2, rtol=0, atol=1)
+    assert torch.equal(changed[1, 0], changed[1, 1])  # without saturation all channels are one grey
 
 
-def test_a_subsample_draws_from_all_of_a_class() -> None:
-    slope = torch.linspace(0, 90, 4001)
-    table = PixelTable.group(torch.zeros(4001, dtype=torch.long), slope, slope / 90, 2, max_points=1000)
-    assert table.count.tolist() == [1000, 0]
-    assert len(table.slope_deg[0].unique()) == 1000
-    assert float(table.slope_deg[0].mean()) == pytest.approx(45, abs=4)
+def test_jitter_is_within_its_range_and_valid_maps_are_never_changed(dataset: TerrainDataset) -> None:
+    (drawn,) = (factors for *_, factors in MapSampler(100, 100, jitter=0.2))
+    assert drawn.min() >= 0.8
+    assert drawn.max() <= 1.2
+    assert drawn.std() > 0.1
+    plain, jittered = (MapData(dataset, 4, seed=0, jitter=jitter) for jitter in (0.0, 0.5))
+    assert torch.equal(*(next(iter(data.val_dataloader()))["rgb"] for data in (plain, jittered)))
+    first, second = (next(iter(data.train_dataloader())) for data in (plain, jittered))
+    assert torch.equal(first["class_id"], second["class_id"])
+    assert not torch.equal(first["rgb"], second["rgb"])
 
 
-def test_a_table_of_logs_out_of_range_is_refused() -> None:
-    ids = torch.tensor([0, 1])
-    with pytest.raises(ConfigError, match="traversability"):
-        PixelTable.group(ids, torch.tensor([1.0, 2.0]), torch.tensor([0.5, 1.5]), 2)
-    with pytest.raises(ConfigError, match="class_id"):
-        PixelTable.group(ids, torch.tensor([1.0, 2.0]), torch.tensor([0.5, 0.5]), 1)
-    with pytest.raises(ConfigError, match="one length"):
-        PixelTable.group(ids, torch.tensor([1.0]), torch.tensor([0.5, 0.5]), 2)
+@settings(max_examples=30, deadline=None)
+@given(maps=st.integers(1, 40), batch_size=st.integers(1, 16), processes=st.integers(1, 4))
+def test_processes_share_every_batch(maps: int, batch_size: int, processes: int) -> None:
+    whole = [index for index, *_ in MapSampler(maps, batch_size, 3, shuffle=True)]
+    parts = [
+        [index for index, *_ in MapSampler(maps, batch_size, 3, shuffle=True, share=(place, processes))]
+        for place in range(processes)
+    ]
+    for place, batch in enumerate(whole):
+        shared = [part[place] for part in parts]
+        assert all(len(one) for one in shared)
+        assert set(torch.cat(shared).tolist()) == set(batch.tolist())
+        if len(batch) >= processes:
+            assert len(torch.cat(shared)) == len(batch)

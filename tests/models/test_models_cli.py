@@ -11,8 +11,15 @@ from benchnav.models.cli import main
 
 from .support import make_dataset
 
-QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5", "--gp.batch_size", "32", "--gp.max_points", "100"]
-QUICK_CLASSIFIER = ["--classifier.max_epochs", "1", "--classifier.batch_size", "5", "--precision", "32-true"]
+QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5", "--gp.max_points", "100"]
+QUICK_CLASSIFIER = [
+    "--classifier.max_epochs",
+    "1",
+    "--classifier.batch_size",
+    "5",
+    "--trainer.precision",
+    "32-true",
+]
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -46,14 +53,14 @@ def test_halves_are_trained_into_one_checkpoint(
     assert "validation RMSE of the latent mean" in out
     assert "validation accuracy" in out
     assert "wrote new/mine with classifier and gp" in out
-    assert [line.split(":")[0] for line in err.strip().splitlines()] == ["gps", "classifier"], err
+    assert [line.split(":")[0] for line in err.strip().splitlines()] == ["gp", "classifier"], err
     there = load_checkpoint("new/mine")
     assert set(there.parts) == {"classifier", "gp"}
     assert there.part("gp").seed == 7
     assert there.part("gp").config["max_points"] == 100
     assert 0 < there.part("classifier").metrics["valid_accuracy"] < 1
-    assert there.dataset_id == "tiny-v1"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["new"]
+    assert there.part("gp").data_id == "tiny-v1"
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["mine", "mine.training"]
 
     again = refuses(monkeypatch, capfd, "gp", *where, *QUICK_GP)
     assert "--overwrite" in again
@@ -65,41 +72,21 @@ def test_halves_are_trained_into_one_checkpoint(
     assert after.part("classifier").metrics == there.part("classifier").metrics
 
 
-def test_a_half_of_other_maps_is_refused(
-    checkpoint_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    copy = shutil.copytree(checkpoint_path, tmp_path / "copy")
-    (copy / "classifier.safetensors").unlink()
-    config = json.loads((copy / "config.json").read_text())
-    del config["parts"]["classifier"]
-    (copy / "config.json").write_text(json.dumps(config))
-    other = make_dataset(tmp_path / "other.h5", train=3, valid=1)
-    where = ["--data", other.path, "--out", copy]
-    message = refuses(monkeypatch, capfd, "classifier", *where, *QUICK_CLASSIFIER)
-    assert "other maps" in message
-
-
-def test_evaluate_prints_a_table_and_writes_json(
+def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
     checkpoint_path: Path,
     dataset: TerrainDataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    report = tmp_path / "report.json"
-    assert call(monkeypatch, "evaluate", checkpoint_path, "--data", dataset.path, "--json", report) == 0
-    out = capfd.readouterr().out
-    assert "test/std" in out
-    assert "mIoU" in out
-    found = json.loads(report.read_text())
-    assert list(found["splits"]) == ["test/std", "test/hs"]
-    assert found["dataset"]["digest"] == dataset.digest
-    assert set(found["splits"]["test/hs"]) == {
-        "maps", "accuracy", "miou", "ece", "brier",
-        "rmse_observed", "rmse_expected", "nll", "crps", "coverage", "tail_rate",
-    }  # fmt: skip
-    assert call(monkeypatch, "evaluate", "oracle", "--data", dataset.path, "--splits", "[valid]") == 0
-    assert "valid" in capfd.readouterr().out
+    copy = shutil.copytree(checkpoint_path, tmp_path / "copy")
+    config = json.loads((copy / "config.json").read_text())
+    config["class_names"][0] = "lava"
+    (copy / "config.json").write_text(json.dumps(config))
+    where = ["--data", dataset.path, "--out", copy]
+    message = refuses(monkeypatch, capfd, "classifier", *where, *QUICK_CLASSIFIER)
+    assert "classes lava" in message
+    assert f"classes {dataset.recipe.classes[0].name}" in message
 
 
 @pytest.mark.parametrize(
@@ -144,8 +131,8 @@ def test_an_interrupted_training_goes_on_from_its_gps(
     assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
     kept = (tmp_path / "c" / "gp.safetensors").read_bytes()
     capfd.readouterr()
-    assert call(monkeypatch, "all", *where, *QUICK_GP, *QUICK_CLASSIFIER) == 0
-    assert "gps:" not in capfd.readouterr().err
+    assert call(monkeypatch, "all", *where, *QUICK_GP, *QUICK_CLASSIFIER, "--resume") == 0
+    assert "gp:" not in capfd.readouterr().err
     assert (tmp_path / "c" / "gp.safetensors").read_bytes() == kept
     assert set(load_checkpoint(tmp_path / "c").parts) == {"classifier", "gp"}
     assert "--overwrite" in refuses(monkeypatch, capfd, "all", *where)

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models import predictor
+from benchnav.models import fused, predictor
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import FusedModel, Oracle, load_model, predict, register_model
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict, register_model
 from benchnav.terrain import Observation, Terrain
 
 from .support import NAMES, linear_table, make_terrain
@@ -42,7 +43,7 @@ class Spy:
 
 def test_one_hot_probabilities_give_the_gp_of_that_class() -> None:
     terrain = make_terrain()
-    model = FusedModel(Fixed(1.0, 1e-30, 1e-30), linear_table(), NAMES)
+    model = FusedModel([Fixed(1.0, 1e-30, 1e-30)], linear_table(), NAMES)
     mixture = model.predict(terrain.observe())
     expected = TraversabilityMixture(
         torch.ones(2, 1, 16, 16), (1 - terrain.slope_deg / 90)[:, None], torch.full((2, 1, 16, 16), 0.1)
@@ -53,7 +54,7 @@ def test_one_hot_probabilities_give_the_gp_of_that_class() -> None:
 
 def test_the_mixture_is_equation_one() -> None:
     terrain = make_terrain()
-    mixture = FusedModel(Fixed(0.5, 0.3, 0.2), linear_table(), NAMES).predict(terrain.observe())
+    mixture = FusedModel([Fixed(0.5, 0.3, 0.2)], linear_table(), NAMES).predict(terrain.observe())
     share = terrain.slope_deg / 90
     parts = [(0.5, 1 - share, 0.1), (0.3, torch.full_like(share, 0.5), 0.2), (0.2, share, 0.3)]
     for value in (0.2, 0.7):
@@ -63,7 +64,7 @@ def test_the_mixture_is_equation_one() -> None:
 
 
 def test_single_class_is_the_gp_of_the_most_likely_class() -> None:
-    mixture = FusedModel(Fixed(0.3, 0.5, 0.2), linear_table(), NAMES).predict(make_terrain().observe())
+    mixture = FusedModel([Fixed(0.3, 0.5, 0.2)], linear_table(), NAMES).predict(make_terrain().observe())
     single = mixture.most_likely()
     torch.testing.assert_close(single.means, torch.full((2, 1, 16, 16), 0.5))
     torch.testing.assert_close(single.stds, torch.full((2, 1, 16, 16), 0.2))
@@ -75,9 +76,9 @@ def test_chunks_change_nothing_and_the_result_is_no_inference_tensor(monkeypatch
             return rgb.float() / 100
 
     terrain = make_terrain(batch=5)
-    model = FusedModel(Bright(), linear_table(), NAMES)
+    model = FusedModel([Bright()], linear_table(), NAMES)
     whole = model.predict(terrain.observe())
-    monkeypatch.setattr(predictor, "CHUNK_CELLS", 2 * 16 * 16)
+    monkeypatch.setattr(fused, "CHUNK_CELLS", 2 * 16 * 16)
     pieces = model.predict(terrain.observe())
     assert torch.equal(whole.weights, pieces.weights)
     assert not any(t.is_inference() for t in (pieces.weights, pieces.means, pieces.stds))
@@ -116,7 +117,7 @@ def test_a_prediction_that_does_not_fit_the_maps_is_refused() -> None:
 
 
 def test_a_registered_model_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predictor, "_FACTORIES", dict(predictor._FACTORIES))
+    monkeypatch.setattr(predictor, "_REGISTERED", {})
     register_model("mine", Spy)
     assert isinstance(load_model("mine"), Spy)
 
@@ -142,7 +143,7 @@ def test_a_checkpoint_with_one_half_says_how_to_train_the_other(checkpoint_path:
     whole = load_checkpoint(checkpoint_path)
     half = replace(whole, parts={"gp": whole.part("gp")})
     with pytest.raises(CheckpointError, match="benchnav-train classifier"):
-        FusedModel.from_checkpoint(half)
+        open_checkpoint(half)
 
 
 def test_the_oracle_loads_no_heavy_library() -> None:

@@ -1,0 +1,103 @@
+"""The paper's model: a classifier's probabilities times the class-wise Gaussian processes.
+
+Source: paper III-B, equation (1); ensembles: Lakshminarayanan et al. (2017), "Simple and scalable
+predictive uncertainty estimation using deep ensembles". Letters in shapes: M members, B maps, H×W
+cells, C classes.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from benchnav.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.models.checkpoint import GP, Checkpoint, member_names
+from benchnav.models.slope_table import SlopeTable
+from benchnav.terrain import Observation
+
+CHUNK_CELLS = 2**17
+
+
+class FusedModel:
+    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class.
+
+    P(c) is the average of the members' probabilities. The paper's `single-class` option is
+    `TraversabilityMixture.most_likely` of the prediction.
+
+    Args:
+        classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
+        table: the GPs over slope.
+        class_names: names of the C classes.
+    """
+
+    def __init__(
+        self, classifiers: Sequence[nn.Module], table: SlopeTable, class_names: tuple[str, ...]
+    ) -> None:
+        """Sets the classifiers to evaluation."""
+        if len(class_names) != len(table.mean):
+            raise ConfigError(f"Expected a GP for each of {len(class_names)} classes, got {len(table.mean)}.")
+        self.classifiers = tuple(classifier.eval() for classifier in classifiers)
+        self.table, self.class_names = table, class_names
+
+    def predict(self, observation: Observation) -> TraversabilityMixture:
+        """Predicts on the observation's device, to which the classifiers are moved.
+
+        Args:
+            observation: B maps of any size.
+
+        Returns:
+            Mixture with float32 parameters of shape [B, C, H, W].
+        """
+        weights = self._probabilities(self.classifiers[0], observation)
+        for classifier in self.classifiers[1:]:
+            weights += self._probabilities(classifier, observation)
+        means, stds = self.table.lookup(observation.slope_deg.float())
+        return TraversabilityMixture(weights / len(self.classifiers), means, stds)
+
+    def member_probabilities(self, observation: Observation) -> Tensor:
+        """Class probabilities of each member.
+
+        Args:
+            observation: B maps of any size.
+
+        Returns:
+            float32, shape [M, B, C, H, W].
+        """
+        return torch.stack([self._probabilities(member, observation) for member in self.classifiers])
+
+    @classmethod
+    def from_checkpoint(cls, checkpoint: Checkpoint) -> "FusedModel":
+        """Rebuilds the model from a checkpoint with GPs and one classifier or more.
+
+        Raises:
+            CheckpointError: a half is missing, or its tensors do not fit its settings.
+        """
+        from benchnav.models.classifier import TerrainClassifier
+
+        names = checkpoint.class_names
+        members = [checkpoint.part(name) for name in member_names(checkpoint)]
+        tensors = checkpoint.part(GP).tensors
+        try:
+            classifiers = [
+                TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
+            ]
+            table = SlopeTable(**{name: tensors[name] for name in ("mean", "std", "noise_std")})
+            return cls(classifiers, table, names)
+        except (BenchnavError, KeyError, RuntimeError) as error:
+            raise CheckpointError(
+                f"Expected tensors that fit the checkpoint's settings, got: {error}. Train the model again."
+            ) from error
+
+    def _probabilities(self, classifier: nn.Module, observation: Observation) -> Tensor:
+        rgb, (height, width), classes = observation.rgb, observation.grid.shape, len(self.class_names)
+        classifier.to(rgb.device)
+        probabilities = torch.empty(len(rgb), classes, height, width, device=rgb.device)
+        step = max(1, CHUNK_CELLS // (height * width))
+        with torch.inference_mode():
+            for start in range(0, len(rgb), step):
+                logits = classifier(rgb[start : start + step])
+                if logits.shape[1] != classes:
+                    raise ConfigError(f"Expected {classes} classes of the classifier, got {logits.shape[1]}.")
+                probabilities[start : start + step] = logits.float().softmax(1)
+        return probabilities

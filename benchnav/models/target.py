@@ -1,0 +1,138 @@
+"""The checkpoint that a training goes into: what may be written there, and what is there already.
+
+Every refusal comes before any work is done. Where processes train together, the first alone refuses
+and writes.
+"""
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from benchnav.errors import CheckpointError
+from benchnav.models.checkpoint import CLASSIFIER, CONFIG, Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.fitting import FitOptions, forget, interrupted, is_first_process
+
+
+class Target:
+    """A checkpoint that parts are added to, one after the other, each saved as soon as it is trained.
+
+    Args:
+        folder: where it is saved.
+        checkpoint: what it holds so far.
+        digest: of the data that parts are trained on.
+        options: how they are trained.
+    """
+
+    def __init__(self, folder: Path, checkpoint: Checkpoint, digest: str, options: FitOptions) -> None:
+        """Starts with what is there."""
+        self.folder, self.checkpoint = folder, checkpoint
+        self.digest, self.options = digest, options
+
+    def holds(self, name: str, config: Mapping[str, Any], seed: int) -> bool:
+        """Tells whether an interrupted run has left a part, trained in the same way.
+
+        Raises:
+            CheckpointError: it was trained in another way.
+        """
+        part = self.checkpoint.parts.get(name)
+        if part is None:
+            return False
+        if config.items() <= part.config.items() and (part.seed, part.data_digest) == (seed, self.digest):
+            return True
+        raise CheckpointError(
+            f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
+            f"{part.seed} and {part.data_id}. Repeat its settings, or pass --overwrite instead of --resume."
+        )
+
+    def add(self, name: str, part: Part) -> None:
+        """Saves a trained part with the rest."""
+        self.checkpoint = self.checkpoint.with_part(name, part)
+        if not is_first_process():
+            return
+        save_checkpoint(self.folder, self.checkpoint)
+        if self.options.folder:
+            forget(self.options.folder, name)
+        size = sum(path.stat().st_size for path in self.folder.iterdir())
+        parts = " and ".join(sorted(self.checkpoint.parts))
+        print(f"wrote {self.folder} with {parts} ({size / 1e6:.1f} MB)")
+
+
+def open_target(
+    folder: Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions, overwrite: bool
+) -> Target:
+    """Opens the checkpoint that training goes into.
+
+    Args:
+        folder: where it is, or will be.
+        fresh: without parts, of the family and classes that are to be trained.
+        parts: names of the parts to train.
+        digest: of the data that they are trained on.
+        options: how to train.
+        overwrite: whether what is there may be replaced.
+
+    Raises:
+        CheckpointError: the folder is something else, or what is there would be lost or does not fit.
+    """
+    left = interrupted(options.folder, parts) if options.folder else []
+    if left and not (options.resume or overwrite) and is_first_process():
+        raise CheckpointError(
+            f"Expected no interrupted training in {options.folder}, got one of {' and '.join(left)}. "
+            "Pass --resume to go on with it, or --overwrite to begin anew."
+        )
+    checkpoint = _what_is_there(folder, fresh, overwrite)
+    trained = [name for name in checkpoint.parts if name in parts]
+    if overwrite:
+        # Members of an ensemble stand or fall together.
+        dropped = {
+            name for name in checkpoint.parts if name in parts or (_is_member(name) and CLASSIFIER in parts)
+        }
+        checkpoint = replace(
+            checkpoint, parts={name: part for name, part in checkpoint.parts.items() if name not in dropped}
+        )
+    elif trained and not options.resume and is_first_process():
+        raise CheckpointError(
+            f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace "
+            "it, or --resume to go on with what an interrupted training has left."
+        )
+    elif trained and not options.resume:
+        checkpoint = fresh
+    return Target(folder, checkpoint, digest, options)
+
+
+def _what_is_there(folder: Path, fresh: Checkpoint, overwrite: bool) -> Checkpoint:
+    if not folder.exists():
+        # Whether a checkpoint can be written there shows now rather than after the training.
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        os.rmdir(tempfile.mkdtemp(dir=folder.parent))
+        return fresh
+    if not (folder / CONFIG).is_file():
+        raise CheckpointError(
+            f"Expected `out` to be a new folder or a checkpoint, got {folder}, which is something else. "
+            "Choose another `out`."
+        )
+    try:
+        there = load_checkpoint(folder)
+    except CheckpointError:
+        if overwrite:
+            return fresh
+        raise
+    if (there.model, there.class_names) == (fresh.model, fresh.class_names):
+        return there
+    if overwrite:
+        return fresh
+    raise CheckpointError(
+        f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(there)}. "
+        "Choose another `out`, or pass --overwrite to replace it."
+    )
+
+
+def _describe(checkpoint: Checkpoint) -> str:
+    return f"a {checkpoint.model} model of the classes {', '.join(checkpoint.class_names)}"
+
+
+def _is_member(name: str) -> bool:
+    return name.partition("-")[0] == CLASSIFIER

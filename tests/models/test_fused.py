@@ -1,0 +1,89 @@
+import pytest
+import torch
+from torch import Tensor, nn
+
+from benchnav.errors import ConfigError
+from benchnav.models import fused
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import EnsembleModel
+
+from .support import NAMES, linear_table, make_terrain
+
+
+class Linear(nn.Module):
+    """A classifier whose logits are its weights times the colours."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.weight = torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)) / 100
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return torch.einsum("dc,bchw->bdhw", self.weight, rgb.float())
+
+
+def test_probabilities_of_members_are_averaged() -> None:
+    observation = make_terrain(batch=3).observe()
+    members = [Linear(seed) for seed in range(3)]
+    ensemble = FusedModel(members, linear_table(), NAMES)
+    alone = torch.stack(
+        [FusedModel([one], linear_table(), NAMES).predict(observation).weights for one in members]
+    )
+    torch.testing.assert_close(ensemble.predict(observation).weights, alone.mean(0))
+    assert torch.equal(ensemble.member_probabilities(observation), alone)
+    assert isinstance(ensemble, EnsembleModel)
+
+
+def test_members_are_chunked_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    observation = make_terrain(batch=5).observe()
+    model = FusedModel([Linear(0), Linear(1)], linear_table(), NAMES)
+    whole = model.member_probabilities(observation)
+    monkeypatch.setattr(fused, "CHUNK_CELLS", 2 * 16 * 16)
+    assert torch.equal(model.member_probabilities(observation), whole)
+
+
+def test_zero_probabilities_leave_finite_distributions() -> None:
+    class Certain(nn.Module):
+        def forward(self, rgb: Tensor) -> Tensor:
+            return (
+                torch.tensor([0.0, -1e4, -torch.inf]).view(1, 3, 1, 1).expand(len(rgb), -1, *rgb.shape[-2:])
+            )
+
+    terrain = make_terrain()
+    mixture = FusedModel([Certain()], linear_table(), NAMES).predict(terrain.observe())
+    assert torch.equal(mixture.weights[:, 1:], torch.zeros(2, 2, 16, 16))
+    alone = mixture.most_likely()
+    for value in (
+        mixture.cvar(0.9),
+        mixture.var(0.9),
+        mixture.mean(),
+        mixture.log_prob(terrain.traversability),
+    ):
+        assert bool(value.isfinite().all())
+    torch.testing.assert_close(mixture.cvar(0.9), alone.cvar(0.9))
+
+
+@pytest.mark.parametrize("slope", [0.0, 89.9, 90.0, 200.0])
+def test_any_slope_has_a_prediction(slope: float) -> None:
+    observation = make_terrain().observe()
+    steep = type(observation)(
+        rgb=observation.rgb,
+        elevation_m=observation.elevation_m,
+        slope_deg=torch.full_like(observation.slope_deg, slope),
+        grid=observation.grid,
+    )
+    mixture = FusedModel([Linear(0)], linear_table(), NAMES).predict(steep)
+    assert bool(mixture.cvar(0.9).isfinite().all())
+
+
+def test_classes_and_gps_have_to_be_as_many() -> None:
+    with pytest.raises(ConfigError, match="GP for each of 2"):
+        FusedModel([Linear(0)], linear_table(), NAMES[:2])
+
+
+def test_a_classifier_of_other_classes_is_refused() -> None:
+    class Two(nn.Module):
+        def forward(self, rgb: Tensor) -> Tensor:
+            return rgb[:, :2].float()
+
+    with pytest.raises(ConfigError, match="Expected 3 classes of the classifier, got 2"):
+        FusedModel([Two()], linear_table(), NAMES).predict(make_terrain().observe())
