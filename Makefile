@@ -31,6 +31,8 @@ test: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/datasets.py
+	$(BIN)/python benchmarks/gps.py
+	$(BIN)/python benchmarks/training.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -137,7 +137,7 @@ def _out_of_range(split: str, name: str, values: np.ndarray, start: int, classes
     field = schema.FIELDS[name]
     most = classes - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
-    if name == "reference_time_s":
+    if name in ("reference_time_s", "traversability"):  # not asked for; not observed
         allowed |= np.isnan(values)
     for index in np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)):
         yield Fault(split, start + int(index), name, "is out of range")

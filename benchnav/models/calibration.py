@@ -202,6 +202,8 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
         if isinstance(model, ClassModel):
             classes = classes or [_ClassTally(model, terrain)]
             classes[0].add(mixture.weights, terrain)
+    if not cells:
+        raise DatasetError("Expected maps with an observed λ to measure on, got none.")
     squared_observed, squared_expected, nll, score, covered, in_tail = (sums / cells).tolist()
     return Quality(
         maps=maps,
@@ -229,15 +231,15 @@ def measure_latent(table: SlopeTable, terrain: Terrain) -> dict[str, float]:
         `latent_rmse` to f_c(ψ), `noise_error` (largest relative error of a class's σ_c that occurs) and
         `nll` of λ as realised.
     """
-    table = table.to(terrain.class_id.device)
+    table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
     own = terrain.class_id.unsqueeze(1)
     mean, std = (values.gather(1, own) for values in table.lookup(terrain.slope_deg))
-    mixture = TraversabilityMixture(torch.ones_like(mean), mean, std)
+    mixture = _choose(TraversabilityMixture(torch.ones_like(mean), mean, std), known)
     noise_error = (table.noise_std[terrain.class_id] / terrain.traversability_std - 1).abs()
     return {
         "latent_rmse": float((mean.squeeze(1) - terrain.traversability_mean).square().mean().sqrt()),
         "noise_error": float(noise_error.max()),
-        "nll": float(-mixture.log_prob(terrain.traversability).mean()),
+        "nll": float(-mixture.log_prob(terrain.traversability[known].unsqueeze(0)).mean()),
     }
 
 
@@ -305,12 +307,22 @@ class _ClassTally:
         )
 
 
+def _choose(mixture: TraversabilityMixture, cells: Tensor) -> TraversabilityMixture:
+    """The chosen ones (bool, shape [B, H, W]) of a mixture's cells, as a map of one row: [K, 1, N]."""
+    parameters = (mixture.weights, mixture.means, mixture.stds)
+    return TraversabilityMixture(*(values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters))
+
+
 def _score_cells(
     mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Sums of squared errors, NLL, CRPS, covered and tail cells, float64, shape [6]; and every PIT."""
-    observed = terrain.traversability
-    mean, std = terrain.traversability_mean.unsqueeze(1), terrain.traversability_std.unsqueeze(1)
+    """Sums of squared errors, NLL, CRPS, covered and tail cells, float64, shape [6]; and every PIT.
+
+    Cells whose λ was not observed are left out.
+    """
+    known = ~terrain.traversability.isnan()
+    mixture, observed = _choose(mixture, known), terrain.traversability[known].unsqueeze(0)
+    mean, std = (v[known].view(1, 1, -1) for v in (terrain.traversability_mean, terrain.traversability_std))
     truth = TraversabilityMixture(torch.ones_like(mean), mean, std).mean()
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()

@@ -121,6 +121,11 @@ class Simulation:
         self._grid = terrain.grid
         self._goal_m = goal_m
         if self.config.noise == "frozen":
+            if bool(terrain.traversability.isnan().any()):
+                raise ConfigError(
+                    "Expected maps with λ in every cell for `noise` 'frozen', got some that were not observed. "
+                    "Take `noise` 'resampled'."
+                )
             self._mean = terrain.grid.pad(terrain.traversability, outside=0.0)
             self._std = torch.zeros_like(self._mean)
         else:

@@ -68,14 +68,16 @@ def test_changed_values_with_sound_checksums_are_named_by_map_and_field(tmp_path
         file["test/hs/traversability"][1, 2, 3] = 1.5
         file["train/elevation_m"][2, 0, 0] += 2.0**-13
         file["train/goal_m"][4] = [1, 1]
+        file["valid/traversability"][0, 5, 5] = np.nan  # as of a cell not observed: in range
     found = {str(fault) for fault in find_faults(path)}
     assert found == {
         "test/hs: map 1: field 'traversability' is out of range",
         "test/hs: map 1: field 'traversability' does not match its digest",
         "train: map 2: field 'elevation_m' does not match its digest",
         "train: map 4: field 'goal_m' does not match its digest",
+        "valid: map 0: field 'traversability' does not match its digest",
     }
-    assert mend(path) == {"train": [2, 4], "test/hs": [1]}
+    assert mend(path) == {"train": [2, 4], "valid": [0], "test/hs": [1]}
     assert same(content(path), before)
 
 

@@ -9,10 +9,11 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.calibration import choose_splits, evaluate, measure, measure_latent
+from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.scores import crps
 from benchnav.models.uncertainty import mutual_information, predictive_entropy
-from benchnav.terrain import Observation
+from benchnav.terrain import Grid, Observation
 
 from .stub import ColourModel
 from .support import linear_table, make_terrain
@@ -181,3 +182,34 @@ def test_a_model_of_other_classes_is_refused(dataset: TerrainDataset) -> None:
 
 def test_a_split_named_twice_is_measured_once(dataset: TerrainDataset) -> None:
     assert choose_splits(Oracle(), dataset, ["valid", "test/std", "valid"]) == ["valid", "test/std"]
+
+
+def test_cells_that_were_not_observed_are_left_out() -> None:
+    terrain = make_terrain(batch=2)
+    gone = torch.zeros(2, 16, 16, dtype=torch.bool)
+    gone[:, :, :5] = True
+    holed = replace(terrain, traversability=terrain.traversability.masked_fill(gone, torch.nan))
+    rest = replace(
+        terrain,
+        **{  # the same cells, cut to a map of their own
+            name: getattr(terrain, name)[..., 5:]
+            for name in (
+                "rgb", "class_id", "elevation_m", "slope_deg",
+                "traversability", "traversability_mean", "traversability_std",
+            )
+        },
+        grid=Grid(16, 11, 0.5),
+    )  # fmt: skip
+    model = FusedModel([torch.nn.Identity()], linear_table(), ("a", "b", "c"))
+    found, wanted = (measure(model, [one], generator(1)).traversability for one in (holed, rest))
+    for name in ("rmse_observed", "rmse_expected", "nll", "crps"):
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-6), name
+    assert sum(found.pit) == 2 * 16 * 11
+    latent = [measure_latent(linear_table(), one)["nll"] for one in (holed, rest)]
+    assert latent[0] == pytest.approx(latent[1], rel=1e-6)
+    with pytest.raises(DatasetError, match="observed"):
+        measure(
+            model,
+            [replace(holed, traversability=torch.full_like(holed.traversability, torch.nan))],
+            generator(1),
+        )

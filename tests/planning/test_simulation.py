@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -88,6 +90,17 @@ def test_frozen_noise_is_the_maps_realised_traversability() -> None:
     now, met = sim.step(sim.init(torch.tensor([[3.3, 1.2, 0.0]])), AHEAD)
     assert met[0] == mean[0, 2, 6]
     assert now.state[0, 0].item() == pytest.approx(3.3 + 0.1 * mean[0, 2, 6].item())
+
+
+def test_frozen_noise_needs_every_cell_observed() -> None:
+    terrain = factories.terrain(torch.full((1, 16, 16), 0.5), 0.1)
+    holed = terrain.traversability.clone()
+    holed[0, 3, 3] = torch.nan
+    terrain = replace(terrain, traversability=holed)
+    build = (terrain, Unicycle(), torch.ones(1, 2), KEY, range(1))
+    Simulation(*build, SimulationConfig(noise="resampled"))
+    with pytest.raises(ConfigError, match="not observed"):
+        Simulation(*build, SimulationConfig(noise="frozen"))
 
 
 def test_outcomes() -> None:
