@@ -117,7 +117,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
     Raises:
         CheckpointError: it cannot be written, or the name is that of something else.
     """
-    folder = Path(folder)
+    folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
     if folder.exists() and not (folder / CONFIG).is_file():
         raise CheckpointError(
             f"Expected `out` to be a new folder or a checkpoint, got {folder}, which is something else. "
@@ -159,18 +159,16 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
                 tensors=_read_tensors(folder / f"{name}.safetensors", entry["sha256"]),
                 seed=int(entry["seed"]),
                 metrics=dict(entry["metrics"]),
-                data_id=entry.get("data", config.get("dataset"))["id"],
-                data_digest=entry.get("data", config.get("dataset"))["digest"],
-                half_precision=bool(entry.get("half_precision", name == CLASSIFIER)),
-                versions=dict(entry.get("versions", {})),
+                data_id=entry["data"]["id"],
+                data_digest=entry["data"]["digest"],
+                half_precision=bool(entry["half_precision"]),
+                versions=dict(entry["versions"]),
             )
             for name, entry in config["parts"].items()
         }
         if config["class_count"] != len(config["class_names"]):
             raise ValueError("class_count is not the number of class_names")
-        return Checkpoint(
-            class_names=tuple(config["class_names"]), parts=parts, model=config.get("model", FUSED)
-        )
+        return Checkpoint(class_names=tuple(config["class_names"]), parts=parts, model=config["model"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
 
@@ -231,10 +229,12 @@ def _read_config(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav checkpoint."
         )
-    if version > FORMAT_VERSION:
+    if version > FORMAT_VERSION or version[0] < FORMAT_VERSION[0]:
+        remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
         raise CheckpointError(
-            f"Expected format version at most {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
-            f"{config['format_version']}. Read it with a newer benchnav: pip install --upgrade benchnav."
+            f"Expected format version {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
+            f"{config['format_version']}. "
+            + (remedy if version > FORMAT_VERSION else "Train the model again with this version.")
         )
     return config
 

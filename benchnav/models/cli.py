@@ -1,5 +1,6 @@
 """The command `benchnav-train`: train models and measure them."""
 
+import os
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -187,7 +188,9 @@ def _options(
     settings = dict(trainer or {})
     if "max_epochs" in settings:
         config = replace(config, max_epochs=settings.pop("max_epochs"))
-    return config, FitOptions(folder=Path(f"{out}.training"), resume=resume, trainer=settings)
+    return config, FitOptions(
+        folder=Path(f"{os.path.normpath(out)}.training"), resume=resume, trainer=settings
+    )
 
 
 def _members(count: int) -> list[str]:

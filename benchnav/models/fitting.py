@@ -88,7 +88,7 @@ class KeepBest(Callback):
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Copies the weights when they are the best so far."""
-        measured = _measured(trainer)
+        measured = {name: value for name, value in _measured(trainer).items() if name.startswith("valid_")}
         if measured["valid_loss"] < self.loss:
             self.loss, self.metrics = measured["valid_loss"], {**measured, "epoch": trainer.current_epoch + 1}
             self.weights = {name: value.detach().clone() for name, value in module.state_dict().items()}

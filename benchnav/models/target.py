@@ -76,6 +76,7 @@ def open_target(
     Raises:
         CheckpointError: the folder is something else, or what is there would be lost or does not fit.
     """
+    folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
     left = interrupted(options.folder, parts) if options.folder else []
     if left and not (options.resume or overwrite) and is_first_process():
         raise CheckpointError(

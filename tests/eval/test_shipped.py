@@ -43,6 +43,6 @@ def test_the_shipped_maps_are_sound_and_of_the_recipe() -> None:
 def test_the_shipped_model_is_as_good_as_its_readme_says() -> None:
     dataset = TerrainDataset(find_dataset("paper-v1"))
     quality = dict(evaluate(load_model("paper-v1"), dataset))
-    assert quality["test/std"].classes[0].accuracy == pytest.approx(0.9652, abs=2e-3)
-    assert quality["test/hs"].classes[0].accuracy == pytest.approx(0.5436, abs=1e-2)
-    assert quality["test/std"].traversability.coverage == pytest.approx(0.9007, abs=5e-3)
+    assert quality["test/std"].classes[0].accuracy == pytest.approx(0.9950, abs=2e-3)
+    assert quality["test/hs"].classes[0].accuracy == pytest.approx(0.5289, abs=1e-2)
+    assert quality["test/std"].traversability.coverage == pytest.approx(0.8996, abs=5e-3)

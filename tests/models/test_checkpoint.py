@@ -101,9 +101,12 @@ def test_a_damaged_config_is_refused(folder: Path) -> None:
             load_checkpoint(folder)
 
 
-def test_a_newer_format_is_refused(folder: Path) -> None:
-    edit(folder, format_version="2.1")
-    with pytest.raises(CheckpointError, match="pip install --upgrade benchnav"):
+@pytest.mark.parametrize(
+    ("version", "remedy"), [("2.1", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
+)
+def test_another_format_is_refused(folder: Path, version: str, remedy: str) -> None:
+    edit(folder, format_version=version)
+    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.0 .* got {version}.*{remedy}"):
         load_checkpoint(folder)
 
 

@@ -66,6 +66,14 @@ def test_nothing_trained_is_lost_unasked(tmp_path: Path) -> None:
     assert set(load_checkpoint(folder).parts) == {"gp", "classifier"}
 
 
+def test_a_roundabout_name_of_a_checkpoint_is_that_checkpoint(tmp_path: Path) -> None:
+    there(tmp_path / "m", "gp")
+    with pytest.raises(CheckpointError, match="--overwrite"):
+        start(tmp_path / "none" / ".." / "m", ["gp"])
+    save_checkpoint(tmp_path / "none" / ".." / "new", FRESH)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m", "new"]
+
+
 def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(tmp_path: Path) -> None:
     target = start(there(tmp_path / "m", "gp"), ["gp", "classifier"], resume=True)
     assert target.holds("gp", {"width": 3}, 0)
