@@ -27,7 +27,7 @@ from benchnav.models.config import ClassifierConfig
 from benchnav.models.data import MapData
 from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit
 
-EPOCHS = 3
+EPOCHS = 2
 
 
 class Stopwatch(Callback):

@@ -138,5 +138,5 @@ def _check_share(name: str, value: float) -> None:
 
 def _check_least(**limits: tuple[int, int]) -> None:
     for name, (value, least) in limits.items():
-        if value < least:
-            raise ConfigError(f"Expected `{name}` ≥ {least}, got {value}.")
+        if not isinstance(value, int) or value < least:
+            raise ConfigError(f"Expected `{name}` to be an integer ≥ {least}, got {value!r}.")

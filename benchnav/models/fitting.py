@@ -9,6 +9,7 @@ what a batch holds depends on seed and epoch alone.
 import inspect
 import json
 import logging
+import os
 import signal
 import sys
 import warnings
@@ -70,6 +71,11 @@ class FitOptions:
         if accelerator not in ACCELERATORS:
             raise ConfigError(
                 f"Expected `trainer.accelerator` among {', '.join(ACCELERATORS)}, got {accelerator!r}."
+            )
+        devices, processors = self.trainer.get("devices", 1), os.cpu_count() or 1
+        if not torch.cuda.is_available() and isinstance(devices, int) and not 1 <= devices <= processors:
+            raise ConfigError(
+                f"Expected `trainer.devices` in 1–{processors}, as many as there are processors, got {devices}."
             )
         if accelerator in ("cuda", "gpu") and not torch.cuda.is_available():
             raise ConfigError(

@@ -62,7 +62,17 @@ def test_an_unknown_network_is_refused(name: str, value: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("learning_rate", 0.0), ("batch_size", 1), ("max_epochs", 0), ("weight_decay", -1.0)]
+    ("name", "value"),
+    [
+        ("learning_rate", 0.0),
+        ("batch_size", 1),
+        ("max_epochs", 0),
+        ("max_epochs", "many"),
+        ("dice", -1.0),
+        ("weight_decay", -1.0),
+        ("label_smoothing", 1.0),
+        ("jitter", 1.0),
+    ],
 )
 def test_settings_that_cannot_train_are_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=name):

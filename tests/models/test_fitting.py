@@ -192,3 +192,11 @@ def test_two_processes_train_one_classifier(dataset: TerrainDataset, tmp_path: P
     metrics = load_checkpoint(tmp_path / "m").part("classifier").metrics
     assert metrics["epoch"] in (1, 2)
     assert row.valid_accuracy > 0.05
+
+
+def test_no_more_processes_than_processors_are_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    FitOptions(trainer={"devices": os.cpu_count()})
+    for devices in (0, (os.cpu_count() or 1) + 1):
+        with pytest.raises(ConfigError, match=r"trainer\.devices"):
+            FitOptions(trainer={"devices": devices})
