@@ -10,11 +10,12 @@ import inspect
 import json
 import logging
 import os
+import pickle
 import signal
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from rich.progress import Progress as Bar
 from torch import Tensor
 
 from benchnav.errors import CheckpointError, ConfigError
-from benchnav.files import replacing, write_text
+from benchnav.files import replacing, sole_writer, write_text
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 ACCELERATORS = ("auto", "cpu", "cuda", "gpu")
@@ -243,18 +244,20 @@ def fit(
             lightning_trainer = _trainer(callbacks, logger=False, enable_checkpointing=False, **chosen)
             _run(lightning_trainer, module, data, None)
             return _measured(lightning_trainer)
-        state = _prepare(folder, options.resume, {**settings, "precision": chosen["precision"]})
-        keep = ModelCheckpoint(
-            folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
-        )
-        lightning_trainer = _trainer(
-            [*callbacks, History(folder / HISTORY), keep],
-            logger=TensorBoardLogger(folder, name="", version=""),
-            plugins=[WholeFiles()],
-            **chosen,
-        )
-        _run(lightning_trainer, module, data, state)
-        return _measured(lightning_trainer)
+        folder.mkdir(parents=True, exist_ok=True)
+        with sole_writer(folder, f"{folder}") if is_first_process() else nullcontext():
+            state = _prepare(folder, options.resume, {**settings, "precision": chosen["precision"]})
+            keep = ModelCheckpoint(
+                folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
+            )
+            lightning_trainer = _trainer(
+                [*callbacks, History(folder / HISTORY), keep],
+                logger=TensorBoardLogger(folder, name="", version=""),
+                plugins=[WholeFiles()],
+                **chosen,
+            )
+            _run(lightning_trainer, module, data, state)
+            return _measured(lightning_trainer)
 
 
 def is_first_process() -> bool:
@@ -296,7 +299,6 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
             )
         return state
     if is_first_process():
-        folder.mkdir(parents=True, exist_ok=True)
         for old in (state, folder / HISTORY, *folder.glob("events.out.tfevents.*"), *_partial(folder)):
             old.unlink(missing_ok=True)
         write_text(folder / SETTINGS, json.dumps(described, indent=1) + "\n")
@@ -320,7 +322,7 @@ def _run(
     except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
         signal.signal(signal.SIGINT, handler)
         raise KeyboardInterrupt from None
-    except (RuntimeError, EOFError, KeyError) as error:
+    except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
         if state is None or trainer.global_step:
             raise
         raise CheckpointError(

@@ -41,6 +41,7 @@ class Target:
         if part is None:
             return False
         if config.items() <= part.config.items() and (part.seed, part.data_digest) == (seed, self.digest):
+            self._forget(name)  # a kill may have come between saving and forgetting
             return True
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
@@ -53,11 +54,14 @@ class Target:
         if not is_first_process():
             return
         save_checkpoint(self.folder, self.checkpoint)
-        if self.options.folder:
-            forget(self.options.folder, name)
+        self._forget(name)
         size = sum(path.stat().st_size for path in self.folder.iterdir())
         parts = " and ".join(sorted(self.checkpoint.parts))
         print(f"wrote {self.folder} with {parts} ({size / 1e6:.1f} MB)")
+
+    def _forget(self, name: str) -> None:
+        if self.options.folder and is_first_process():
+            forget(self.options.folder, name)
 
 
 def open_target(

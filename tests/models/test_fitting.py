@@ -10,7 +10,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from benchnav.datagen.store import TerrainDataset
-from benchnav.errors import CheckpointError, ConfigError
+from benchnav.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.files import sole_writer
 from benchnav.models import training
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.classifier import TerrainClassifier
@@ -101,9 +102,17 @@ def test_a_training_of_other_settings_is_not_gone_on_with(
 
 def test_a_damaged_state_is_refused(dataset: TerrainDataset, cut: Path) -> None:
     state = cut / "classifier/last.ckpt"
-    state.write_bytes(state.read_bytes()[:100_000])
-    with pytest.raises(CheckpointError, match="is damaged"):
-        train(dataset, cut, resume=True)
+    content = state.read_bytes()
+    for damaged in (content[:100_000], b"garbage", b""):
+        state.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match="is damaged"):
+            train(dataset, cut, resume=True)
+
+
+def test_one_process_at_a_time_trains_in_a_folder(dataset: TerrainDataset, tmp_path: Path) -> None:
+    (tmp_path / "classifier").mkdir()
+    with sole_writer(tmp_path / "classifier", "it"), pytest.raises(BenchnavError, match="Another run"):
+        train(dataset, tmp_path)
 
 
 def test_a_new_training_drops_what_an_old_one_left(dataset: TerrainDataset, cut: Path) -> None:

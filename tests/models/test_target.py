@@ -76,7 +76,11 @@ def test_a_roundabout_name_of_a_checkpoint_is_that_checkpoint(tmp_path: Path) ->
 
 def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(tmp_path: Path) -> None:
     target = start(there(tmp_path / "m", "gp"), ["gp", "classifier"], resume=True)
+    state = tmp_path / "m.training" / "gp" / STATE  # of a kill after the part was saved
+    state.parent.mkdir(parents=True)
+    state.touch()
     assert target.holds("gp", {"width": 3}, 0)
+    assert not state.exists()
     assert not target.holds("classifier", {"width": 3}, 0)
     for config, seed in (({"width": 4}, 0), ({"width": 3}, 1)):
         with pytest.raises(CheckpointError, match="Repeat its settings"):
