@@ -119,7 +119,8 @@ def load_model(source: str | Path) -> AnyModel:
         return open_checkpoint(load_checkpoint(find_checkpoint(source)))
     if isinstance(found, ModelFamily):
         raise ConfigError(
-            f"Expected a model, got {str(source)!r}, which is a family of models. Name a checkpoint of it."
+            f"Expected a model, got {str(source)!r}, which is a family of models. "
+            "Name a checkpoint of it, by its path if it bears the same name."
         )
     return found()
 

@@ -153,3 +153,11 @@ def test_the_oracle_loads_no_heavy_library() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_family_is_no_model_and_a_checkpoint_of_an_unknown_one_says_so(checkpoint_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'mdn', which is a family of models"):
+        load_model("mdn")
+    foreign = replace(load_checkpoint(checkpoint_path), model="theirs")
+    with pytest.raises(CheckpointError, match=r"got one of 'theirs'. Install the package"):
+        open_checkpoint(foreign)
