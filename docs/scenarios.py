@@ -178,7 +178,7 @@ def ground_columns(steepest: float) -> Columns:
         "relief [m]": lambda m: show([m["relief"]], first, digits=2),
         "median slope [°]": lambda m: show([m["slope"]], quantile(0.5, SLOPE_EDGES)),
         "95 % [°]": lambda m: show([m["slope"]], quantile(0.95, SLOPE_EDGES)),
-        "beyond [10⁻⁴]": lambda m: show([m["slope_deg"] > steepest], first, 1e4, 0),
+        "beyond [10⁻⁵]": lambda m: show([m["slope_deg"] > steepest], first, 1e5, 0),
         "E[λ]": lambda m: show([m["expected"]], first, digits=3),
         "λ, 5 %": lambda m: show([m["lambda"]], quantile(0.05, SHARE_EDGES), digits=2),
         "stuck [%]": lambda m: show([m["stuck"]], first, 100),
@@ -240,10 +240,10 @@ def paired_columns(model: FusedModel, std: Maps) -> Columns:
     }
 
 
-def slope_table(std: Maps, hg: Maps, steepest: float) -> str:
+def slope_table(std: Maps, hg: Maps) -> str:
     """Where on the slopes of hg-100 the errors are made."""
     rows = []
-    for low, high in pairwise((0, 10, 15, 20, 25, steepest, 90)):
+    for low, high in pairwise((0, 10, 15, 20, 25, 90)):
         of_std, of_hg = ((low < m["slope_deg"]) & (m["slope_deg"] <= high) for m in (std, hg))
         inside = {name: [hg[name] * of_hg, of_hg] for name in hg if hg[name].shape == of_hg.shape}
         cells = [show([of_std], first, 100, 2), show([of_hg], first, 100, 2)]
@@ -252,7 +252,7 @@ def slope_table(std: Maps, hg: Maps, steepest: float) -> str:
             show(inside[key], ratio, k)
             for key, k in (("right", 100), ("error true", 1000), ("tail true", 100))
         ]
-        rows.append([f"{low:.3g}–{high:.3g}", *cells, shares[0], *errors, *shares[1:]])
+        rows.append([f"{low}–{high}", *cells, shares[0], *errors, *shares[1:]])
     head = ("slope [°]", "of std [%]", "of hg-100 [%]", "accuracy [%]")
     return table([*head, "predicted", "true", "bias, true", "tail, true [%]"], rows)
 
@@ -419,7 +419,7 @@ def main() -> None:
         "model": by_scenario(ladder, model_columns()),
         "calibration": by_scenario(ladder, calibration_columns(recipe)),
         "pairs": by_scenario(changed, paired_columns(model, pairs["std"])),
-        "slopes": slope_table(ladder["std"], ladder["hg-100"], steepest),
+        "slopes": slope_table(ladder["std"], ladder["hg-100"]),
         "colours": colour_table(recipe),
     }
     for name, lines in tables.items():

@@ -17,8 +17,8 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
+from benchnav.models.fitting import one_cycle
 
-_WARM_UP_SHARE = 0.15
 _STRIDE = 32  # the coarsest of any encoder: sides must be multiples of it
 _DETAIL_CHANNELS = 32
 
@@ -147,14 +147,7 @@ class TerrainClassifier(lightning.LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW under a one-cycle schedule over all steps."""
-        optimizer = torch.optim.AdamW(
-            self.parameters(), self.config.learning_rate, weight_decay=self.config.weight_decay, fused=True
-        )
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.config.learning_rate, total_steps=max(steps, 2), pct_start=_WARM_UP_SHARE
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return one_cycle(self, self.config.learning_rate, self.config.weight_decay)
 
     def forward(self, rgb: Tensor) -> Tensor:
         """Computes the logits of the classes; maps of any size are padded and the result cropped.

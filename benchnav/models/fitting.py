@@ -28,6 +28,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from rich.console import Console
 from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
@@ -39,6 +40,7 @@ from benchnav.files import replacing, sole_writer, write_text
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 ACCELERATORS = ("auto", "cpu", "cuda", "gpu")
 
+_WARM_UP_SHARE = 0.15
 _OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "barebones", "fast_dev_run"}
 _OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps"}
 _OWN |= {"use_distributed_sampler", "inference_mode", "enable_autolog_hparams", "model_registry", "profiler"}
@@ -258,6 +260,24 @@ def fit(
             )
             _run(lightning_trainer, module, data, state)
             return _measured(lightning_trainer)
+
+
+def one_cycle(
+    module: lightning.LightningModule, learning_rate: float, weight_decay: float
+) -> OptimizerLRScheduler:
+    """AdamW under a one-cycle schedule over all steps of a training (Smith and Topin, 2018).
+
+    Args:
+        module: what is trained, attached to its trainer.
+        learning_rate: the highest.
+        weight_decay: of AdamW.
+    """
+    optimizer = torch.optim.AdamW(module.parameters(), learning_rate, weight_decay=weight_decay, fused=True)
+    steps = int(module.trainer.estimated_stepping_batches)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, learning_rate, total_steps=max(steps, 2), pct_start=_WARM_UP_SHARE
+    )
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 def is_first_process() -> bool:

@@ -25,7 +25,7 @@ from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.data import MapData
-from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit, one_cycle
 from benchnav.models.training import training_digest
 from benchnav.terrain import Observation
 
@@ -34,7 +34,6 @@ LEAST_STD = 0.01
 
 _FIRST_STD, _FIRST_SPREAD = 0.2, 0.1
 _FEATURES = 32
-_WARM_UP_SHARE = 0.15
 _CHUNK_CELLS = 2**17
 _DEFAULT = FitOptions()
 
@@ -139,14 +138,7 @@ class MixtureDensityNetwork(lightning.LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW under a one-cycle schedule over all steps."""
-        optimizer = torch.optim.AdamW(
-            self.parameters(), self.config.learning_rate, weight_decay=self.config.weight_decay, fused=True
-        )
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, self.config.learning_rate, total_steps=max(steps, 2), pct_start=_WARM_UP_SHARE
-        )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        return one_cycle(self, self.config.learning_rate, self.config.weight_decay)
 
     def forward(self, rgb: Tensor, slope_deg: Tensor) -> Parameters:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.

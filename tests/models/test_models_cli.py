@@ -93,9 +93,6 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
     ("arguments", "expected"),
     [
         (["evaluate", "oracel", "--data", "DATA"], "Did you mean 'oracle'"),
-        (["evaluate", "oracle", "--data", "nothing.h5"], "nothing.h5"),
-        (["evaluate", "oracle", "--data", "DATA", "--splits", "[test/hg]"], "test/hg"),
-        (["evaluate", "oracle", "--data", "DATA", "--json", "no/such/folder.json"], "no/such"),
         (["all", "--data", "DATA"], "out"),
         (["all", "--data", "DATA", "--out", "x", "--classifier.max_epochs", "0"], "max_epochs"),
         (["all", "--data", "DATA", "--out", "x", "--gp.likelihood", "cauchy"], "likelihood"),
