@@ -39,21 +39,51 @@ def write_text(path: Path, text: str) -> None:
 
 
 @contextmanager
-def sole_writer(folder: Path, what: str) -> Iterator[None]:
-    """Holds a folder for one process; a kill frees it.
+def sole_writer(path: Path, what: str) -> Iterator[None]:
+    """Holds a file or folder for one process, whether or not it exists yet; a kill frees it.
+
+    The lock is a file beside it, so `path` may be moved, replaced or removed while it is held.
 
     Args:
-        folder: must exist.
+        path: what is held; its folder is made.
         what: what is written there, for the message.
 
     Raises:
-        BenchnavError: another process holds it.
+        BenchnavError: another process, or another part of this one, holds it.
     """
-    with open(folder / ".lock", "w") as lock:
+    path = path.resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = path.with_name(f".{path.name}.lock")
+    descriptor = _take(lock, what)
+    try:
+        yield
+    finally:
+        # Removed while it is still held: whoever opened it meanwhile sees that its name is gone.
+        lock.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _take(lock: Path, what: str) -> int:
+    """Opens and locks a file that has its name still; gives its descriptor."""
+    while True:
+        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_same(descriptor, lock):
+                return descriptor
         except BlockingIOError as error:
+            os.close(descriptor)
             raise BenchnavError(
                 f"Another run is writing {what}. Wait for it, or choose another `out`."
             ) from error
-        yield
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)  # its holder has removed it since it was opened
+
+
+def _is_same(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False

@@ -12,7 +12,8 @@ since for v in [0, 1] the expected shortfall under v is E[(v − λ)⁺] = G(v) 
     CVaR_α  = 1/p ∫₀^p clip(F⁻¹(u), 0, 1) du = v − (G(v) − G(0)) / p  at v = VaR_α.
 
 The last form is flat in v at the VaR (it is a maximum over v), so the error of the root enters
-squared. Arithmetic is in float64 whatever the dtype of the parameters.
+squared. The root is bisected a fixed number of times: no step waits for the worst cell, or for the
+device, and the error is bounded whatever the parameters. Arithmetic is in float64 whatever their dtype.
 
 Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional
 value-at-risk". Letters in shapes: K components, H×W cells, *B any leading dimensions.
@@ -27,7 +28,7 @@ from torch import Tensor
 from benchnav.errors import ConfigError
 
 _SMALLEST_STD = 1e-9
-_ROOT_STEPS = 60
+_BISECTIONS = 30  # leave an error of at most 2⁻³¹ < 1e-9
 
 
 @dataclass(frozen=True)
@@ -150,36 +151,39 @@ class TraversabilityMixture:
     def _uncensored_cdf(self, value: Tensor) -> Tensor:
         weights, means, stds = self._parameters()
         at = value.unsqueeze(-3) if value.ndim else value
-        return (weights * torch.special.ndtr((at - means) / stds)).sum(-3)
+        return (weights * _probability((at - means) / stds)).sum(-3)
 
     def _integrated_cdf(self, value: Tensor) -> Tensor:
         weights, means, stds = self._parameters()
         z = (value.unsqueeze(-3) - means) / stds
-        return (weights * stds * (z * torch.special.ndtr(z) + _density(z))).sum(-3)
+        return (weights * stds * torch.addcmul(_density(z), z, _probability(z))).sum(-3)
 
+    @torch.no_grad()
     def _value_at_risk(self, tail: float) -> Tensor:
-        """clip(F⁻¹(tail), 0, 1) in float64: Newton's steps, each kept inside a shrinking bracket."""
+        """clip(F⁻¹(tail), 0, 1) in float64, exact at 0 and 1."""
         weights, means, stds = self._parameters()
-        low = torch.zeros_like(weights.select(-3, 0))
-        high = torch.ones_like(low)
+        low, width = torch.zeros_like(means.select(-3, 0)), 1.0
         if tail >= 1:
-            return high
-        at_zero = self._uncensored_cdf(low) >= tail
-        at_one = self._uncensored_cdf(high) <= tail
-        root = 0.5 * (low + high)
-        for _ in range(_ROOT_STEPS):
-            z = (root.unsqueeze(-3) - means) / stds
-            error = (weights * torch.special.ndtr(z)).sum(-3) - tail
-            low = torch.where(error < 0, root, low)
-            high = torch.where(error < 0, high, root)
-            newton = root - error / (weights * _density(z) / stds).sum(-3)
-            inside = (newton > low) & (newton < high)
-            moved = torch.where(inside, newton, 0.5 * (low + high))
-            done = bool(((moved - root).abs() < 1e-9).logical_or(at_zero).logical_or(at_one).all())
-            root = moved
-            if done:
-                break
-        return torch.where(at_one, 1.0, torch.where(at_zero, 0.0, root))
+            return low + width
+        # F(x) = ½ Σ_k w_k erfc(shift_k − x scale_k): few passes over memory, and exact far down in the tail.
+        scale = math.sqrt(0.5) / stds
+        shift = means * scale
+
+        def twice_cdf(value: Tensor) -> Tensor:
+            terms = torch.addcmul(shift, value.unsqueeze(-3), scale, value=-1)
+            return terms.erfc_().mul_(weights).sum(-3)
+
+        at_zero, at_one = twice_cdf(low) >= 2 * tail, twice_cdf(low + width) <= 2 * tail
+        for _ in range(_BISECTIONS):
+            width /= 2
+            middle = low + width
+            low = torch.where(twice_cdf(middle) < 2 * tail, middle, low)
+        return torch.where(at_one, 1.0, torch.where(at_zero, 0.0, low + width / 2))
+
+
+def _probability(z: Tensor) -> Tensor:
+    """Φ(z); several times quicker than `torch.special.ndtr`."""
+    return 0.5 * torch.erfc(z * -math.sqrt(0.5))
 
 
 def _density(z: Tensor) -> Tensor:

@@ -6,8 +6,10 @@ elevation and slope of B maps to a Gaussian mixture of traversability λ in ever
 
     python examples/own_model.py
 
-To use such a model in `benchnav-train evaluate` and `benchnav-eval run`, let your own package name it in
-its pyproject.toml, in place of the call of `register_model` below; installed, it is known everywhere:
+The commands find a model by its file, here with its first option: `--model examples/own_model.py:ConstantModel:0.5`.
+A family of models that are kept in checkpoints, such as `PixelModel`, needs a name instead, since reading a
+checkpoint runs no code but what is known by name. Let your own package give it in its pyproject.toml, in
+place of the call of `register` below; installed, it is known everywhere:
 
     [project.entry-points."benchnav.models"]
     pixel = "my_package.own_model:PixelModel"
@@ -26,7 +28,8 @@ from benchnav.mixture import TraversabilityMixture
 from benchnav.models.calibration import evaluate
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
 from benchnav.models.contract import check_model
-from benchnav.models.predictor import load_model, register_model
+from benchnav.models.predictor import load_model
+from benchnav.registry import register
 from benchnav.terrain import Observation
 
 SEED, STEPS, BATCH, HIDDEN = 0, 400, 4096, 32
@@ -35,7 +38,7 @@ SEED, STEPS, BATCH, HIDDEN = 0, 400, 4096, 32
 class ConstantModel:
     """The least that is a model: the same Gaussian everywhere. Any other should do better."""
 
-    def __init__(self, mean: float, std: float) -> None:
+    def __init__(self, mean: float = 0.6, std: float = 0.2) -> None:
         self.mean, self.std = mean, std
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
@@ -121,7 +124,7 @@ def main() -> None:
         save_checkpoint(folder / "mine", Checkpoint(model="pixel", class_names=(), parts={"pixel": part}))
         print(f"saved a checkpoint of {load_checkpoint(folder / 'mine').model!r}")
 
-        register_model("pixel", PixelModel)
+        register("model", "pixel", PixelModel)
         own = load_model(folder / "mine")
         check_model(own)  # raises an error that lists whatever breaks the contract
         print("kept the contract")

@@ -7,10 +7,12 @@ import torch
 
 from benchnav.datagen.create import create
 from benchnav.datagen.scenario import Recipe, load_recipe
-from benchnav.planning.dynamics import Unicycle
-from benchnav.planning.objective import GoalDistance
-from benchnav.planning.problem import Problem, heading_to
-from benchnav.terrain import Grid, Terrain
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.free_space import Rules
+from benchnav.planning.objective import GoalDistance, Objective
+from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.robots import Robot, Unicycle
+from benchnav.terrain import Grid, Observation, Terrain
 
 GRID = Grid(16, 16, 0.5)
 
@@ -31,25 +33,42 @@ def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
     )
 
 
+def task(
+    robot: Robot | None = None, objective: Objective | None = None, rules: Rules | None = None
+) -> Task:
+    """The paper's task, with some of its parts replaced."""
+    return Task(
+        robot=robot or Unicycle(), objective=objective or GoalDistance(), rules=rules or Rules()
+    )
+
+
+def certain(traversability: torch.Tensor) -> TraversabilityMixture:
+    """A prediction without doubt, from λ of shape [B, H, W]."""
+    means = traversability.unsqueeze(1)
+    return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means))
+
+
 def problem(
     traversability: torch.Tensor,
     start: tuple[float, float] = (1.25, 1.25),
     goal: tuple[float, float] = (6.75, 6.75),
-    **changes: object,
+    robot: Robot | None = None,
+    objective: Objective | None = None,
+    rules: Rules | None = None,
+    elevation_m: torch.Tensor | None = None,
+    time_budget_s: float = 100.0,
 ) -> Problem:
-    """A problem on a flat map with the given λ̂, shape [B, H, W]."""
+    """A problem on maps with the given λ̂, shape [B, H, W], flat unless elevations are given."""
     batch, height, width = traversability.shape
-    start_m, goal_m = (torch.tensor([position] * batch) for position in (start, goal))
-    made = Problem(
-        grid=Grid(height, width, 0.5),
-        elevation_m=torch.zeros_like(traversability),
-        traversability=traversability,
-        dynamics=Unicycle(),
-        objective=GoalDistance(),
-        start=heading_to(start_m, goal_m),
-        goal_m=goal_m,
+    start_m, goal_m = (torch.tensor([position] * batch, dtype=torch.float32) for position in (start, goal))
+    flat = torch.zeros_like(traversability)
+    rgb = torch.full((batch, 3, height, width), 128, dtype=torch.uint8)
+    elevation_m = flat if elevation_m is None else elevation_m
+    observation = Observation(rgb, elevation_m, flat, Grid(height, width, 0.5))
+    made = task(robot, objective, rules)
+    return pose_problem(
+        made, observation, certain(traversability), traversability, start_m, goal_m, time_budget_s
     )
-    return replace(made, **changes)  # type: ignore[arg-type]
 
 
 def tiny_recipe(**maps: int) -> Recipe:

@@ -1,8 +1,14 @@
 """Every example runs as a user runs it, and does what it says."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchnav.planning.planners.contract import check_planner
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -27,3 +33,60 @@ def test_a_model_of_ones_own_beats_a_constant_and_the_oracle_beats_both(tmp_path
         assert own[0] < 0.75 * constant[0]
         assert own[1] < constant[1] - 0.1
         assert all(best < better < worse for best, better, worse in zip(oracle, own, constant, strict=True))
+
+
+def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:
+    """Runs `benchnav-eval run` with two jobs, as a user does, and gives the rows."""
+    command = [
+        Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle", "--instances", "2",
+        "--scenarios", "[std]", "--recorded", "0", "--jobs", "2", "--out", "run", "--time_budget_s", "60",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [*map(str, command), *flags], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Fan" in done.stdout or "–" in done.stdout
+    return pd.read_parquet(folder / "run" / "episodes.parquet")
+
+
+def test_a_planner_and_a_risk_measure_of_ones_own_by_file(dataset_path: Path, tmp_path: Path) -> None:
+    # Given by a path that begins where the command is run.
+    for name in ("own_planner.py", "own_risk.py"):
+        os.symlink(EXAMPLES / name, tmp_path / name)
+    rows = evaluate(
+        dataset_path,
+        tmp_path,
+        "--planners",
+        "[straight,./own_planner.py:Fan]",
+        "--risks",
+        "[mean,./own_risk.py:worst]",
+    )
+    cells = rows.groupby(["planner", "risk"]).size()
+    assert dict(cells) == {("straight", "–"): 2, ("Fan", "mean"): 2, ("Fan", "worst"): 2}
+    assert rows["success"].all()
+    check_planner(f"{EXAMPLES / 'own_planner.py'}:Fan")
+
+
+def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_path: Path) -> None:
+    path = EXAMPLES / "own_robot.py"
+    assert len(path.read_text().splitlines()) < 40
+    rows = evaluate(
+        dataset_path, tmp_path, "--robots", f"[{path}:Tracked]", "--objectives", f"[{path}:Energy]",
+        "--planners", "[straight,astar_dwa,mppi]", "--risks", "[mean]", "--planner_options", "{mppi: {samples: 128}}",
+    )  # fmt: skip
+    assert set(rows["robot"]) == {"Tracked"}
+    assert set(rows["objective"]) == {"Energy"}
+    assert rows["success"].all()
+    # 0.8 m/s at most.
+    assert (rows["path_length_m"] / rows["end_time_s"]).max() < 0.81
+
+
+@pytest.mark.parametrize("name", ["own_planner.py", "own_risk.py", "own_robot.py"])
+def test_the_command_in_an_examples_docstring_names_what_is_there(name: str) -> None:
+    text = (EXAMPLES / name).read_text()
+    for word in (
+        text.split('"""')[1].replace("'", " ").replace(",", " ").replace("[", " ").replace("]", " ").split()
+    ):
+        if ".py:" in word:
+            file, _, part = word.strip("`").partition(":")
+            assert f" {part}" in (EXAMPLES.parent / file).read_text()

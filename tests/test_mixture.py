@@ -5,7 +5,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
+from scipy import optimize, stats
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
@@ -63,6 +64,76 @@ def test_single_gaussian_matches_quadrature_of_its_quantiles(mean: float, std: f
     mixture = single(mean, std)
     assert mixture.cvar(level).item() == pytest.approx(expected, abs=2e-6)
     assert mixture.var(level).item() == pytest.approx(1.0 if level == 0 else quantile(tail), abs=1e-7)
+
+
+@pytest.mark.parametrize("level", [1e-6, 0.3, 0.9, 0.99, 1 - 1e-9])
+def test_value_at_risk_is_the_root_that_another_library_finds(level: float) -> None:
+    generator = torch.Generator().manual_seed(3)
+    shape, tail = (5, 60), 1 - level
+    weights = torch.rand(shape, generator=generator, dtype=torch.float64) ** 4
+    means = 2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
+    stds = 10 ** (-6 * torch.rand(shape, generator=generator, dtype=torch.float64))  # from steps to planes
+    weights = weights / weights.sum(0)
+    found = TraversabilityMixture(*(values.unsqueeze(1) for values in (weights, means, stds))).var(level)
+    inside = 0
+    for cell, value in enumerate(found.flatten().tolist()):
+        own = [values[:, cell].numpy() for values in (weights, means, stds)]
+
+        def excess(x: float, own: list = own) -> float:
+            return float((own[0] * stats.norm.cdf(x, own[1], own[2])).sum()) - tail
+
+        if excess(0) >= 0 or excess(1) <= 0:
+            assert value == (0 if excess(0) >= 0 else 1)
+        else:
+            inside += 1
+            assert value == pytest.approx(optimize.brentq(excess, 0, 1, xtol=1e-13, rtol=1e-14), abs=1e-9)
+    assert inside >= 3
+
+
+def test_clipping_leaves_exact_atoms() -> None:
+    mixture = TraversabilityMixture(
+        torch.tensor([0.3, 0.7]).view(2, 1, 1),
+        torch.tensor([-0.5, 1.5]).view(2, 1, 1),
+        torch.full((2, 1, 1), 0.05),
+    )
+    assert mixture.var(0.71).item() == 0
+    assert mixture.cvar(0.71).item() == 0
+    assert mixture.var(0.69).item() == 1
+    assert mixture.cvar(0.4).item() == pytest.approx(0.5, abs=1e-6)
+
+
+def test_the_slope_of_cvar_is_that_of_its_differences() -> None:
+    mixture, step = random_mixture(), 1e-5
+    means = mixture.means.clone().requires_grad_()
+    TraversabilityMixture(mixture.weights, means, mixture.stds).cvar(0.8).sum().backward()
+    for place in ((0, 1, 0, 2), (1, 3, 0, 5)):
+        shift = torch.zeros_like(mixture.means)
+        shift[place] = step
+        up, down = (
+            TraversabilityMixture(mixture.weights, mixture.means + sign * shift, mixture.stds).cvar(0.8).sum()
+            for sign in (1, -1)
+        )
+        assert means.grad[place].item() == pytest.approx((up - down).item() / (2 * step), abs=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_risk_maps_stay_on_their_device_and_wait_for_nothing(dtype: torch.dtype) -> None:
+    # A fake tensor has a device and no values: what asks for a value, or mixes devices, raises.
+    with FakeTensorMode():
+        weights, means, stds = (torch.empty(3, 10, 7, 5, dtype=dtype, device="cuda") for _ in range(3))
+        mixture = TraversabilityMixture(weights, means, stds)
+        value = torch.empty(3, 7, 5, dtype=dtype, device="cuda")
+        maps = (
+            mixture.mean(),
+            mixture.var(0.9),
+            mixture.cvar(0.9),
+            mixture.most_likely().cvar(0.9),
+            mixture.cdf(0.5),
+            mixture.cdf(value),
+            mixture.log_prob(value),
+        )
+        for found in maps:
+            assert (found.device.type, found.dtype, found.shape) == ("cuda", dtype, (3, 7, 5))
 
 
 def test_unclipped_gaussian_has_the_textbook_cvar() -> None:

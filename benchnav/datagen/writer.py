@@ -144,8 +144,8 @@ def workspace(path: Path, overwrite: bool) -> Iterator[Path]:
         DatasetError: the file is there, and not to be replaced.
     """
     folder = path.parent / f".{path.name}.partial"
-    folder.mkdir(exist_ok=True)
-    with sole_writer(folder, str(path)):
+    with sole_writer(path, str(path)):
+        folder.mkdir(exist_ok=True)
         # Asked here, since another run may have finished it before this one came to hold the folder.
         if path.exists() and not overwrite:
             shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The command `benchnav-eval`: run suites, report on them, replay episodes."""
+"""The command `benchnav-eval`: run suites, list parts, report on runs, replay episodes."""
 
 import os
 import sys
@@ -7,42 +7,55 @@ from pathlib import Path
 from benchnav.command import Command, run
 from benchnav.eval.suite import Suite
 
+SUITES = Path(__file__).parent / "suites"
 
-def run_command(suite: Suite, out: str = "runs/latest", jobs: int = 1, overwrite: bool = False) -> None:
-    """Run a suite into a folder, going on where an interrupted run stopped.
+
+def run_command(
+    suite: Suite,
+    out: str = "runs/latest",
+    jobs: int = 1,
+    overwrite: bool = False,
+    planner_limit_s: float = 0.0,
+) -> int:
+    """Run a suite into a folder, going on with or extending the run that is there.
 
     Args:
         suite: What is evaluated.
         out: Run folder.
         jobs: Worker processes. The result is the same for any number.
         overwrite: Drop a run that is there.
+        planner_limit_s: Seconds that a planner may take for one answer; planners then run in processes of
+            their own. 0 sets no limit.
     """
-    import shutil
-
     from benchnav.command import show_progress
-    from benchnav.datagen.store import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
-    from benchnav.eval.report import write_report
-    from benchnav.eval.runner import check, load_run, run_suite
+    from benchnav.eval.report.write import write_report
+    from benchnav.eval.runner import run_suite
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
+    if planner_limit_s < 0:
+        raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = Path(out)
-    check(suite, TerrainDataset(find_dataset(suite.data)))
-    if overwrite and folder.exists():
-        load_run(folder)  # Only what is a run folder may be dropped.
-        dropped = folder.with_name(f".{folder.name}.{os.getpid()}.dropped")
-        os.replace(folder, dropped)
-        shutil.rmtree(dropped)
     for planner, options in suite.planner_options.items():
-        print(
-            f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()),
-            file=sys.stderr,
-        )
-    show_progress(run_suite(suite, folder, jobs), "units")
-    _print_table(write_report(folder))
-    print(f"report:  {folder / 'summary.md'}")
-    _print_replay(suite, folder)
+        _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
+    show_progress(run_suite(suite, folder, jobs, overwrite, planner_limit_s, _say), "units")
+    write_report(folder)
+    _print(folder)
+    _print_replay(folder)
+    return _failed(folder)
+
+
+def list_command(kinds: list[str]) -> None:
+    """List planners, models, risk measures, robots and objectives with their options.
+
+    Args:
+        kinds: Some of planner, model, risk, robot and objective; all when none is named.
+    """
+    from benchnav.eval.catalogue import print_catalogue
+
+    for kind in kinds or ("",):
+        print_catalogue(kind)
 
 
 def report(folder: str) -> None:
@@ -51,17 +64,20 @@ def report(folder: str) -> None:
     Args:
         folder: Run folder.
     """
-    from benchnav.eval.report import write_report
+    from benchnav.eval.report.write import write_report
 
-    _print_table(write_report(Path(folder)))
-    print(f"report:  {Path(folder) / 'summary.md'}")
+    write_report(Path(folder))
+    _print(Path(folder))
 
 
 def replay(
     folder: str,
-    planner: str | None = None,
-    risk: str | None = None,
-    scenario: str | None = None,
+    planner: str = "",
+    risk: str = "",
+    scenario: str = "",
+    model: str = "",
+    seed: int = -1,
+    realisation: int = 0,
     instance: int = 0,
     view: bool = True,
 ) -> int:
@@ -69,25 +85,22 @@ def replay(
 
     Args:
         folder: Run folder.
-        planner: Planner; the run's first when not given.
-        risk: Risk setting; the run's first when not given.
-        scenario: Scenario; the run's first when not given.
+        planner: Planner as the table calls it; the run's first that fits when not given, as all of these.
+        risk: Risk setting.
+        scenario: Scenario.
+        model: Model.
+        seed: Root seed; the run's first when not given.
+        realisation: Draw of the world's luck.
         instance: Instance of the scenario.
         view: Open the viewer; false only makes the recording.
     """
     import subprocess
 
-    from benchnav.eval.runner import load_run, record_episode
+    from benchnav.eval.recorder import record_episode
 
-    suite, _ = load_run(Path(folder))
-    path = record_episode(
-        suite,
-        Path(folder),
-        planner or suite.planners[0],
-        risk or suite.risks[0],
-        scenario or suite.scenarios[0],
-        instance,
-    )
+    labels = {"planner": planner, "risk": risk, "scenario": scenario, "model": model}
+    asked = {name: label for name, label in labels.items() if label}
+    path = record_episode(Path(folder), asked, seed if seed >= 0 else None, realisation, instance)
     print(f"recording: {path}")
     shown = sys.platform != "linux" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if view and shown:
@@ -98,23 +111,39 @@ def replay(
     return 0
 
 
-def _print_table(summary) -> None:  # type: ignore[no-untyped-def]
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from benchnav.eval.report import HEADINGS, table_rows
-
-    # Escaped, since square brackets are markup.
-    table = Table(*map(escape, HEADINGS))
-    for row in table_rows(summary):
-        table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 130).print(table)
+def _say(line: str) -> None:
+    print(f"benchnav-eval: {line}", file=sys.stderr, flush=True)
 
 
-def _print_replay(suite: Suite, folder: Path) -> None:
-    command = f"replay {folder} --planner {suite.planners[-1]} --risk {suite.risks[0]}"
-    print(f"replay:  {_program('benchnav-eval')} {command}")
+def _print(folder: Path) -> None:
+    from benchnav.eval.report.write import print_report
+
+    print_report(folder)
+    print(f"report:  {folder / 'summary.md'}")
+
+
+def _print_replay(folder: Path) -> None:
+    from benchnav.eval.run.folder import open_run
+
+    trials = [trial for trial, _ in open_run(folder).trials.values()]
+    labels = trials[-1].labels
+    asked = f"--planner {labels['planner']} --scenario {labels['scenario']}"
+    if not trials[-1].blind:
+        asked += f" --risk {labels['risk']}"
+    print(f"replay:  {_program('benchnav-eval')} replay {folder} {asked}")
+
+
+def _failed(folder: Path) -> int:
+    """Exit status of a finished run: 1 where a planner or model failed, which one line says."""
+    from benchnav.eval.run.folder import EPISODES, ERRORS, read_table
+
+    outcomes = read_table(folder, EPISODES)["outcome"]
+    faults = {kind: int((outcomes == kind).sum()) for kind in ("planner_error", "model_error")}
+    if not any(faults.values()):
+        return 0
+    counted = " and ".join(f"{count} in {kind}" for kind, count in faults.items() if count)
+    _say(f"episodes that ended by a fault of the code they ran: {counted}; see {folder / ERRORS}")
+    return 1
 
 
 def _program(name: str) -> str:
@@ -128,7 +157,8 @@ def _program(name: str) -> str:
 def main() -> None:
     """Entry point of `benchnav-eval`."""
     commands = {
-        "run": Command(run_command, settings=Suite),
+        "run": Command(run_command, settings=Suite, configs=SUITES),
+        "list": Command(list_command, ("kinds",)),
         "report": Command(report, ("folder",)),
         "replay": Command(replay, ("folder",)),
     }

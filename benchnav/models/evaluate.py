@@ -32,7 +32,7 @@ def evaluate(
     """Measure a model on the test splits of a dataset.
 
     Args:
-        checkpoint: Checkpoint folder, or name of a registered model such as oracle.
+        checkpoint: Checkpoint folder, or a model by NAME such as oracle, package.module:Name or path/to/file.py:Name.
         data: Path or id of a dataset.
         splits: Which splits, for example [test/std,valid]; every test split when not given.
         out: Folder for quality.json, quality.csv, quality.md and figures; none when not given.

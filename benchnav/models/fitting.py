@@ -246,8 +246,8 @@ def fit(
             lightning_trainer = _trainer(callbacks, logger=False, enable_checkpointing=False, **chosen)
             _run(lightning_trainer, module, data, None)
             return _measured(lightning_trainer)
-        folder.mkdir(parents=True, exist_ok=True)
         with sole_writer(folder, f"{folder}") if is_first_process() else nullcontext():
+            folder.mkdir(parents=True, exist_ok=True)
             state = _prepare(folder, options.resume, {**settings, "precision": chosen["precision"]})
             keep = ModelCheckpoint(
                 folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False

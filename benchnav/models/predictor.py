@@ -1,28 +1,29 @@
 """What a model is, and how it is found by name or by checkpoint.
 
 A model sees an `Observation` and gives a `TraversabilityMixture`; the oracle alone is given the
-Terrain. Models are found by name through `register_model` or an entry point of the group
-`benchnav.models`; what stands there is either called without arguments and makes a model, or is a
-family, with `from_checkpoint`, for checkpoints that bear its name. The package's own models use the
-same group. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes, K
-components.
+Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what stands at a name is
+either called with its options and makes a model, or is a family, with `from_checkpoint`, for checkpoints
+that bear its name. The package's own models are in the same registry. Source: paper III-B. Letters in
+shapes: M members, B maps, H×W cells, C classes, K components.
 """
 
-import difflib
-from collections.abc import Callable
-from importlib.metadata import entry_points
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from benchnav import registry
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import CONFIG, Checkpoint, load_checkpoint
 from benchnav.terrain import Observation, Terrain
 
-GROUP = "benchnav.models"
+if TYPE_CHECKING:
+    from benchnav.datagen.scenario import Recipe
+    from benchnav.datagen.store import TerrainDataset
 
 
 class Model(Protocol):
@@ -83,58 +84,50 @@ class Oracle:
 
 
 AnyModel = Model | Oracle
-Registered = Callable[[], AnyModel] | ModelFamily
-
-_REGISTERED: dict[str, Registered] = {}
+Source = str | Path | Mapping[str, Any] | registry.Part
 
 
-def register_model(name: str, model: Registered) -> None:
-    """Makes a model or a family known by name in this process.
+def load_model(source: Source) -> AnyModel:
+    """Finds a model by checkpoint or as a part of the registry; it predicts on the observation's device.
 
     Args:
-        name: what suites, commands and checkpoints call it.
-        model: makes a model when called without arguments, or has `from_checkpoint`.
-    """
-    _REGISTERED[name] = model
-
-
-def model_names() -> list[str]:
-    """Registered names of models and families."""
-    return sorted({*_REGISTERED, *(point.name for point in entry_points(group=GROUP))})
-
-
-def load_model(source: str | Path) -> AnyModel:
-    """Finds a model by registered name or by checkpoint; it predicts on the observation's device.
-
-    Args:
-        source: a registered name such as `oracle`; or the folder of a checkpoint, by path or by its
-            name in `checkpoints/` here or in this checkout.
+        source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or in this
+            checkout; or a part, such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
+            options where it is a mapping.
 
     Raises:
-        ConfigError: there is no such model.
+        ConfigError: there is no such model, or it refuses its options.
         CheckpointError: the checkpoint cannot be used.
     """
-    found = _find_registered(str(source))
-    if found is None:
-        return open_checkpoint(load_checkpoint(find_checkpoint(source)))
-    if isinstance(found, ModelFamily):
+    part = _as_part(source)
+    if isinstance(part, Path):
+        return open_checkpoint(load_checkpoint(part))
+    if isinstance(registry.find("model", part.part).target, ModelFamily):
         raise ConfigError(
-            f"Expected a model, got {str(source)!r}, which is a family of models. "
+            f"Expected a model, got {part.part!r}, which is a family of models. "
             "Name a checkpoint of it, by its path if it bears the same name."
         )
-    return found()
+    model = registry.make("model", part)
+    if not isinstance(model, Oracle) and not callable(getattr(model, "predict", None)):
+        raise ConfigError(
+            f"Expected model {part.part!r} to have `predict(observation)`, got {type(model).__name__} without it."
+        )
+    return model
 
 
 def open_checkpoint(checkpoint: Checkpoint) -> Model:
     """Rebuilds the model of a checkpoint through the family that it names.
 
+    Names alone are looked up, never a module or file: what a checkpoint says runs no code of its choice.
+
     Raises:
-        CheckpointError: the family is not registered here, or cannot rebuild the model.
+        CheckpointError: the family is not known here by name, or cannot rebuild the model.
     """
-    family = _find_registered(checkpoint.model)
+    known = registry.names("model")
+    family = registry.find("model", checkpoint.model).target if checkpoint.model in known else None
     if not isinstance(family, ModelFamily):
         raise CheckpointError(
-            f"Expected a checkpoint of a model among {', '.join(model_names())}, got one of "
+            f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
             f"{checkpoint.model!r}. Install the package that registers it."
         )
     return family.from_checkpoint(checkpoint)
@@ -147,17 +140,74 @@ def find_checkpoint(source: str | Path) -> Path:
         CheckpointError: the folder holds no checkpoint.
         ConfigError: there is no such folder, nor a model of that name.
     """
-    folders = [Path("checkpoints"), Path(__file__).parents[2] / "checkpoints"]
-    for path in (Path(source), *(folder / source for folder in folders)):
+    for path in (Path(source), *(folder / source for folder in _checkpoint_folders())):
         if (path / CONFIG).is_file():
             return path
     if Path(source).is_dir():
         return Path(source)  # to be refused by the reader, which says what is missing there
-    known = sorted({*model_names(), *(path.parent.name for f in folders for path in f.glob(f"*/{CONFIG}"))})
-    close = difflib.get_close_matches(str(source), known, n=1)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
+    known = sorted({*registry.names("model"), *(path.name for path in list_checkpoints())})
+    near = registry.hint(str(source), known) or _near_path(Path(source))
     raise ConfigError(
-        f"Expected a model among {', '.join(known)} or the folder of a checkpoint, got {str(source)!r}.{hint}"
+        f"Expected a model among {', '.join(known)}, the folder of a checkpoint, package.module:Name or "
+        f"path/to/file.py:Name, got {str(source)!r}.{near}"
+    )
+
+
+def list_checkpoints() -> list[Path]:
+    """Folders of the checkpoints in `checkpoints/` here and in this checkout; of one name the first."""
+    found: dict[str, Path] = {}
+    for folder in _checkpoint_folders():
+        for path in sorted(config.parent for config in folder.glob(f"*/{CONFIG}")):
+            found.setdefault(path.name, path)
+    return list(found.values())
+
+
+def model_identity(source: Source) -> dict[str, Any]:
+    """Says which model a source is, so that a change of it is seen: plain data.
+
+    Args:
+        source: as `load_model` takes it.
+
+    Returns:
+        Of a checkpoint its `name`, and under `files` the SHA-256 of each; of a part `name`, `origin`,
+        `digest` and, where it is of this package, `shipped`. Options are not in it.
+
+    Raises:
+        ConfigError: there is no such model.
+    """
+    part = _as_part(source)
+    if not isinstance(part, Path):
+        found = registry.find("model", part.part)
+        return {"name": part.part, "origin": found.origin, "digest": found.digest, "shipped": found.shipped}
+    name = source if isinstance(source, str | Path) else registry.read_part("model", source).part
+    files = sorted(path for path in part.iterdir() if path.suffix in (".json", ".safetensors"))
+    return {
+        "name": str(name),
+        "files": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files},
+    }
+
+
+def class_mismatch(
+    model: AnyModel | Checkpoint, data: "TerrainDataset | Recipe", name: str = "the model"
+) -> str:
+    """Tells in one line when a model knows another class table than that of the data.
+
+    Args:
+        model: a model, or a checkpoint, which has a class table even where its model tells no classes.
+        data: a dataset or its recipe.
+        name: what the line calls the model.
+
+    Returns:
+        Empty where the tables are the same, or the model has none.
+    """
+    own = tuple(getattr(model, "class_names", ()))
+    recipe: Recipe = getattr(data, "recipe", data)
+    names = tuple(item.name for item in recipe.classes)
+    if not own or own == names:
+        return ""
+    return (
+        f"{name} was trained on another class table than that of {getattr(data, 'id', 'the data')}: on "
+        f"{', '.join(own)}; the maps have {', '.join(names)}"
     )
 
 
@@ -191,12 +241,30 @@ def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
     return mixture
 
 
-def _find_registered(name: str) -> Registered | None:
-    if name in _REGISTERED:
-        return _REGISTERED[name]
-    for point in entry_points(group=GROUP, name=name):
-        return point.load()
-    return None
+def _as_part(source: Source) -> registry.Part | Path:
+    """Reads a source as a part of the registry or as the folder of a checkpoint; known names go first."""
+    if isinstance(source, Path):
+        return find_checkpoint(source)
+    part = registry.read_part("model", source)
+    if part.part in registry.names("model"):
+        return part
+    if (":" in part.part or part.part.endswith(".py")) and not (Path(part.part) / CONFIG).is_file():
+        return part
+    folder = find_checkpoint(part.part)
+    if part.options:
+        raise ConfigError(f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
+    return folder
+
+
+def _checkpoint_folders() -> tuple[Path, Path]:
+    return Path("checkpoints"), Path(__file__).parents[2] / "checkpoints"
+
+
+def _near_path(path: Path) -> str:
+    """A hint with the nearest checkpoint in the folder of a mistyped path, or of its name elsewhere."""
+    siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
+    near = registry.hint(path.name, siblings, f"{path.parent}/")
+    return near or registry.hint(path.name, (found.name for found in list_checkpoints()))
 
 
 def _cell_shape(weights: Tensor) -> tuple[int, ...]:

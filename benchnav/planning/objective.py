@@ -1,7 +1,10 @@
 """Objectives J: what a planner minimises.
 
 An objective is any object with `stage` and `terminal`. `target` is the goal, or a local planner's
-waypoint; traversability is read at the state before the move. Source: paper III-C and IV-A.
+way-point; traversability is read at the state before the move. Ground that is not free is no concern of
+J: the `Problem` adds its price. An objective whose constructor has a parameter `robot` is given the
+task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading dimensions, S state and A action
+dimensions.
 """
 
 from dataclasses import dataclass
@@ -9,6 +12,9 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.planning.robots import Robot
 
 
 class Objective(Protocol):
@@ -33,26 +39,46 @@ class Objective(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
 class GoalDistance:
-    """Distance to the target, and a penalty wherever the robot would be stuck.
-
-    Source: paper IV-A.
-
-    Args:
-        stuck_threshold: λ_stuck; at or under it the penalty is due.
-        stuck_penalty: added at each such state.
-    """
-
-    stuck_threshold: float = 0.3
-    stuck_penalty: float = 1e4
+    """The paper's: distance to the target in metres, at each step. Source: paper IV-A."""
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step; see `Objective`."""
-        return self.terminal(state, traversability, target)
+        return distance(state, target)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
-        offset_x, offset_y = state[..., 0] - target[..., 0], state[..., 1] - target[..., 1]
-        distance = torch.sqrt(offset_x * offset_x + offset_y * offset_y)
-        return distance + self.stuck_penalty * (traversability <= self.stuck_threshold)
+        return distance(state, target)
+
+
+@dataclass(frozen=True)
+class TravelTime:
+    """Seconds until the target: those of the steps before arrival, and at top speed for what is left.
+
+    Args:
+        robot: gives time step and top speed.
+        arrival_m: a state this near to the target has arrived.
+    """
+
+    robot: Robot
+    arrival_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuses a distance at which nothing arrives."""
+        if not self.arrival_m > 0:
+            raise ConfigError(f"Expected `arrival_m` > 0, got {self.arrival_m}.")
+
+    def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+        """Cost of one step; see `Objective`."""
+        away = distance(state, target)
+        return self.robot.dt_s * (away > self.arrival_m).to(away.dtype)
+
+    def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+        """Cost of the last state; see `Objective`."""
+        return (distance(state, target) - self.arrival_m).clamp(min=0) / self.robot.top_speed_mps
+
+
+def distance(state: Tensor, target: Tensor) -> Tensor:
+    """Distances of states [*B, S] to positions [*B, 2], shape [*B]."""
+    offset_x, offset_y = state[..., 0] - target[..., 0], state[..., 1] - target[..., 1]
+    return torch.sqrt(offset_x * offset_x + offset_y * offset_y)

@@ -1,55 +1,71 @@
 """The navigation problem that a planner is given (paper, equation 2).
 
-It holds the *predicted* traversability λ̂ alone: the truth stays with the simulation. Letters in
-shapes: B episodes, H×W cells, S state and A action dimensions.
+It holds what is *predicted* alone: the truth stays with the simulation. Letters in shapes: B episodes, H×W
+cells, K components, S state and A action dimensions, *K any further dimensions.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.dynamics import Dynamics
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.free_space import PRICE, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
-from benchnav.terrain import Grid
+from benchnav.planning.robots import Robot
+from benchnav.terrain import Grid, Observation
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What is to be done.
+
+    Args:
+        robot: F with its action bounds and time step.
+        objective: J.
+        rules: free space, least λ̂, goal radius.
+    """
+
+    robot: Robot
+    objective: Objective
+    rules: Rules = Rules()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """A batch of navigation problems on maps of one grid.
+    """A batch of navigation problems on maps of one grid; `pose_problem` makes one.
 
     Args:
-        grid: size and resolution of the maps.
-        elevation_m: shape [B, H, W].
-        traversability: λ̂, the risk setting's map, in [0, 1], shape [B, H, W].
-        dynamics: F with its action bounds and time step.
-        objective: J.
+        task: what is to be done.
+        observation: what the robots saw.
+        mixture: the predicted distribution of λ, parameters of shape [B, K, H, W].
+        risk_map: λ̂ as the risk setting gives it, in [0, 1], shape [B, H, W].
+        free: S_free, the goal's disc included, bool, shape [B, H, W].
         start: initial states, shape [B, S].
         goal_m: (x, y) of the goals, shape [B, 2].
-        stuck_threshold: λ_stuck; S_free is where λ̂ exceeds it.
-        goal_radius_m: a robot this near has arrived.
         time_budget_s: T.
     """
 
-    grid: Grid
-    elevation_m: Tensor
-    traversability: Tensor
-    dynamics: Dynamics
-    objective: Objective
+    task: Task
+    observation: Observation
+    mixture: TraversabilityMixture
+    risk_map: Tensor
+    free: Tensor
     start: Tensor
     goal_m: Tensor
-    stuck_threshold: float = 0.3
-    goal_radius_m: float = 1.0
-    time_budget_s: float = 100.0
+    time_budget_s: float
 
     def __post_init__(self) -> None:
         """Checks that the batch is one batch."""
         batch = self.start.shape[0]
         expected = {
-            "elevation_m": (batch, *self.grid.shape),
-            "traversability": (batch, *self.grid.shape),
+            "risk_map": (batch, *self.grid.shape),
+            "free": (batch, *self.grid.shape),
             "goal_m": (batch, 2),
         }
         for name, shape in expected.items():
@@ -62,23 +78,87 @@ class Problem:
         return self.start.shape[0]
 
     @property
-    def dt_s(self) -> float:
-        """Time step of the dynamics."""
-        return self.dynamics.dt_s
+    def grid(self) -> Grid:
+        """Size and resolution of the maps."""
+        return self.observation.grid
 
     @property
-    def free(self) -> Tensor:
-        """S_free, bool, shape [B, H, W]."""
-        return self.traversability > self.stuck_threshold
+    def elevation_m(self) -> Tensor:
+        """Shape [B, H, W]."""
+        return self.observation.elevation_m
+
+    @property
+    def robot(self) -> Robot:
+        """F."""
+        return self.task.robot
+
+    @property
+    def objective(self) -> Objective:
+        """J, without the price of ground that is not free: see `stage_cost`."""
+        return self.task.objective
+
+    @property
+    def goal_radius_m(self) -> float:
+        """A robot this near has arrived."""
+        return self.task.rules.goal_radius_m
+
+    @property
+    def dt_s(self) -> float:
+        """Time step of the robot."""
+        return self.robot.dt_s
 
     @cached_property
-    def padded_traversability(self) -> Tensor:
-        """λ̂ framed for lookups; 0 off the map, so that outside is not free."""
-        return self.grid.pad(self.traversability, outside=0.0)
+    def traversability(self) -> Tensor:
+        """The λ̂ that motion and path costs are given: at least `slowest`, shape [B, H, W]."""
+        return self.risk_map.clamp(min=self.task.rules.slowest)
+
+    @cached_property
+    def padded_ground(self) -> Tensor:
+        """λ̂ and free space in one map framed for lookups: λ̂ where free, −λ̂ where not, −0 off the map.
+
+        One lookup a step serves both motion and price; see `traversability_at` and `free_at`.
+        """
+        signed = torch.where(self.free, self.traversability, -self.traversability)
+        return self.grid.pad(signed, outside=-0.0)
+
+    @cached_property
+    def action_bounds(self) -> tuple[Tensor, Tensor]:
+        """Least and greatest actions, each of shape [A]."""
+        return (
+            self.start.new_tensor(self.robot.action_low),
+            self.start.new_tensor(self.robot.action_high),
+        )
+
+    def ground_at(self, state: Tensor) -> Tensor:
+        """Reads `padded_ground` where the robots stand; shape of `state` [B, *K, S] without the last."""
+        return self.grid.lookup(self.padded_ground, state[..., 0], state[..., 1])
 
     def traversability_at(self, state: Tensor) -> Tensor:
-        """λ̂ where the robot stands, shape of `state` [B, *K, S] without the last dimension."""
-        return self.grid.lookup(self.padded_traversability, state[..., 0], state[..., 1])
+        """λ̂ of motion where the robots stand, 0 off the map; shapes as for `ground_at`."""
+        return self.ground_at(state).abs()
+
+    def free_at(self, state: Tensor) -> Tensor:
+        """Tells which robots stand on free ground, bool; shapes as for `ground_at`."""
+        return self.ground_at(state) > 0
+
+    def stage_cost(self, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
+        """J of a step, and the price of ground that is not free.
+
+        Args:
+            state: shape [B, *K, S].
+            action: shape [B, *K, A].
+            ground: `ground_at(state)`, shape [B, *K].
+            target: (x, y) to be reached, shape [B, *1, 2].
+
+        Returns:
+            Shape [B, *K].
+        """
+        return stage_cost(self.objective, state, action, ground, target)
+
+    def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
+        """J of the last state, and the price of ground that is not free; shapes as for `stage_cost`."""
+        ground = self.ground_at(state)
+        return self.objective.terminal(state, ground.abs(), target) + PRICE * (ground <= 0)
 
     def select(self, members: Tensor) -> "Problem":
         """Keeps some episodes of the batch.
@@ -86,16 +166,71 @@ class Problem:
         Args:
             members: indices, shape [M].
         """
-        return replace(
-            self,
-            elevation_m=self.elevation_m[members],
-            traversability=self.traversability[members],
-            start=self.start[members],
-            goal_m=self.goal_m[members],
-        )
+        return _with_tensors(self, lambda value: value[members])
+
+    def clone(self) -> "Problem":
+        """A copy that shares no tensor."""
+        return _with_tensors(self, torch.clone)
+
+    def to(self, device: torch.device | str) -> "Problem":
+        """The problem on a device."""
+        return _with_tensors(self, lambda value: value.to(device))
+
+
+def stage_cost(
+    objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
+) -> Tensor:
+    """J of a step and the price of ground that is not free; see `Problem.stage_cost`."""
+    return objective.stage(state, action, ground.abs(), target) + PRICE * (ground <= 0)
+
+
+def pose_problem(
+    task: Task,
+    observation: Observation,
+    mixture: TraversabilityMixture,
+    risk_map: Tensor,
+    start_m: Tensor,
+    goal_m: Tensor,
+    time_budget_s: float,
+) -> Problem:
+    """Poses the problem of driving from start to goal, heading at the goal.
+
+    Args:
+        task: what is to be done.
+        observation: what the robots saw, B maps.
+        mixture: the predicted distribution of λ.
+        risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
+        start_m: (x, y), shape [B, 2].
+        goal_m: (x, y), shape [B, 2].
+        time_budget_s: T.
+    """
+    rules = task.rules
+    at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
+    return Problem(
+        task=task,
+        observation=observation,
+        mixture=mixture,
+        risk_map=risk_map,
+        free=rules.free_space.mask(risk_map, mixture) | at_goal,
+        start=task.robot.initial_state(heading_to(start_m, goal_m)),
+        goal_m=goal_m,
+        time_budget_s=time_budget_s,
+    )
 
 
 def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
-    """Initial states (x, y, θ) that look at the goal, shape [B, 3], from positions [B, 2]."""
+    """Poses (x, y, θ) that look at the goal, shape [B, 3], from positions [B, 2]."""
     offset = goal_m - position_m
     return torch.cat((position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1)
+
+
+def _with_tensors(value: T, change: Any) -> T:
+    """Changes every tensor of a dataclass and of the dataclasses in it, but for the task's."""
+    changed: dict[str, Any] = {}
+    for field in fields(value):  # type: ignore[arg-type]
+        item = getattr(value, field.name)
+        if isinstance(item, Tensor):
+            changed[field.name] = change(item)
+        elif is_dataclass(item) and not isinstance(item, Task | Grid):
+            changed[field.name] = _with_tensors(item, change)
+    return replace(value, **changed)  # type: ignore[type-var]

@@ -1,74 +1,74 @@
-"""Risk settings: from the distribution of traversability to the one map a planner sees.
+"""Risk measures: from the distribution of traversability to the one map a planner is given.
 
-A setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`, `mean`, `single-class`. Risk
-means the lower tail of λ; a higher level is more cautious. Source: paper II and III-B.
+A measure is a function of a `TraversabilityMixture` with parameters of shape [B, K, H, W] that gives λ̂ in
+[0, 1] of shape [B, H, W]; its further keyword parameters are its options. A setting is written
+`name` or `name:level`: `cvar:0.9`, `var:0.95`, `mean`. Risk means the lower tail of λ; a higher level is
+more cautious. Source: paper II and III-B.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 from torch import Tensor
 
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
 
-NAMES = ("cvar", "var", "mean", "single-class")
+RiskMeasure = Callable[[TraversabilityMixture], Tensor]
 
 
-@dataclass(frozen=True)
-class RiskSetting:
-    """How a distribution becomes a number.
+def mean(mixture: TraversabilityMixture) -> Tensor:
+    """E[λ], which looks at no tail."""
+    return mixture.mean()
+
+
+def var(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+    """Value at risk: λ falls below it with probability 1 − level.
 
     Args:
-        name: `cvar`, `var`, `mean`, or `single-class`, the CVaR of the most likely class alone.
-        level: α in [0, 1); `mean` has none.
+        mixture: distribution a cell.
+        level: α in [0, 1).
     """
+    return mixture.var(level)
 
-    name: str
-    level: float = 0.9
 
-    def __post_init__(self) -> None:
-        """Refuses unknown names and levels."""
-        if self.name not in NAMES:
-            raise ConfigError(f"Expected a risk setting among {', '.join(NAMES)}, got {self.name!r}.")
-        if not 0 <= self.level < 1:
-            raise ConfigError(
-                f"Expected the level of risk setting {self.name!r} in [0, 1), got {self.level}."
-            )
+def cvar(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+    """Conditional value at risk: the mean of λ over its worst share 1 − level.
 
-    @classmethod
-    def parse(cls, text: str) -> "RiskSetting":
-        """Reads `name` or `name:level`.
+    Args:
+        mixture: distribution a cell.
+        level: α in [0, 1).
+    """
+    return mixture.cvar(level)
 
-        Raises:
-            ConfigError: it is neither.
-        """
-        name, colon, level = text.partition(":")
-        if not colon:
-            return cls(name)
-        if name == "mean":
-            raise ConfigError(f"Expected risk setting 'mean' without a level, got {text!r}.")
-        try:
-            return cls(name, float(level))
-        except ValueError as error:
-            if isinstance(error, ConfigError):
-                raise
-            raise ConfigError(f"Expected risk setting `name:level` with a number, got {text!r}.") from error
 
-    def apply(self, mixture: TraversabilityMixture) -> Tensor:
-        """Infers the map λ̂ that a planner is given.
+def single_class(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+    """The CVaR of the most likely class alone.
 
-        Args:
-            mixture: distribution a cell, shape [B, K, H, W].
+    Args:
+        mixture: distribution a cell.
+        level: α in [0, 1).
+    """
+    return mixture.most_likely().cvar(level)
 
-        Returns:
-            λ̂ in [0, 1], shape [B, H, W].
-        """
-        match self.name:
-            case "cvar":
-                return mixture.cvar(self.level)
-            case "var":
-                return mixture.var(self.level)
-            case "mean":
-                return mixture.mean()
-            case _:
-                return mixture.most_likely().cvar(self.level)
+
+def apply(measure: RiskMeasure, mixture: TraversabilityMixture) -> Tensor:
+    """Infers λ̂ and checks it.
+
+    Args:
+        measure: any risk measure.
+        mixture: distribution a cell, parameters of shape [B, K, H, W].
+
+    Returns:
+        λ̂ in [0, 1], shape [B, H, W].
+
+    Raises:
+        ConfigError: the measure gave something else.
+    """
+    risk_map = measure(mixture)
+    shape = mixture.weights.select(-3, 0).shape
+    if not isinstance(risk_map, Tensor) or risk_map.shape != shape or not risk_map.is_floating_point():
+        got = list(risk_map.shape) if isinstance(risk_map, Tensor) else type(risk_map).__name__
+        raise ConfigError(f"Expected a risk measure to give λ̂ of shape {list(shape)}, got {got}.")
+    if not bool(((risk_map >= 0) & (risk_map <= 1)).all()):
+        raise ConfigError("Expected a risk measure to give λ̂ in [0, 1], got values outside or not a number.")
+    return risk_map.to(mixture.weights.dtype)

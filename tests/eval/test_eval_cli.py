@@ -3,12 +3,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
+from benchnav import registry
 from benchnav.eval import cli as eval_cli
+from benchnav.eval.cli import SUITES
+from benchnav.eval.run.folder import open_run
 
 SMALL = (
-    "--planners", "[mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1", "--model", "oracle",
-    "--time_budget_s", "30", "--planner_options", '{"mppi": {"samples": 64}}',
+    "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1",
+    "--model", "oracle", "--time_budget_s", "30", "--planner_options", '{"mppi": {"samples": 64}}',
 )  # fmt: skip
 
 
@@ -33,14 +37,73 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert evaluate(monkeypatch, "report", str(out)) == 0
     assert evaluate(monkeypatch, "replay", str(out), "--view", "false") == 0
     assert ".rrd" in capsys.readouterr().out
-    # The same command again finds all done; another suite in the folder needs leave to drop it.
-    assert evaluate(monkeypatch, "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
-    other = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--seed", "1")
-    assert evaluate(monkeypatch, *other) == 2
+    # The same command again finds all done; with another seed it extends the run.
+    again = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
+    assert evaluate(monkeypatch, *again) == 0
+    assert "2 of 2 units were there already" in capsys.readouterr().err
+    assert evaluate(monkeypatch, *again, "--seed", "1") == 0
+    assert "2 of 4 units were there already" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
-    assert evaluate(monkeypatch, *other, "--overwrite", "true", "--instances", "99") == 2
+    assert evaluate(monkeypatch, *again, "--overwrite", "true", "--instances", "99") == 2
     assert (out / "episodes.parquet").exists()
-    assert evaluate(monkeypatch, *other, "--overwrite", "true") == 0
+    assert evaluate(monkeypatch, *again, "--overwrite") == 0
+    assert "already" not in capsys.readouterr().err
+
+
+def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    out = tmp_path / "run"
+    arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--world", "paper")
+    arguments += (
+        "--world.noise",
+        "stored",
+        "--task.slowest",
+        "0.05",
+        "--task.free_space",
+        "{by: mean, above: 0.1}",
+    )
+    assert evaluate(monkeypatch, *arguments) == 0
+    for trial, _ in open_run(out).trials.values():
+        assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 30.0)
+        assert trial.rules.slowest == 0.05
+        assert (trial.rules.free_space.by, trial.rules.free_space.above) == ("mean", 0.1)
+
+
+def test_a_planner_that_fails_ends_with_status_1(
+    dataset_path: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:  # type: ignore[no-untyped-def]
+    out, faulty = tmp_path / "run", "{part: tests.eval.parts:Faulty, label: bad, options: {fault: raise}}"
+    arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
+    assert evaluate(monkeypatch, *arguments, "--planners", f"[straight,{faulty}]") == 1
+    captured = capsys.readouterr()
+    assert "1 in planner_error" in captured.err
+    assert "errors.txt" in captured.err
+    assert "straight" in captured.out
+
+
+def test_list_names_every_part_with_its_options(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert evaluate(monkeypatch, "list") == 0
+    printed = capsys.readouterr().out
+    for kind in registry.KINDS:
+        for name in registry.names(kind):
+            assert name in printed
+    assert "samples" in printed
+    assert "5000" in printed
+    assert evaluate(monkeypatch, "list", "risk") == 0
+    printed = capsys.readouterr().out
+    assert "cvar" in printed
+    assert "mppi" not in printed
+    assert evaluate(monkeypatch, "list", "rsk") == 2
+
+
+def test_shipped_suites_are_found_by_name_and_have_the_blind_baseline(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    names = [path.stem for path in SUITES.glob("*.yaml")]
+    assert {"demo", "paper"} <= set(names)
+    for name in names:
+        assert evaluate(monkeypatch, "run", "--config", name, "--print_config") == 0
+        printed = yaml.safe_load(capsys.readouterr().out)
+        assert "straight" in printed["planners"]
+    assert evaluate(monkeypatch, "run", "--config", "dmo") == 2
+    assert "Did you mean" in capsys.readouterr().err
 
 
 def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
@@ -60,6 +123,10 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monk
         ("run", "--instances", "some"),
         ("run", "--jobs", "0"),
         ("run", "--planers", "[mppi]"),
+        ("run", "--planners", "[mppi,nowhere.py:Mine]", "--model", "oracle"),
+        ("run", "--world", "mars", "--model", "oracle"),
+        ("run", "--noise", "frozen", "--model", "oracle"),
+        ("run", "--planner_limit_s", "-1", "--model", "oracle"),
         ("run", "--config", "no-such.yaml"),
         ("run", "--out", "/proc/none/run", "--model", "oracle"),
         ("run", "--out", "/dev/null", "--model", "oracle"),

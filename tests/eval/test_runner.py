@@ -1,9 +1,11 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,34 +14,55 @@ import pandas as pd
 import pytest
 import torch
 
+from benchnav import registry
 from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval import playback
-from benchnav.eval.report import write_report
-from benchnav.eval.runner import record_episode, run_suite
-from benchnav.eval.suite import Suite, units
-from benchnav.mixture import TraversabilityMixture
-from benchnav.models import predictor
-from benchnav.planning import planner as planners
-from benchnav.terrain import Observation, Terrain
+from benchnav.eval.recorder import record_episode
+from benchnav.eval.report.playback import read_path
+from benchnav.eval.report.write import write_report
+from benchnav.eval.run import provenance
+from benchnav.eval.run.folder import open_run
+from benchnav.eval.runner import run_suite
+from benchnav.eval.suite import Suite
+from tests import factories
 
 BUDGETS = {"mppi": {"samples": 64, "horizon": 20}, "cl_rrt": {"expansions": 50}}
+PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")
+KEYS = ["scenario", "planner", "risk", "seed", "realisation", "instance"]
+# What a wall clock says is no result.
+TIMING = ["planning_ms"]
 
 
 def suite_on(dataset: Path, **changes: object) -> Suite:
-    made = Suite(data=str(dataset), model="oracle", instances=2, time_budget_s=40.0, planner_options=BUDGETS)
+    made = Suite(
+        data=str(dataset), model="oracle", instances=2, time_budget_s=40.0, planner_options=BUDGETS,
+        risks=("cvar", "mean"), scenarios=("std", "hs"),
+    )  # fmt: skip
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
-def finish(suite: Suite, folder: Path, jobs: int = 1) -> pd.DataFrame:
-    for _ in run_suite(suite, folder, jobs):
+def quick(dataset: Path, **changes: object) -> Suite:
+    """A suite of a planner that needs no time."""
+    given = {"planners": ("tests.eval.parts:Faulty",), "planner_options": {}, "recorded": 0} | changes
+    return suite_on(dataset, **given)
+
+
+def finish(suite: Suite, folder: Path, jobs: int = 1, **options: object) -> pd.DataFrame:
+    for _ in run_suite(suite, folder, jobs, **options):  # type: ignore[arg-type]
         pass
     return pd.read_parquet(folder / "episodes.parquet")
+
+
+def same(first: pd.DataFrame, second: pd.DataFrame) -> None:
+    first, second = (
+        rows.sort_values(KEYS).drop(columns=TIMING).reset_index(drop=True) for rows in (first, second)
+    )
+    pd.testing.assert_frame_equal(first, second)
 
 
 @pytest.fixture(scope="module")
 def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Suite, Path]:
     """A run of every planner under two risk settings on two scenarios."""
-    suite = suite_on(dataset_path, risks=("cvar", "mean"), scenarios=("std", "hs"))
+    suite = suite_on(dataset_path)
     folder = tmp_path_factory.mktemp("run") / "run"
     finish(suite, folder)
     write_report(folder)
@@ -47,48 +70,52 @@ def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tu
 
 
 def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> None:
-    suite, folder = finished
+    _, folder = finished
     episodes = pd.read_parquet(folder / "episodes.parquet")
-    assert len(episodes) == 3 * 2 * 2 * 2
-    assert not episodes.duplicated(["planner", "risk", "scenario", "instance"]).any()
-    assert set(episodes["planner"]) == set(suite.planners)
+    assert len(episodes) == (1 + 3 * 2) * 2 * 2
+    assert not episodes.duplicated(KEYS).any()
+    assert set(episodes["planner"]) == set(PLANNERS)
+    assert set(episodes[episodes["planner"] == "straight"]["risk"]) == {"–"}
     about = json.loads((folder / "run.json").read_text())
-    assert about["versions"]["torch"] == torch.__version__.split("+")[0]
-    assert len(about["dataset"]["splits"]["test/std"]["digest"]) == 64
+    assert (about["format"], about["format_version"]) == ("benchnav-run", 2)
+    assert about["code"]["versions"]["torch"] == torch.__version__.split("+")[0]
+    (data,) = about["datasets"].values()
+    assert [len(digests) for digests in data["maps"].values()] == [2, 2]
+    assert len({digest for digests in data["maps"].values() for digest in digests}) == 4
     figures = ("figures/trajectories.png", "figures/success.png")
-    for name in ("summary.md", "summary.csv", "summary.tex", "timing.csv", *figures):
+    for name in ("summary.md", "summary.csv", "summary.tex", *figures):
         assert (folder / name).stat().st_size > 100
-    assert len(pd.read_csv(folder / "summary.csv")) == 12
+    assert len(pd.read_csv(folder / "summary.csv")) == 14
     assert not list(folder.rglob("*partial*"))
+    assert not list(folder.parent.glob(".*"))
+    # A unit is one file, in the folder of its trial.
+    assert sorted(p.parent.name for p in folder.glob("units/*/*")) == sorted(about["trials"])
 
 
 def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
     recordings = sorted((folder / "playback").glob("*.rrd"))
-    assert len(recordings) == 3
+    assert len(recordings) == len(PLANNERS)
+    paths = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     subprocess.run(
-        ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=_path()
+        ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=paths
     )
     steps = pd.read_parquet(folder / "steps.parquet")
-    for path in recordings:
-        planner, risk, scenario, instance = path.stem.split("+")
-        episode = steps.query(
-            "planner == @planner and risk == @risk and scenario == @scenario and instance == @i",
-            local_dict={"planner": planner, "risk": risk, "scenario": scenario, "i": int(instance)},
-        )
-        times, positions = playback.read_path(path)
+    for planner in PLANNERS:
+        path = record_episode(folder, {"planner": planner}, None, 0, 0)
+        assert path in recordings
+        trial = next(i for i, (t, _) in open_run(folder).trials.items() if t.labels["planner"] == planner)
+        episode = steps[(steps["trial"] == trial) & (steps["instance"] == 0)]
+        times, positions = read_path(path)
         np.testing.assert_allclose(times, episode["time_s"], atol=1e-6)
         np.testing.assert_array_equal(positions[:, :2], episode[["x_m", "y_m"]].to_numpy())
 
 
-def _path() -> dict[str, str]:
-    return {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
-
-
 def test_rows_do_not_depend_on_workers(finished: tuple[Suite, Path], tmp_path: Path) -> None:
     suite, folder = finished
-    again = finish(suite, tmp_path / "two", jobs=2)
-    pd.testing.assert_frame_equal(again, pd.read_parquet(folder / "episodes.parquet"))
+    same(finish(suite, tmp_path / "two", jobs=2), pd.read_parquet(folder / "episodes.parquet"))
+    steps = [pd.read_parquet(place / "steps.parquet") for place in (folder, tmp_path / "two")]
+    pd.testing.assert_frame_equal(*steps)
 
 
 def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp_path: Path) -> None:
@@ -100,143 +127,229 @@ def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp
         f"for _ in run_suite({suite!r}, Path({str(folder)!r})): pass"
     )
     process = subprocess.Popen([sys.executable, "-c", code])
-    while len(list(folder.glob("units/*.json"))) < 2:
+    while len(list(folder.glob("units/*/*.parquet"))) < 2:
         time.sleep(0.02)
         assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert not (folder / "episodes.parquet").exists()
-    kept = {path: path.stat().st_mtime_ns for path in folder.glob("units/*.json")}
-    rows = finish(suite, folder)
-    pd.testing.assert_frame_equal(rows, pd.read_parquet(whole / "episodes.parquet"))
+    kept = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/[!.]*.parquet")}
+    said: list[str] = []
+    same(finish(suite, folder, say=said.append), pd.read_parquet(whole / "episodes.parquet"))
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert said == [f"{len(kept)} of 14 units were there already"]
 
 
-def test_another_suite_does_not_mix_into_a_run(finished: tuple[Suite, Path]) -> None:
-    suite, folder = finished
-    with pytest.raises(ConfigError, match="another suite"):
-        finish(replace(suite, seed=1), folder)
+def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_path: Path) -> None:
+    suite, said = quick(dataset_path), []
+    first = finish(suite, tmp_path / "run")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").glob("units/*/*")}
+    again = finish(suite, tmp_path / "run", say=said.append)
+    pd.testing.assert_frame_equal(first, again)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert said == ["4 of 4 units were there already"]
 
 
-def test_two_runs_in_one_folder_refuse_each_other(dataset_path: Path, tmp_path: Path) -> None:
-    suite = suite_on(dataset_path, planners=("astar_dwa",), risks=("mean",), scenarios=("std",), recorded=0)
+@pytest.mark.parametrize(
+    ("change", "trials", "rows", "kept"),
+    [
+        ({"risks": ("cvar", "mean", "var")}, 6, 12, 4),
+        ({"risks": ("var",)}, 6, 12, 4),
+        ({"planners": ("tests.eval.parts:Faulty", "straight")}, 6, 12, 4),
+        ({"models": ("oracle", "tests.eval.parts:Gaussian")}, 8, 16, 4),
+        ({"seeds": (0, 5)}, 4, 16, 4),
+        ({"seed": 5}, 4, 16, 4),
+        ({"realisations": 3}, 4, 24, 4),
+        ({"scenarios": ("hg",)}, 6, 12, 4),
+        ({"noise": "stored"}, 8, 16, 4),
+    ],
+)
+def test_a_run_is_extended_by_what_is_missing(
+    change: dict[str, object], trials: int, rows: int, kept: int, dataset_path: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    finish(quick(dataset_path), folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
+    run_id = open_run(folder).about["run_id"]
+    extended = finish(quick(dataset_path, **change), folder)
+    assert (extended["trial"].nunique(), len(extended)) == (trials, rows)
+    assert sum(path.stat().st_mtime_ns == when for path, when in before.items()) == kept == len(before)
+    assert open_run(folder).about["run_id"] == run_id
+    # What was there and what came make the rows of a run that had all at once.
+    fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
+    fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
+    if "scenarios" not in change and "noise" not in change:
+        same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
+
+
+def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
+    dataset = factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=23))
+    folder, suite = tmp_path / "run", quick(dataset, scenarios=("std",), risks=("mean",))
+    sizes = []
+    for instances in (20, 22, 0, 4):
+        rows = finish(replace(suite, instances=instances), folder)
+        sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
+    assert sizes == [(20, 1), (22, 2), (23, 2), (23, 2)]
+    same(rows, finish(replace(suite, instances=0), tmp_path / "fresh"))
+
+
+def test_a_run_of_other_code_or_data_is_refused_and_what_changed_is_named(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, mine, folder = tmp_path / "tiny.h5", tmp_path / "mine.py", tmp_path / "run"
+    shutil.copy(dataset_path, data)
+    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    suite = quick(data, planners=(f"{mine}:Mine",), scenarios=("std",))
+    rows = finish(suite, folder)
+    code = provenance.describe_code()
+    changes = {
+        "benchnav's own sources": {**code, "sources": "0" * 64},
+        "torch": {**code, "versions": {**code["versions"], "torch": "9.9"}},
+        "processor": {**code, "processor": "ABACUS"},
+    }
+    for name, changed in changes.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(provenance, "describe_code", lambda changed=changed: changed)
+            with pytest.raises(ConfigError, match=name):
+                finish(suite, folder)
+    mine.write_text(mine.read_text() + "# another\n")
+    with pytest.raises(ConfigError, match=r"mine\.py"):
+        finish(suite, folder)
+    mine.write_text(mine.read_text().removesuffix("# another\n"))
+    factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    os.replace(tmp_path / "other.h5", data)
+    with pytest.raises(ConfigError, match=r"maps of .* test/std"):
+        finish(suite, folder)
+    pd.testing.assert_frame_equal(pd.read_parquet(folder / "episodes.parquet"), rows)
+    assert len(finish(suite, folder, overwrite=True)) == len(rows)
+
+
+def test_a_changed_checkpoint_is_named(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = quick(dataset_path, scenarios=("std",))
+    finish(suite, tmp_path / "run")
+    monkeypatch.setattr(provenance, "model_identity", lambda source: {"name": source, "files": {"a": "b"}})
+    with pytest.raises(ConfigError, match="model oracle"):
+        finish(suite, tmp_path / "run")
+
+
+def test_two_runs_in_one_folder_refuse_each_other_also_with_overwrite(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    suite = quick(dataset_path)
     first = run_suite(suite, tmp_path / "run")
     next(first)
-    with pytest.raises(BenchnavError, match="Another run"):
-        finish(suite, tmp_path / "run")
-    first.close()
+    for options in ({}, {"overwrite": True}):
+        with pytest.raises(BenchnavError, match="Another run"):
+            finish(suite, tmp_path / "run", **options)
+    for _ in first:
+        pass
+    assert len(pd.read_parquet(tmp_path / "run" / "episodes.parquet")) == 8
+
+
+def test_overwrite_drops_run_folders_alone(dataset_path: Path, tmp_path: Path) -> None:
+    precious = tmp_path / "run" / "thesis.tex"
+    precious.parent.mkdir()
+    precious.write_text("years")
+    with pytest.raises(ConfigError):
+        finish(quick(dataset_path), tmp_path / "run", overwrite=True)
+    with pytest.raises(ConfigError, match="something else"):
+        finish(quick(dataset_path), tmp_path / "run")
+    assert precious.read_text() == "years"
+
+
+def test_a_run_of_the_first_format_is_not_gone_on_with(dataset_path: Path, tmp_path: Path) -> None:
+    shutil.copytree(Path(__file__).parents[1] / "data" / "run-1", tmp_path / "run")
+    with pytest.raises(ConfigError, match="version 1"):
+        finish(quick(dataset_path), tmp_path / "run")
 
 
 def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:
-    suite, folder = finished
-    path = record_episode(suite, folder, "astar_dwa", "mean", "hs", 1)
-    _, positions = playback.read_path(path)
-    steps = pd.read_parquet(folder / "steps.parquet").query(
-        "planner == 'astar_dwa' and risk == 'mean' and scenario == 'hs' and instance == 1"
-    )
+    _, folder = finished
+    asked = {"planner": "astar_dwa", "risk": "mean", "scenario": "hs"}
+    path = record_episode(folder, asked, None, 0, 1)
+    _, positions = read_path(path)
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    rows = rows[(rows["planner"] == "astar_dwa") & (rows["risk"] == "mean") & (rows["scenario"] == "hs")]
+    steps = pd.read_parquet(folder / "steps.parquet")
+    steps = steps[(steps["trial"] == rows["trial"].iloc[0]) & (steps["instance"] == 1)]
     np.testing.assert_array_equal(positions[:, :2], steps[["x_m", "y_m"]].to_numpy())
-    with pytest.raises(ConfigError, match="instance 9"):
-        record_episode(suite, folder, "mppi", "mean", "hs", 9)
+    for labels, seed, instance in (({"planner": "mppi"}, None, 9), ({"planner": "no"}, None, 0), ({}, 7, 0)):
+        with pytest.raises(ConfigError, match="Expected an episode"):
+            record_episode(folder, labels, seed, 0, instance)
 
 
-def test_every_setting_meets_the_same_luck(dataset_path: Path, tmp_path: Path) -> None:
-    suite = suite_on(
-        dataset_path, planners=("astar_dwa", "mppi"), risks=("mean",), scenarios=("std",), recorded=0
-    )
-    finish(suite, tmp_path / "run")
-    steps = pd.read_parquet(tmp_path / "run" / "steps.parquet").query("step == 0 and instance == 1")
-    # At the start both stand on the same cell: the λ they meet must be the same draw.
-    assert steps["traversability"].nunique() == 1
+def test_what_the_caller_set_is_left_alone(dataset_path: Path, tmp_path: Path) -> None:
+    threads, filters = torch.get_num_threads(), list(warnings.filters)
+    torch.set_num_threads(2)
+    try:
+        steps = run_suite(quick(dataset_path), tmp_path / "run")
+        for _ in steps:
+            assert torch.get_num_threads() == 2
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert list(warnings.filters) == filters
 
 
-def test_models_see_observations_and_planners_the_prediction(
-    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[object] = []
-
-    class Spy:
-        def predict(self, observation: Observation) -> TraversabilityMixture:
-            seen.append(observation)
-            shape = (len(observation.rgb), 1, *observation.grid.shape)
-            return TraversabilityMixture(torch.ones(shape), torch.full(shape, 0.77), torch.full(shape, 0.01))
-
-    problems: list[object] = []
-    original = planners.make_planner("astar_dwa")
-
-    class Watched:
-        def init(self, problem, generator):  # type: ignore[no-untyped-def]
-            problems.append(problem)
-            return original.init(problem, generator)
-
-        def plan(self, state, plan_state):  # type: ignore[no-untyped-def]
-            return original.plan(state, plan_state)
-
-    monkeypatch.setattr(predictor, "_REGISTERED", {})
-    monkeypatch.setattr(planners, "_FACTORIES", {})
-    predictor.register_model("spy", lambda *_, **__: Spy())
-    planners.register("watched", lambda options: Watched())
-    suite = suite_on(
-        dataset_path,
-        model="spy",
-        planners=("watched",),
-        risks=("mean",),
-        scenarios=("std",),
-        planner_options={},
-    )
-    finish(suite, tmp_path / "run")
-    assert seen
-    assert all(type(item) is Observation for item in seen)
-    for problem in problems:
-        torch.testing.assert_close(problem.traversability, torch.full_like(problem.traversability, 0.77))
-        assert not any(isinstance(value, Terrain) for value in vars(problem).values())
-
-
-def test_suites_are_checked_before_anything_runs(dataset_path: Path, tmp_path: Path) -> None:
+def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path, tmp_path: Path) -> None:
+    finish(quick(dataset_path, scenarios=("std",), risks=("mean",)), tmp_path / "run")
+    kept = sorted((tmp_path / "run").rglob("*"))
     for change, expected in (
         ({"scenarios": ("fog",)}, "fog"),
         ({"risks": ("cvr",)}, "cvr"),
         ({"planners": ("mpi",), "planner_options": {}}, "mpi"),
-        ({"planner_options": {"mppi": {"sample": 1}}}, "samples"),
+        ({"planner_options": {"mppi": {"sample": 1}}, "planners": ("mppi",)}, "samples"),
         ({"model": "no-such-model"}, "no-such-model"),
         ({"data": "no-such-data"}, "no-such-data"),
         ({"noise": "loud"}, "loud"),
-        ({"instances": 9}, "instances"),
-        ({"risks": ("cvar", "cvar:0.9")}, "risks"),
+        ({"noise": "frozen"}, "stored"),
+        ({"instances": 9}, "0 takes all"),
         ({"time_budget_s": 0.01}, "time_budget_s"),
+        ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
+        ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
+        ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
     ):
-        with pytest.raises(BenchnavError, match=expected):
-            finish(suite_on(dataset_path, **change), tmp_path / "run")
-        assert not (tmp_path / "run").exists()
+        for place in (tmp_path / "run", tmp_path / "new"):
+            with pytest.raises(BenchnavError, match=expected):
+                finish(quick(dataset_path, **change), place, overwrite=True)
+        assert not (tmp_path / "new").exists()
+    assert sorted((tmp_path / "run").rglob("*")) == kept
 
 
-def test_units_cover_every_episode_once_in_blocks_of_twenty() -> None:
-    suite = Suite(instances=0, planners=("mppi",), risks=("mean",))
-    made = list(units(suite, {"std": 45, "hg": 3, "hs": 20}))
-    assert [len(unit.instances) for unit in made] == [20, 20, 5, 3, 20]
-    assert len({unit.name for unit in made}) == len(made)
-    assert sum(unit.recorded for unit in made) == 1
-
-
-def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(
+def test_parts_of_this_process_alone_are_refused_for_workers(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Hopeless:
-        def init(self, problem, generator):  # type: ignore[no-untyped-def]
-            return None
+    from tests.eval.parts import Faulty
 
-        def plan(self, state, plan_state):  # type: ignore[no-untyped-def]
-            failed = torch.full((len(state),), int(planners.PlanStatus.FAILED))
-            return torch.zeros(len(state), 2), None, planners.Plan.empty(len(state), status=failed)
+    registry.register("planner", "mine", Faulty)
+    suite = quick(dataset_path, planners=("mine",))
+    assert len(finish(suite, tmp_path / "run")) == 8
+    with pytest.raises(ConfigError, match="jobs"):
+        finish(suite, tmp_path / "two", jobs=2)
 
-    monkeypatch.setattr(planners, "_FACTORIES", {"hopeless": lambda options: Hopeless()})
-    suite = suite_on(
-        dataset_path, planners=("hopeless",), risks=("mean",), scenarios=("std",), planner_options={}
-    )
+
+def test_what_a_user_should_know_is_said(dataset_path: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    suite = quick(dataset_path, task={"free_space": {"above": 0.1}}, model="paper-v1", scenarios=("std",))
+    other = replace(factories.tiny_recipe(), classes=factories.tiny_recipe().classes[:4], environments=1)
+    data = factories.tiny_dataset(tmp_path / "four.h5", other)
+    finish(replace(suite, data=str(data)), tmp_path / "run", say=said.append)
+    assert any("λ_stuck = 0.3" in line and "above 0.1" in line for line in said)
+    assert any("class" in line and "paper-v1" in line for line in said)
+
+
+def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: Path, tmp_path: Path) -> None:
+    hopeless = {
+        "part": "tests.eval.parts:Faulty", "label": "hopeless", "options": {"fault": "give up", "after_s": 0.0},
+    }  # fmt: skip
+    suite = quick(dataset_path, planners=(hopeless,), scenarios=("std",), risks=("mean",), recorded=1)
     episodes = finish(suite, tmp_path / "run")
     assert episodes["outcome"].tolist() == ["planner_failure"] * 2
     assert episodes["end_time_s"].tolist() == [0, 0]
     assert episodes["total_time_s"].tolist() == [40, 40]
     write_report(tmp_path / "run")
     (recording,) = (tmp_path / "run" / "playback").glob("*.rrd")
-    _, positions = playback.read_path(recording)
-    assert len(positions) == 1
+    _, positions = read_path(recording)
+    assert len(positions) <= 2

@@ -1,7 +1,6 @@
 import random
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import load_checkpoint, member_name
 from benchnav.models.config import MDNConfig
 from benchnav.models.contract import check_model
 from benchnav.models.mdn import MixtureDensityModel, MixtureDensityNetwork
-from benchnav.models.predictor import GROUP, ModelFamily, load_model, model_names, open_checkpoint
+from benchnav.models.predictor import ModelFamily, load_model, open_checkpoint
 from benchnav.terrain import Observation
 
 NAMES = ("soft", "firm")
@@ -233,16 +233,16 @@ def test_a_good_model_keeps_the_contract_and_is_tried_on_maps_of_many_colours_an
 
 
 def is_family(name: str) -> bool:
-    return any(isinstance(point.load(), ModelFamily) for point in entry_points(group=GROUP, name=name))
+    return isinstance(registry.find("model", name).target, ModelFamily)
 
 
-@pytest.mark.parametrize("name", [name for name in model_names() if not is_family(name)])
+@pytest.mark.parametrize("name", [name for name in registry.names("model") if not is_family(name)])
 def test_every_registered_model_keeps_the_contract(name: str) -> None:
     check_model(load_model(name))
 
 
 def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_has() -> None:
-    own = {point.name for point in entry_points(group=GROUP) if point.dist and point.dist.name == "benchnav"}
+    own = {name for name in registry.names("model") if registry.find("model", name).shipped}
     assert {name for name in own if is_family(name)} == {"fused", "mdn"}
 
 

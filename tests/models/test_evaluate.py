@@ -6,20 +6,20 @@ from pathlib import Path
 
 import pytest
 
+from benchnav import registry
 from benchnav.datagen.store import TerrainDataset
-from benchnav.models import predictor
 from benchnav.models.baseline import nearest_colour_accuracy
 from benchnav.models.calibration import evaluate
 from benchnav.models.cli import main
-from benchnav.models.predictor import Oracle, register_model
+from benchnav.models.predictor import Oracle
 
 from .stub import ColourModel
 
 
 @pytest.fixture(autouse=True)
 def _colour_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predictor, "_REGISTERED", {})
-    register_model("colours", ColourModel)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("model", "colours", ColourModel)
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -149,7 +149,7 @@ def test_bad_input_is_refused_in_one_line_before_any_work(
     def never(*arguments: object) -> None:
         raise AssertionError("measured what was to be refused")
 
-    register_model("other", Other)
+    registry.register("model", "other", Other)
     monkeypatch.setattr(Oracle, "predict_terrain", never)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()

@@ -1,3 +1,5 @@
+import hashlib
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -7,12 +9,21 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from benchnav import registry
+from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models import fused, predictor
+from benchnav.models import fused
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.fused import FusedModel
-from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict, register_model
+from benchnav.models.predictor import (
+    Oracle,
+    class_mismatch,
+    load_model,
+    model_identity,
+    open_checkpoint,
+    predict,
+)
 from benchnav.terrain import Observation, Terrain
 
 from .support import NAMES, linear_table, make_terrain
@@ -116,15 +127,135 @@ def test_a_prediction_that_does_not_fit_the_maps_is_refused() -> None:
         predict(Small(), make_terrain())
 
 
+MINE = """
+import torch
+from benchnav.mixture import TraversabilityMixture
+
+
+class Constant:
+    def __init__(self, mean: float = 0.5, std: float = 0.1) -> None:
+        self.mean, self.std = mean, std
+
+    def predict(self, observation):
+        ones = torch.ones_like(observation.slope_deg).unsqueeze(1)
+        return TraversabilityMixture(ones, self.mean * ones, self.std * ones)
+
+
+class Family:
+    @classmethod
+    def from_checkpoint(cls, checkpoint):
+        raise RuntimeError("ran what a checkpoint names")
+
+
+class Nothing:
+    pass
+"""
+
+
+@pytest.fixture
+def _own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path("mine_of_tests.py").write_text(MINE)
+
+
 def test_a_registered_model_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predictor, "_REGISTERED", {})
-    register_model("mine", Spy)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("model", "mine", Spy)
     assert isinstance(load_model("mine"), Spy)
 
 
-def test_an_unknown_name_gets_a_hint() -> None:
-    with pytest.raises(ConfigError, match="Did you mean 'oracle'"):
-        load_model("oracel")
+@pytest.mark.usefixtures("_own_file")
+@pytest.mark.parametrize("place", ["./mine_of_tests.py", "mine_of_tests"])
+def test_a_model_is_found_by_file_or_module_with_its_options(place: str) -> None:
+    terrain = make_terrain()
+    for source, mean, std in (
+        (f"{place}:Constant", 0.5, 0.1),
+        (f"{place}:Constant:0.25", 0.25, 0.1),
+        ({"part": f"{place}:Constant", "options": {"std": 0.75}}, 0.5, 0.75),
+        (registry.read_part("model", f"{place}:Constant:0.25"), 0.25, 0.1),
+    ):
+        mixture = predict(load_model(source), terrain)
+        assert torch.equal(mixture.means, torch.full((2, 1, 16, 16), mean))
+        assert torch.equal(mixture.stds, torch.full((2, 1, 16, 16), std))
+
+
+@pytest.mark.usefixtures("_own_file")
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("oracel", "Did you mean 'oracle'?"),
+        ("./mine_of_tests.py:Constnat", "Did you mean 'Constant'?"),
+        ("./mine_of_tests.py:Constant:much", "as float such as 0.5, got 'much'"),
+        ("./mine_of_tests.py:Family", "which is a family of models"),
+        ("./mine_of_tests.py:Nothing", "to have `predict(observation)`, got Nothing without it"),
+        ("./mine_of_tests.py", "Say which class or function of it"),
+        ("oracle:3", "it has no options"),
+        ("checkpoints/papr-v1", "Did you mean 'paper-v1'?"),
+        ("papr-v1", "Did you mean 'paper-v1'?"),
+        ("checkpoints/minn", "Did you mean 'checkpoints/mine'?"),
+        ("./elsewhere/thiers", "Did you mean 'elsewhere/theirs'?"),
+        ("nothing/like/it", "Expected a model among"),
+    ],
+)
+def test_what_is_no_model_gets_a_hint(source: str, expected: str, checkpoint_path: Path) -> None:
+    for folder in ("checkpoints/mine", "elsewhere/theirs"):
+        Path(folder).parent.mkdir()
+        Path(folder).symlink_to(checkpoint_path)
+    with pytest.raises(ConfigError) as caught:
+        load_model(source)
+    assert expected in str(caught.value)
+
+
+@pytest.mark.usefixtures("_own_file")
+def test_a_checkpoint_runs_no_code_that_it_names(checkpoint_path: Path) -> None:
+    for name in ("./mine_of_tests.py:Family", "mine_of_tests:Family", "oracle"):
+        with pytest.raises(CheckpointError, match="Install the package"):
+            open_checkpoint(replace(load_checkpoint(checkpoint_path), model=name))
+    assert not [name for name in sys.modules if "mine_of_tests" in name]
+
+
+def test_a_checkpoint_has_no_options(checkpoint_path: Path) -> None:
+    given = {"part": str(checkpoint_path), "label": "ours"}
+    assert isinstance(load_model(given), FusedModel)
+    with pytest.raises(ConfigError, match="no options"):
+        load_model({**given, "options": {"level": 1}})
+
+
+@pytest.mark.usefixtures("_own_file")
+def test_the_identity_of_a_model_changes_with_its_files(checkpoint_path: Path) -> None:
+    copy = Path(shutil.copytree(checkpoint_path, "copy"))
+    before = model_identity("copy")
+    assert before["name"] == "copy"
+    assert set(before["files"]) == {"config.json", "classifier.safetensors", "gp.safetensors"}
+    assert before["files"]["config.json"] == hashlib.sha256((copy / "config.json").read_bytes()).hexdigest()
+    assert model_identity({"part": "copy", "label": "ours"}) == before
+    with open(copy / "gp.safetensors", "ab") as file:
+        file.write(b" ")
+    after = model_identity("copy")
+    assert {name for name in before["files"] if before["files"][name] != after["files"][name]} == {
+        "gp.safetensors"
+    }
+
+    own = model_identity("./mine_of_tests.py:Constant:0.25")
+    assert (own["name"], own["origin"]) == ("./mine_of_tests.py:Constant", "file mine_of_tests.py")
+    assert model_identity("./mine_of_tests.py:Constant") == own
+    Path("mine_of_tests.py").write_text(MINE + "# changed")
+    assert model_identity("./mine_of_tests.py:Constant")["digest"] != own["digest"]
+    assert model_identity("oracle")["shipped"]
+
+
+def test_another_class_table_is_told_in_one_line(checkpoint_path: Path, dataset: TerrainDataset) -> None:
+    model = load_model(checkpoint_path)
+    assert class_mismatch(model, dataset) == class_mismatch(model, dataset.recipe) == ""
+    assert class_mismatch(Spy(), dataset) == class_mismatch(Oracle(), dataset) == ""
+    classes = dataset.recipe.classes
+    other = replace(dataset.recipe, classes=(replace(classes[0], name="lava"), *classes[1:]))
+    for asked in (model, load_checkpoint(checkpoint_path)):
+        line = class_mismatch(asked, other, "model 'mine'")
+        assert line.startswith("model 'mine' was trained on another class table than that of tiny-v1")
+        assert "lava" in line
+        assert "\n" not in line
 
 
 def test_a_checkpoint_is_found_by_path_and_by_name(

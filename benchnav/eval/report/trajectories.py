@@ -1,0 +1,150 @@
+"""The figure of trajectories, after the paper's Fig. 2."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from benchnav.eval.report.drawn_plan import STYLES, LayerStyle
+from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, display_name
+from benchnav.eval.report.snapshot import Snapshot
+from benchnav.eval.report.tables import NOT_USED
+
+MOST_PANELS = 8
+_PANELS_A_LINE = 4
+_LINE_WIDTH = 0.6
+_CLOSED = "0.25"
+_MAP = ("data", "scenario", "instance", "seed", "realisation")
+
+
+def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapshot]:
+    """Chooses one snapshot a trial, all of one map where there are such, at most `MOST_PANELS`.
+
+    Args:
+        snapshots: all there are.
+        trials: ids in the order wanted.
+    """
+    order = {trial: place for place, trial in enumerate(trials)}
+    known = [snapshot for snapshot in snapshots if snapshot.about["trial"] in order]
+    known.sort(key=lambda s: (order[s.about["trial"]], int(s.about["instance"])))
+    shown = [known[0].about[name] for name in _MAP] if known else []
+    known.sort(key=lambda s: [s.about[name] for name in _MAP] != shown)
+    first: dict[str, Snapshot] = {}
+    for snapshot in known:
+        first.setdefault(snapshot.about["trial"], snapshot)
+    return sorted(first.values(), key=lambda s: order[s.about["trial"]])[:MOST_PANELS]
+
+
+def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
+    """Draws snapshots side by side: the terrain above with what was planned, the map planned on below.
+
+    Args:
+        snapshots: at least one.
+    """
+    across = min(len(snapshots), _PANELS_A_LINE)
+    down = 2 * -(-len(snapshots) // across)
+    tallest = max(float(snapshot.extent_m[1] / snapshot.extent_m[0]) for snapshot in snapshots)
+    size = (3.5 * across + 1.0, (3.2 * min(max(tallest, 0.3), 3.0) + 0.7) * down + 0.7)
+    figure = Figure(figsize=size, layout="compressed")
+    panels = figure.subplots(down, across, squeeze=False)
+    for panel in panels.flat:
+        panel.set_visible(False)
+    for place, snapshot in enumerate(snapshots):
+        above, below = panels[2 * (place // across) : 2 * (place // across) + 2, place % across]
+        _draw_terrain(above, snapshot)
+        _draw_predicted(below, snapshot)
+        for panel in (above, below):
+            lines = _draw_episode(panel, snapshot)
+        above.set_title(_title(snapshot), fontsize=9)
+    figure.legend(
+        handles=_legend(snapshots), loc="outside lower center", ncols=4 if across > 1 else 2, frameon=False
+    )
+    figure.colorbar(lines, ax=panels, fraction=0.03, aspect=40, label="traversability λ")
+    return figure
+
+
+def _title(snapshot: Snapshot) -> str:
+    about = snapshot.about
+    names = [display_name(about["planner"]), about["risk"], f"{about['scenario']} {about['instance']}"]
+    heading = ", ".join(name for name in names if name != NOT_USED)
+    return f"{heading}\nt = {snapshot.time_s:g} s; outcome: {about['outcome'].replace('_', ' ')}"
+
+
+def _draw_terrain(panel: Axes, snapshot: Snapshot) -> None:
+    panel.imshow(np.moveaxis(snapshot.rgb, 0, -1), origin="lower", extent=_extent(snapshot))
+
+
+def _draw_predicted(panel: Axes, snapshot: Snapshot) -> None:
+    extent = _extent(snapshot)
+    panel.imshow(
+        snapshot.predicted, origin="lower", extent=extent, cmap=TRAVERSABILITY_COLOURS, vmin=0, vmax=1
+    )
+    closed = np.where(snapshot.free, np.nan, 1.0)
+    panel.imshow(closed, origin="lower", extent=extent, cmap=ListedColormap([_CLOSED]))
+
+
+def _extent(snapshot: Snapshot) -> tuple[float, float, float, float]:
+    return 0, float(snapshot.extent_m[0]), 0, float(snapshot.extent_m[1])
+
+
+def _draw_episode(panel: Axes, snapshot: Snapshot) -> LineCollection:
+    panel.set_visible(True)
+    for name, style in STYLES.items():
+        panel.add_collection(LineCollection(list(snapshot.plan.lines.get(name, ())), **_looks(style)))
+    driven = snapshot.track[: snapshot.now + 1]
+    segments = np.stack((driven[:-1], driven[1:]), axis=1)
+    lines = LineCollection(list(segments), cmap=TRAVERSABILITY_COLOURS, linewidths=3, capstyle="round")
+    lines.set_array(snapshot.traversability[: snapshot.now])
+    lines.set_clim(0, 1)
+    # Edged, since below the map has the same colours.
+    panel.plot(*driven.T, color="white", lw=4.6, solid_capstyle="round")
+    panel.add_collection(lines)
+    lines.set_zorder(2.5)
+    for marker, colour, size, place in _marks(snapshot):
+        panel.plot(*place, marker, color=colour, mec="white", ms=size, zorder=3)
+    panel.set(xlim=(0, snapshot.extent_m[0]), ylim=(0, snapshot.extent_m[1]), aspect="equal")
+    panel.tick_params(labelsize=8)
+    panel.set_xlabel("x [m]", fontsize=8)
+    panel.set_ylabel("y [m]", fontsize=8)
+    return lines
+
+
+def _marks(snapshot: Snapshot) -> list[tuple[str, str, float, np.ndarray]]:
+    places = (snapshot.track[0], snapshot.goal_m, snapshot.track[snapshot.now])
+    return [(*look, place) for look, place in zip(_MARKS.values(), places, strict=True)]
+
+
+_MARKS = {"start": ("o", "red", 8.0), "goal": ("X", "magenta", 10.0), "robot": ("o", "black", 7.0)}
+
+
+def _looks(style: LayerStyle) -> dict[str, Any]:
+    red, green, blue, alpha = (value / 255 for value in style.colour)
+    return {
+        "colors": (red, green, blue, alpha),
+        "linewidths": _LINE_WIDTH * style.width,
+        "linestyles": "dashed" if style.dashed else "solid",
+    }
+
+
+def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
+    drawn = {name for snapshot in snapshots for name, lines in snapshot.plan.lines.items() if len(lines)}
+    marks: list[Artist] = [
+        Line2D([], [], marker=marker, color=colour, mec="white", ms=size, ls="none", label=name)
+        for name, (marker, colour, size) in _MARKS.items()
+    ]
+    lines: list[Artist] = [
+        Line2D(
+            [], [], color=_looks(style)["colors"], lw=max(_LINE_WIDTH * style.width, 1), label=style.label,
+            ls="--" if style.dashed else "-",
+        )
+        for name, style in STYLES.items()
+        if name in drawn
+    ]  # fmt: skip
+    return [*marks, Patch(color=_CLOSED, label="not free"), *lines]

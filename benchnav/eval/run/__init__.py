@@ -1,0 +1,1 @@
+"""Running trials: episodes, units of work, run folders and their provenance."""

@@ -1,0 +1,140 @@
+"""What is refused, and what a user is told, before anything of a suite is run or dropped."""
+
+from collections.abc import Callable
+from typing import Any
+
+from benchnav import registry
+from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.errors import ConfigError
+from benchnav.eval.run.unit import Extent
+from benchnav.eval.suite import Suite
+from benchnav.eval.trial import PART_KINDS, Trial, trials_of
+from benchnav.models.predictor import class_mismatch
+from benchnav.planning.planners.planner import check_steers
+
+Say = Callable[[str], None]
+
+
+def check_suite(
+    suite: Suite, jobs: int, say: Say
+) -> tuple[dict[str, tuple[Trial, Extent]], dict[str, TerrainDataset]]:
+    """Makes the trials of a suite and refuses what cannot be run.
+
+    Args:
+        suite: what is evaluated.
+        jobs: worker processes.
+        say: is told what is worth knowing, a line at a time.
+
+    Returns:
+        The trials by id, with how often each is to be run; the datasets by path or id.
+
+    Raises:
+        ConfigError: a part, scenario, instance or combination cannot be had.
+        DatasetError: there is no such dataset.
+    """
+    datasets: dict[str, TerrainDataset] = {}
+
+    def scenarios_of(data: str) -> list[str]:
+        if data not in datasets:
+            datasets[data] = TerrainDataset(find_dataset(data))
+        return [name.removeprefix("test/") for name in datasets[data].splits if name.startswith("test/")]
+
+    trials = trials_of(suite, scenarios_of)
+    for trial in trials:
+        _check_split(trial, scenarios_of(trial.data), datasets[trial.data], suite.instances)
+    for trial in _distinct(trials, ("planner", "robot", "objective")):
+        check_steers(trial.make_planner(), trial.make_task().robot, trial.planner.label)
+        _check_first_plan(trial)
+    for trial in trials:
+        trial.world.steps(trial.make_task().robot.dt_s)
+        trial.make_risk()
+    if jobs > 1:
+        _check_everywhere(trials)
+    for trial in _distinct(trials, ("model",)):
+        model = trial.make_model()
+        for data in {other.data for other in trials if other.model == trial.model and not other.blind}:
+            _tell(say, class_mismatch(model, datasets[data]))
+    for line in dict.fromkeys(line for trial in trials for line in _doubts(trial, datasets[trial.data])):
+        say(line)
+    wanted = {}
+    for trial in trials:
+        there = datasets[trial.data].map_count(trial.split)
+        extent = Extent(
+            seeds=suite.all_seeds, realisations=suite.realisations, instances=suite.instances or there
+        )
+        wanted[trial.id] = (trial, extent)
+    return wanted, datasets
+
+
+def _check_split(trial: Trial, known: list[str], dataset: TerrainDataset, instances: int) -> None:
+    if trial.scenario not in known:
+        raise ConfigError(
+            f"Expected `scenarios` among {known} of {dataset.path}, got {trial.scenario!r}."
+            f"{registry.hint(trial.scenario, known)}"
+        )
+    there = dataset.map_count(trial.split)
+    if instances > there:
+        raise ConfigError(
+            f"Expected `instances` at most {there}, the maps of {trial.split} in {dataset.path}, "
+            f"got {instances}. 0 takes all."
+        )
+
+
+def _check_first_plan(trial: Trial) -> None:
+    """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
+    if not registry.find("planner", trial.planner.part).shipped:
+        return
+    import torch
+
+    from benchnav.mixture import TraversabilityMixture
+    from benchnav.planning.problem import pose_problem
+    from benchnav.terrain import Grid, Observation
+
+    ground = torch.full((1, 4, 4), 0.9)
+    seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, Grid(4, 4, 1.0))
+    ones = torch.ones_like(ground).unsqueeze(1)
+    mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
+    places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
+    problem = pose_problem(trial.make_task(), seen, mixture, ground, *places, 1.0)
+    trial.make_planner().init(problem, torch.Generator())
+
+
+def _check_everywhere(trials: list[Trial]) -> None:
+    for trial in trials:
+        for kind in PART_KINDS:
+            source = getattr(trial, kind).part
+            known = kind != "model" or source in registry.names("model") or ":" in source
+            if known and not registry.find(kind, source).everywhere:
+                raise ConfigError(
+                    f"Expected {kind} {source!r} to be found by other processes, since `jobs` > 1, but it is "
+                    "registered in this one alone. Name it as path/to/file.py:Name."
+                )
+
+
+def _doubts(trial: Trial, dataset: TerrainDataset) -> list[str]:
+    lines = []
+    threshold = dataset.recipe.stuck_threshold
+    if trial.rules.free_space.above != threshold:
+        lines.append(
+            f"the maps of {dataset.id} were made solvable at λ_stuck = {threshold:g}, "
+            f"and ground is free above {trial.rules.free_space.above:g} here"
+        )
+    split = dataset.recipe.splits.get(trial.split)
+    if split is not None and not split.solvable:
+        lines.append(
+            f"the maps of {dataset.id} {trial.split} were not asked to have a free way to the goal; "
+            "a failure may be the map's"
+        )
+    return lines
+
+
+def _distinct(trials: list[Trial], kinds: tuple[str, ...]) -> list[Trial]:
+    found: dict[str, Trial] = {}
+    for trial in trials:
+        found.setdefault(repr([getattr(trial, kind) for kind in kinds]), trial)
+    return list(found.values())
+
+
+def _tell(say: Say, line: Any) -> None:
+    if line:
+        say(str(line))

@@ -1,0 +1,157 @@
+"""From a unit of work to its problem and its simulation.
+
+Only the unit's own block of maps is read and predicted. A prediction serves all planners and risk settings
+of its block that a process runs one after another.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchnav import rng
+from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.eval.run.isolation import IsolatedPlanner
+from benchnav.eval.run.rollout import Episodes, Watcher, run_episodes
+from benchnav.eval.run.unit import Unit
+from benchnav.eval.trial import Trial
+from benchnav.mixture import TraversabilityMixture
+from benchnav.models.predictor import predict
+from benchnav.planning import risk
+from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.world.simulation import Simulation
+from benchnav.terrain import Terrain
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """What is stored of a block of instances.
+
+    Args:
+        terrain: the true maps.
+        start_m: (x, y), shape [B, 2].
+        goal_m: (x, y), shape [B, 2].
+        reference_time_s: grid reference times, shape [B].
+    """
+
+    terrain: Terrain
+    start_m: Tensor
+    goal_m: Tensor
+    reference_time_s: np.ndarray
+
+
+def read_block(unit: Unit, run_id: str) -> Block:
+    """Reads a unit's maps and places; they are kept for one run alone."""
+    return _block(run_id, unit.trial.data, unit.trial.split, unit.instances)
+
+
+def build(unit: Unit, run_id: str) -> tuple[Problem, Simulation]:
+    """Makes the problem and the simulation of a unit.
+
+    Args:
+        unit: what is to be run.
+        run_id: predictions are kept for one run alone.
+
+    Raises:
+        Exception: whatever the model or the risk measure raises.
+    """
+    trial = unit.trial
+    block, task = read_block(unit, run_id), trial.make_task()
+    mixture = _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances)
+    problem = pose_problem(
+        task,
+        block.terrain.observe(),
+        mixture,
+        risk.apply(trial.make_risk(), mixture),
+        block.start_m,
+        block.goal_m,
+        trial.world.time_budget_s,
+    )
+    luck = luck_key(unit.seed, trial.split, unit.realisation)
+    simulation = Simulation(block.terrain, task, trial.world, block.goal_m, luck, unit.instances)
+    return problem, simulation
+
+
+def luck_key(seed: int, split: str, realisation: int) -> int:
+    """Key of the world's luck: the same for every trial, so that all meet the same."""
+    return rng.stream_key(seed, "simulation", *_draw(split, realisation))
+
+
+def planner_generator(unit: Unit) -> torch.Generator:
+    """The planner's randomness: keyed by seed and split, never by the batch."""
+    return rng.generator(rng.stream_key(unit.seed, "planner", *_draw(unit.trial.split, unit.realisation)))
+
+
+def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
+    return (split, realisation) if realisation else (split,)
+
+
+def simulate(
+    unit: Unit,
+    problem: Problem,
+    simulation: Simulation,
+    watch: Watcher | None = None,
+    watch_every: int = 1,
+    planner_limit_s: float = 0.0,
+) -> tuple[Episodes, bool]:
+    """Runs a unit's episodes; gives what happened, and whether the planner ran compiled."""
+    trial = unit.trial
+    isolated = IsolatedPlanner(trial, planner_limit_s) if planner_limit_s else None
+    with isolated or nullcontext():
+        planner = isolated or trial.make_planner()
+        generator = planner_generator(unit)
+        episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every)
+    return episodes, bool(getattr(planner, "compiled", False))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for PyTorch, whose results do not then depend on the machine; what was is put back."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _ModelOf:
+    """A trial's model as a key of a cache: the same for all trials of one model."""
+
+    def __init__(self, trial: Trial) -> None:
+        self.trial, self.key = trial, repr((trial.model.part, trial.model.options))
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ModelOf) and self.key == other.key
+
+
+@lru_cache(maxsize=2)
+def _block(run_id: str, data: str, split: str, instances: tuple[int, ...]) -> Block:
+    dataset = TerrainDataset(find_dataset(data))
+    places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
+    return Block(
+        terrain=dataset.terrain(split, instances),
+        start_m=torch.from_numpy(places["start_m"]),
+        goal_m=torch.from_numpy(places["goal_m"]),
+        reference_time_s=places["reference_time_s"],
+    )
+
+
+@lru_cache(maxsize=2)
+def _prediction(
+    run_id: str, model: _ModelOf, data: str, split: str, instances: tuple[int, ...]
+) -> TraversabilityMixture:
+    return predict(_model(run_id, model), _block(run_id, data, split, instances).terrain)
+
+
+@lru_cache(maxsize=2)
+def _model(run_id: str, model: _ModelOf) -> Any:
+    return model.trial.make_model()

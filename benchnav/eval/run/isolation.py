@@ -1,0 +1,124 @@
+"""A planner in a process of its own, so that one that hangs can be stopped.
+
+The simulation stays where it is: only the planner's calls cross, each with a time limit. The child makes
+the planner's, robot's and objective's parts by name first, so that what they are made of can be sent.
+"""
+
+import multiprocessing
+import pickle
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+
+from benchnav.errors import BenchnavError
+from benchnav.eval.trial import Trial
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.problem import Problem
+
+# Starting a process and importing PyTorch is not the planner's time.
+_START_S = 120.0
+
+
+class TimeLimitError(BenchnavError):
+    """A planner did not answer in time, or its process ended."""
+
+
+class IsolatedPlanner:
+    """A trial's planner, run in a child process; a planner like any other.
+
+    Args:
+        trial: whose planner.
+        limit_s: time limit of each call.
+    """
+
+    def __init__(self, trial: Trial, limit_s: float) -> None:
+        """Starts the child."""
+        self.limit_s = limit_s
+        self.compiled: bool | None = None
+        context = multiprocessing.get_context("spawn")
+        self._here, there = context.Pipe()
+        self._child = context.Process(target=_serve, args=(there, trial), daemon=True)
+        self._child.start()
+        there.close()
+        self._answer("start", _START_S)
+
+    def __enter__(self) -> "IsolatedPlanner":
+        """Ends the child at the end."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Ends the child."""
+        self._child.kill()
+        self._child.join()
+        self._here.close()
+
+    def init(self, problem: Problem, generator: torch.Generator) -> int:
+        """See `Planner`. The plan state stays in the child; here it is the number of calls."""
+        self._send(("init", problem, generator.initial_seed(), generator.get_state()))
+        self._answer("init", self.limit_s)
+        return 0
+
+    def plan(self, step: Step, plan_state: int) -> tuple[torch.Tensor, int, Plan]:
+        """See `Planner`."""
+        self._send(("plan", step))
+        action, plan, self.compiled = self._answer("plan", self.limit_s)
+        return action, plan_state + 1, plan
+
+    def _send(self, message: Any) -> None:
+        self._here.send_bytes(pickle.dumps(message))
+
+    def _answer(self, what: str, limit_s: float) -> Any:
+        try:
+            if not self._here.poll(limit_s):
+                self._child.kill()
+                raise TimeLimitError(f"The planner gave no answer to `{what}` within {limit_s:g} s.")
+            kind, value = pickle.loads(self._here.recv_bytes())
+        except (EOFError, BrokenPipeError, ConnectionResetError) as error:
+            self._child.join(1)
+            raise TimeLimitError(
+                f"The planner's process ended in `{what}` with status {self._child.exitcode}."
+            ) from error
+        if kind == "raised":
+            error = ChildError(value.strip().splitlines()[-1])
+            error.add_note(value)
+            raise error
+        return value
+
+
+class ChildError(BenchnavError):
+    """What a planner raised in its process: its last line, and the child's traceback as a note."""
+
+
+def _serve(connection: Connection, trial: Trial) -> None:
+    import traceback
+
+    torch.set_num_threads(1)
+    plan_state: Any = None
+    try:
+        trial.make_task()
+        planner = trial.make_planner()
+        connection.send_bytes(pickle.dumps(("started", None)))
+    except Exception:
+        connection.send_bytes(pickle.dumps(("raised", traceback.format_exc())))
+        return
+    while True:
+        try:
+            message = connection.recv_bytes()
+        except EOFError:
+            return
+        try:
+            call, *arguments = pickle.loads(message)
+            if call == "init":
+                problem, seed, state = arguments
+                generator = torch.Generator().manual_seed(seed)
+                generator.set_state(state)
+                plan_state = planner.init(problem, generator)
+                answer: Any = None
+            else:
+                action, plan_state, plan = planner.plan(arguments[0], plan_state)
+                answer = action, plan, getattr(planner, "compiled", None)
+            text = pickle.dumps(("answer", answer))
+        except Exception:
+            text = pickle.dumps(("raised", traceback.format_exc()))
+        connection.send_bytes(text)

@@ -1,0 +1,155 @@
+"""Running episodes: a planner and the simulation in a closed loop, as one batch.
+
+Letters in shapes: B episodes, N steps, S state and A action dimensions.
+"""
+
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.errors import BenchnavError
+from benchnav.planning.objective import distance
+from benchnav.planning.planners.boundary import act, begin
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.world.outcome import Outcome, tell_standstill
+from benchnav.planning.world.simulation import Simulation, SimulationState, end
+
+Watcher = Callable[[int, Plan], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episodes:
+    """What happened in a batch of episodes. Beyond an episode's own `steps` its state stands still.
+
+    Args:
+        states: shape [B, N + 1, S].
+        actions: shape [B, N, A].
+        traversability: λ that the robot met at each step, shape [B, N].
+        turn_rate_radps: turn rate that each action would give on ground of λ = 1, shape [B, N].
+        outcome: `Outcome`, shape [B].
+        steps: steps to the end, shape [B].
+        planning_s: wall time spent in the planner.
+        errors: one line for each episode that ended by a fault of its planner, empty for the others, B of
+            them.
+        traceback: where the planner raised; empty where it did not.
+    """
+
+    states: Tensor
+    actions: Tensor
+    traversability: Tensor
+    turn_rate_radps: Tensor
+    outcome: Tensor
+    steps: Tensor
+    planning_s: float
+    errors: tuple[str, ...]
+    traceback: str = ""
+
+
+class _Log:
+    """What is kept of the steps while they are taken."""
+
+    def __init__(self, start: SimulationState, dt_s: float) -> None:
+        self.dt_s = dt_s
+        self.states = [start.state]
+        self.actions: list[Tensor] = []
+        self.met: list[Tensor] = []
+        self.driven_m: list[Tensor] = []
+        self.turned: list[Tensor] = []
+        self.errors = [""] * len(start.state)
+
+    def blame(self, which: Tensor, reason: str) -> None:
+        for member in which.nonzero()[:, 0].tolist():
+            self.errors[member] = self.errors[member] or reason
+
+    def add(self, before: Tensor, after: SimulationState, action: Tensor, met: Tensor, free: Tensor) -> None:
+        self.states.append(after.state)
+        self.actions.append(action)
+        self.met.append(met)
+        self.driven_m.append(distance(free, before[:, :2]))
+        self.turned.append((free[:, 2] - before[:, 2]) / self.dt_s)
+
+    def episodes(self, now: SimulationState, actions: int, planning_s: float, traceback_: str) -> Episodes:
+        track = torch.stack(self.states, dim=1)
+        none = track.new_zeros(len(track), 0)
+        driven = torch.stack(self.driven_m, dim=1) if self.actions else none
+        return Episodes(
+            states=track,
+            actions=torch.stack(self.actions, dim=1)
+            if self.actions
+            else none[..., None].expand(-1, 0, actions),
+            traversability=torch.stack(self.met, dim=1) if self.actions else none,
+            turn_rate_radps=torch.stack(self.turned, dim=1) if self.actions else none,
+            outcome=tell_standstill(now.outcome, track[..., :2], driven, self.dt_s),
+            steps=now.step,
+            planning_s=planning_s,
+            errors=tuple(self.errors),
+            traceback=traceback_,
+        )
+
+
+def run_episodes(
+    planner: Planner[Any],
+    problem: Problem,
+    simulation: Simulation,
+    generator: torch.Generator,
+    watch: Watcher | None = None,
+    watch_every: int = 1,
+) -> Episodes:
+    """Runs a batch of episodes to the end of the last.
+
+    A planner that raises ends the episodes that still run; one whose action no robot can do ends that
+    action's own.
+
+    Args:
+        planner: chooses actions; it is given copies of what is predicted, never the truth.
+        problem: with predicted traversability.
+        simulation: with the true terrain.
+        generator: the planner's randomness.
+        watch: is called with a step's number and plan, before the step is taken.
+        watch_every: of so many steps one is watched, from the first on.
+
+    Returns:
+        What happened.
+    """
+    now = simulation.init(problem.start)
+    log = _Log(now, problem.dt_s)
+    felt = torch.full_like(now.state[:, 0], torch.nan)
+    planning_s, trace = 0.0, ""
+    began = time.perf_counter()
+    try:
+        plan_state = begin(planner, problem, generator)
+        planning_s = time.perf_counter() - began
+        while bool(now.running.any()):
+            count = len(log.actions)
+            watched = watch is not None and count % watch_every == 0
+            step = Step(state=now.state, felt=felt, time_s=count * problem.dt_s, draw=watched)
+            began = time.perf_counter()
+            answer = act(planner, step, plan_state, problem)
+            planning_s += time.perf_counter() - began
+            plan_state = answer.plan_state
+            if watched and watch is not None:
+                watch(count, answer.plan)
+            log.blame(now.running & answer.faulty, answer.reason)
+            now = end(now, answer.faulty, Outcome.PLANNER_ERROR)
+            now = end(now, answer.plan.status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
+            free = simulation.unhindered(now, answer.action)
+            before = now.state
+            now, felt = simulation.step(now, answer.action)
+            log.add(before, now, answer.action, felt, free)
+    except Exception as error:
+        trace = traceback.format_exc()
+        log.blame(now.running, one_line(error))
+        now = end(now, now.running, Outcome.PLANNER_ERROR)
+    return log.episodes(now, len(problem.robot.action_low), planning_s, trace)
+
+
+def one_line(error: BaseException) -> str:
+    """An error as one line; our own errors speak for themselves."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, BenchnavError) else f"{type(error).__name__}: {text}"

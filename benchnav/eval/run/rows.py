@@ -1,0 +1,145 @@
+"""Rows of tables: an episode's metrics, and its steps.
+
+Sources: paper IV-A for success rate, total time and average traversability; Perille et al. (2020),
+"Benchmarking metric ground navigation" (BARN), for the score.
+"""
+
+import numpy as np
+import pandas as pd
+
+from benchnav.eval.run.rollout import Episodes
+from benchnav.eval.run.unit import Unit
+from benchnav.planning.problem import Problem
+from benchnav.planning.world.outcome import Outcome
+
+
+def episode_rows(
+    unit: Unit, problem: Problem, episodes: Episodes, reference_time_s: np.ndarray, compiled: bool
+) -> pd.DataFrame:
+    """Tabulates episodes, a row each.
+
+    Args:
+        unit: what was run.
+        problem: what was to be solved.
+        episodes: what happened.
+        reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
+        compiled: the planner ran compiled.
+
+    Returns:
+        The trial's id and labels, `seed`, `realisation`, `instance`; `outcome`, `success`; `total_time_s`,
+        where a failure counts as the whole time budget; `end_time_s`, when the episode ended;
+        `traversability`, the mean of the λ met; `reference_time_s`; `time_ratio`, over the reference time at
+        the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
+        `stuck_share`, share of steps with λ at most λ_stuck; `roughness_radps2`, the mean change of the
+        commanded turn rate; `planning_ms` a step and episode; `compiled`; `error`. What an episode that
+        ended at once does not have is NaN.
+    """
+    top_speed = problem.robot.top_speed_mps
+    steps_planned = max(int(episodes.steps.max()), 1) * len(unit.instances)
+    rows = []
+    for b, instance in enumerate(unit.instances):
+        steps = int(episodes.steps[b])
+        outcome = Outcome(int(episodes.outcome[b]))
+        met = episodes.traversability[b, :steps].double().cpu().numpy()
+        # Compared in the tensor's own precision, as the planners do.
+        stuck = episodes.traversability[b, :steps] <= problem.task.rules.free_space.above
+        track = episodes.states[b, : steps + 1, :2].double().cpu().numpy()
+        turn = episodes.turn_rate_radps[b, :steps].double().cpu().numpy()
+        success = outcome is Outcome.SUCCESS
+        end_time_s = steps * problem.dt_s
+        reference = float(reference_time_s[b]) / top_speed
+        rows.append(
+            {
+                "trial": unit.trial.id,
+                **unit.trial.labels,
+                "seed": unit.seed,
+                "realisation": unit.realisation,
+                "instance": instance,
+                "outcome": outcome.name.lower(),
+                "success": success,
+                "total_time_s": end_time_s if success else problem.time_budget_s,
+                "end_time_s": end_time_s,
+                "traversability": met.mean() if steps else np.nan,
+                "reference_time_s": float(reference_time_s[b]),
+                "time_ratio": end_time_s / reference if success else np.nan,
+                "score": score(end_time_s, reference) if success else 0.0,
+                "path_length_m": path_length_m(track) if steps else np.nan,
+                "stuck_share": float(stuck.double().mean()) if steps else np.nan,
+                "roughness_radps2": np.abs(np.diff(turn)).mean() / problem.dt_s if steps > 1 else np.nan,
+                "planning_ms": 1e3 * episodes.planning_s / steps_planned,
+                "compiled": compiled,
+                "error": episodes.errors[b],
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
+    """Rows of episodes that could not begin, since their model or risk measure failed."""
+    nothing = dict.fromkeys(
+        ("traversability", "reference_time_s", "time_ratio", "path_length_m", "stuck_share"), np.nan
+    )
+    rows = [
+        {
+            "trial": unit.trial.id,
+            **unit.trial.labels,
+            "seed": unit.seed,
+            "realisation": unit.realisation,
+            "instance": instance,
+            "outcome": Outcome.MODEL_ERROR.name.lower(),
+            "success": False,
+            "total_time_s": time_budget_s,
+            "end_time_s": 0.0,
+            **nothing,
+            "score": 0.0,
+            "roughness_radps2": np.nan,
+            "planning_ms": np.nan,
+            "compiled": False,
+            "error": error,
+        }
+        for instance in unit.instances
+    ]
+    columns = ["trial", *unit.trial.labels, "seed", "realisation", "instance", "outcome", "success"]
+    columns += ["total_time_s", "end_time_s", "traversability", "reference_time_s", "time_ratio", "score"]
+    columns += ["path_length_m", "stuck_share", "roughness_radps2", "planning_ms", "compiled", "error"]
+    return pd.DataFrame(rows)[columns]
+
+
+def step_columns(problem: Problem, episodes: Episodes) -> list[dict[str, np.ndarray]]:
+    """The driven paths, for each episode its columns: a value a step and one for the last state.
+
+    Returns:
+        `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its name and `traversability` as met; the last
+        two NaN at the last state.
+    """
+    made = []
+    for b in range(len(episodes.steps)):
+        steps = int(episodes.steps[b])
+        states = episodes.states[b, : steps + 1].cpu().numpy()
+        actions = episodes.actions[b, :steps].cpu().numpy()
+        met = episodes.traversability[b, :steps].cpu().numpy()
+        columns = {
+            "time_s": np.arange(steps + 1) * problem.dt_s,
+            "x_m": states[:, 0],
+            "y_m": states[:, 1],
+            "heading_rad": states[:, 2],
+        }
+        for index, name in enumerate(problem.robot.action_names):
+            columns[name] = np.append(actions[:, index], np.float32(np.nan))
+        columns["traversability"] = np.append(met, np.float32(np.nan))
+        made.append(columns)
+    return made
+
+
+def path_length_m(track: np.ndarray) -> float:
+    """Length of a driven path, positions of shape [N, 2]."""
+    return float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
+
+
+def score(time_s: float, reference_s: float) -> float:
+    """BARN's score of a success: OT over the time, kept within 2 OT and 8 OT; at most 0.5.
+
+    OT is half the reference time at the robot's top speed, so that arriving in that time is the best.
+    """
+    least = reference_s / 2
+    return least / min(max(time_s, 2 * least), 8 * least)

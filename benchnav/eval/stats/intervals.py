@@ -1,0 +1,121 @@
+"""Summaries of trials: success with its interval, and means with how many episodes each is made of.
+
+The map is the unit. Episodes on one map, under other seeds or realisations, have much in common, so that a
+hundred of them on twenty maps tell less than a hundred maps would. The design effect says how much less.
+"""
+
+import numpy as np
+import pandas as pd
+from scipy.stats import norm
+
+from benchnav.planning.world.outcome import FAILURES
+
+LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
+MAP = ("data", "scenario", "instance")
+
+# Of each column its name in the summary, which the statistic parts, and its unit.
+_QUANTITIES = {
+    "total_time_s": ("total_time", "_s"),
+    "success_time_s": ("success_time", "_s"),
+    "traversability": ("traversability", ""),
+    "time_ratio": ("time_ratio", ""),
+    "score": ("score", ""),
+    "path_length_m": ("path_length", "_m"),
+    "stuck_share": ("stuck_share", ""),
+    "roughness_radps2": ("roughness", "_radps2"),
+}
+
+
+def wilson_interval(rate: float, n: float, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval for a rate. Source: Wilson (1927).
+
+    Args:
+        rate: share of successes, in [0, 1].
+        n: number of independent trials, > 0; an effective number need not be whole.
+        confidence: coverage asked for.
+
+    Returns:
+        Lower and upper end, in [0, 1].
+    """
+    z = float(norm.ppf((1 + confidence) / 2))
+    centre = rate + z**2 / (2 * n)
+    half = z * (rate * (1 - rate) / n + z**2 / (4 * n**2)) ** 0.5
+    low, high = (centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)
+    return max(low, 0.0), min(high, 1.0)
+
+
+def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
+    """How many episodes tell as much as one on a map of its own would.
+
+    1 + (m − 1)·ρ, with m the size-weighted mean number of episodes a map and ρ the intra-class correlation
+    of success by map, from the analysis of variance and kept in [0, 1]. Where the outcomes do not differ at
+    all, or there is but one map, ρ cannot be seen; it is then 1, so that a map counts as one episode. Since ρ
+    is an estimate, a 95 % interval made with it holds 93 % of the time on 20 maps and 95 % on 60 (simulated,
+    five episodes a map).
+    Source: Donner and Klar (2000), "Design and Analysis of Cluster Randomization Trials", 1.2 and 6.2.1;
+    Ridout, Demétrio and Firth (1999) for the estimator on binary data.
+
+    Args:
+        success: bool, shape [N].
+        maps: which map each episode was on, any labels, shape [N].
+
+    Returns:
+        At least 1, at most N.
+    """
+    _, member = np.unique(maps, return_inverse=True)
+    size = np.bincount(member).astype(float)
+    episodes, count = len(success), len(size)
+    if episodes == count:
+        return 1.0
+    weighted = float((size**2).sum()) / episodes
+    return 1 + (weighted - 1) * _correlation_within(success.astype(float), member, size, weighted)
+
+
+def summarise(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Summarises each trial, in the order in which trials first appear.
+
+    Args:
+        episodes: rows of episodes, format version 2.
+
+    Returns:
+        A row a trial: `trial` and its labels; `n_episodes`, `n_maps`; `success_rate` with Wilson's interval
+        `success_low`, `success_high` on the number of episodes over `design_effect`. Of each quantity
+        `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
+        counted as T; time of the successes alone; λ met; time over the reference time; score; path length;
+        share of stuck steps; roughness. `planning_ms_median`; `compiled_share`; and `OUTCOME_count` of each
+        failure.
+    """
+    return pd.DataFrame([_summarise_trial(group) for _, group in episodes.groupby("trial", sort=False)])
+
+
+def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray, weighted: float) -> float:
+    """Intra-class correlation by the analysis of variance, in [0, 1]."""
+    episodes, count = len(value), len(size)
+    if count == 1:
+        return 1.0
+    mean = np.bincount(member, weights=value) / size
+    between = float((size * (mean - value.mean()) ** 2).sum()) / (count - 1)
+    within = float(((value - mean[member]) ** 2).sum()) / (episodes - count)
+    if between == within == 0:
+        return 1.0
+    typical = (episodes - weighted) / (count - 1)
+    return min(max((between - within) / (between + (typical - 1) * within), 0.0), 1.0)
+
+
+def _summarise_trial(group: pd.DataFrame) -> dict[str, object]:
+    success = group["success"].to_numpy(dtype=bool)
+    member = group.groupby(list(MAP), sort=False, dropna=False).ngroup().to_numpy()
+    rate, effect = float(success.mean()), design_effect(success, member)
+    low, high = wilson_interval(rate, len(group) / effect)
+    row: dict[str, object] = {name: group[name].iloc[0] for name in ("trial", *LABELS)}
+    row |= {"n_episodes": len(group), "n_maps": int(member.max()) + 1}
+    row |= {"success_rate": rate, "success_low": low, "success_high": high, "design_effect": effect}
+    columns = group.assign(success_time_s=group["total_time_s"].where(success))
+    for column, (name, unit) in _QUANTITIES.items():
+        values = columns[column]
+        row |= {f"{name}_mean{unit}": values.mean(), f"{name}_std{unit}": values.std()}
+        row[f"{name}_n"] = int(values.notna().sum())
+    row["planning_ms_median"] = group["planning_ms"].median()
+    row["compiled_share"] = group["compiled"].astype(float).mean()
+    outcomes = [outcome.name.lower() for outcome in FAILURES]
+    return row | {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}

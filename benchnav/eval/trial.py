@@ -1,0 +1,316 @@
+"""Trials: the cell of an experiment as a value, and how a suite becomes a list of them.
+
+A trial says which data split, model, risk setting, planner, robot, objective, rules and world. Its id is
+the digest of that value; its labels are for people. Seeds, realisations and instances are how often a trial
+is run, and belong to the suite.
+"""
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.eval.suite import Suite
+from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.problem import Task
+from benchnav.planning.risk import RiskMeasure
+from benchnav.planning.world.world import PRESETS, World
+from benchnav.registry import Part
+
+PART_KINDS = ("model", "risk", "planner", "robot", "objective")
+NOT_USED = "–"
+
+# What the mappings of `trials` may hold, with the other way to write it.
+_KEYS = {
+    **{"data": "datas", "scenarios": "scenario", "models": "model", "risks": "risk", "planners": "planner"},
+    **{"robots": "robot", "objectives": "objective", "world": "worlds", "task": "tasks"},
+}
+_SINGULAR = {other: key for key, other in _KEYS.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One cell of an experiment.
+
+    Args:
+        data: path or id of the dataset.
+        scenario: its test split.
+        model: predicts.
+        risk: turns a prediction into λ̂.
+        planner: plans.
+        robot: F.
+        objective: J.
+        rules: free space, least λ̂, goal radius.
+        world: what λ does.
+        world_label: what tables call rules and world.
+        blind: the planner looks at nothing predicted; model and risk stand in for any.
+    """
+
+    data: str
+    scenario: str
+    model: Part
+    risk: Part
+    planner: Part
+    robot: Part
+    objective: Part
+    rules: Rules
+    world: World
+    world_label: str
+    blind: bool = False
+
+    @property
+    def split(self) -> str:
+        """Name of the data's split."""
+        return f"test/{self.scenario}"
+
+    @property
+    def value(self) -> dict[str, Any]:
+        """All that bears on the trial's rows, as plain data; no labels."""
+        parts = {kind: getattr(self, kind) for kind in PART_KINDS}
+        return {
+            "data": self.data,
+            "split": self.split,
+            **{kind: {"part": part.part, "options": dict(part.options)} for kind, part in parts.items()},
+            "rules": asdict(self.rules),
+            "world": asdict(self.world),
+        }
+
+    @property
+    def id(self) -> str:
+        """Digest of the value, 16 hexadecimal digits."""
+        text = json.dumps(self.value, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What tables call it, by column."""
+        parts = {kind: getattr(self, kind).label for kind in PART_KINDS}
+        if self.blind:
+            parts |= {"model": NOT_USED, "risk": NOT_USED}
+        return {"data": self.data, "scenario": self.scenario, **parts, "world": self.world_label}
+
+    def make_task(self) -> Task:
+        """Makes the robot, the objective and with them the task."""
+        robot = registry.make("robot", self.robot)
+        objective = registry.make("objective", self.objective, robot=robot)
+        return Task(robot=robot, objective=objective, rules=self.rules)
+
+    def make_planner(self) -> Any:
+        """Makes the planner."""
+        return registry.make("planner", self.planner)
+
+    def make_model(self) -> Any:
+        """Makes the model, or loads its checkpoint."""
+        from benchnav.models.predictor import load_model
+
+        return registry.make("model", self.model) if self.model.options else load_model(self.model.part)
+
+    def make_risk(self) -> RiskMeasure:
+        """Makes the risk measure."""
+        return registry.make("risk", self.risk)
+
+
+def trial_from(about: Mapping[str, Any]) -> Trial:
+    """Rebuilds a trial from its `value` and `labels`, as `run.json` holds them."""
+    value, labels = about["value"], about["labels"]
+    parts = {
+        kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
+        for kind in PART_KINDS
+    }
+    rules = Rules(**{**value["rules"], "free_space": FreeSpace(**value["rules"]["free_space"])})
+    return Trial(
+        data=value["data"],
+        scenario=value["split"].removeprefix("test/"),
+        **parts,
+        rules=rules,
+        world=World(**value["world"]),
+        world_label=labels["world"],
+        blind=labels["risk"] == NOT_USED,
+    )
+
+
+def trials_of(suite: Suite, scenarios_of: Any) -> list[Trial]:
+    """Lists the trials of a suite, in the order of tables.
+
+    Args:
+        suite: what is evaluated.
+        scenarios_of: gives the scenarios of a dataset's test splits, from its path or id.
+
+    Raises:
+        ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
+    """
+    found: dict[str, Trial] = {}
+    labels: dict[tuple[str, str], Any] = {}
+    for product in suite.trials or ({},):
+        here: set[str] = set()
+        for trial in _product(suite, product, scenarios_of):
+            for name, label in trial.labels.items():
+                value = _labelled(trial, name)
+                if labels.setdefault((name, label), value) != value and label != NOT_USED:
+                    raise ConfigError(
+                        f"Expected a label for each {name}, got two settings that are both called {label!r}. "
+                        f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
+                    )
+            if trial.id in here and not trial.blind:
+                raise ConfigError(f"Expected settings that differ, got twice what {_words(trial)} is.")
+            here.add(trial.id)
+            found.setdefault(trial.id, trial)
+    return list(found.values())
+
+
+def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Iterator[Trial]:
+    given = {}
+    for key, values in product.items():
+        key = _SINGULAR.get(key, key)
+        if key not in _KEYS:
+            known = [*_KEYS, *_SINGULAR]
+            raise ConfigError(
+                f"Expected keys of `trials` among {', '.join(_KEYS)}, got {key!r}.{registry.hint(key, known)}"
+            )
+        given[key] = values if isinstance(values, list | tuple) else [values]
+
+    def chosen(key: str, default: Sequence[Any]) -> Sequence[Any]:
+        return given.get(key, default)
+
+    parts = {
+        "model": chosen("models", suite.models or (suite.model,)),
+        "risk": chosen("risks", suite.risks),
+        "planner": chosen("planners", suite.planners),
+        "robot": chosen("robots", suite.robots),
+        "objective": chosen("objectives", suite.objectives),
+    }
+    ready = {kind: [_part(kind, part, suite) for part in listed] for kind, listed in parts.items()}
+    _check_options_used(suite, ready["planner"])
+    worlds = [
+        _world(suite, world, task)
+        for world in chosen("world", (suite.world,))
+        for task in chosen("task", (suite.task,))
+    ]
+    for data in chosen("data", (suite.data,)):
+        for scenario, (world, rules, label), robot, objective, model, risk, planner in itertools.product(
+            chosen("scenarios", suite.scenarios) or scenarios_of(data),
+            worlds,
+            *(ready[kind] for kind in ("robot", "objective", "model", "risk", "planner")),
+        ):
+            trial = Trial(
+                data=data, scenario=scenario, model=model, risk=risk, planner=planner, robot=robot,
+                objective=objective, rules=rules, world=world, world_label=label,
+            )  # fmt: skip
+            yield _as_blind(trial) if _is_blind(planner) else trial
+
+
+def _part(kind: str, given: Any, suite: Suite) -> Part:
+    if kind == "model":
+        return read_model(given)
+    part = registry.read_part(kind, given)
+    if kind == "planner" and part.part in suite.planner_options:
+        part = replace(part, options={**suite.planner_options[part.part], **part.options})
+    return registry.complete(kind, part)
+
+
+def read_model(given: Any) -> Part:
+    """Reads a model: a registered one, or a checkpoint, which has no options.
+
+    Raises:
+        ConfigError: there is no such model, or it is refused its options.
+    """
+    from benchnav.models.predictor import find_checkpoint, load_model
+
+    asked = {"part": given} if isinstance(given, str) else dict(given)
+    source = str(asked.get("part", ""))
+    if source in registry.names("model") or ":" in source:
+        part = registry.read_part("model", given)
+        if hasattr(registry.find("model", part.part).target, "from_checkpoint"):
+            load_model(source)  # says what to name in place of a family
+        return registry.complete("model", part)
+    find_checkpoint(source)
+    if asked.get("options"):
+        raise ConfigError(f"Expected no options for the checkpoint {source!r}, got {asked['options']}.")
+    label = str(asked.get("label", Path(source).name))
+    return Part(part=source, label=label)
+
+
+def _check_options_used(suite: Suite, planners: Sequence[Part]) -> None:
+    if suite.trials:
+        return  # a product may leave a planner out
+    for name in suite.planner_options:
+        if name not in {part.part for part in planners}:
+            known = [part.part for part in planners]
+            raise ConfigError(
+                f"Expected `planner_options` of planners of the suite, {', '.join(known)}, got {name!r}."
+                f"{registry.hint(name, known)}"
+            )
+
+
+def _world(suite: Suite, world: Any, task: Any) -> tuple[World, Rules, str]:
+    given = {"preset": world} if isinstance(world, str) else dict(world)
+    name = given.pop("preset", "paper")
+    if name not in PRESETS:
+        raise ConfigError(
+            f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{registry.hint(name, PRESETS)}"
+        )
+    if suite.noise:
+        given = {"noise": suite.noise} | given
+    if suite.time_budget_s:
+        given = {"time_budget_s": suite.time_budget_s} | given
+    preset = PRESETS[name]
+    made_world = _changed(preset.world, given, "world")
+    made_rules = _changed(preset.rules, dict(task), "task")
+    changes = _differences(preset.world, made_world) + _differences(preset.rules, made_rules)
+    return made_world, made_rules, " ".join([name, *changes])
+
+
+def _changed(value: Any, changes: dict[str, Any], where: str) -> Any:
+    """Replaces fields of a dataclass by what is given, of dataclasses in it likewise."""
+    known = {f.name: getattr(value, f.name) for f in fields(value)}
+    made = {}
+    for name, change in changes.items():
+        if name not in known:
+            raise ConfigError(
+                f"Expected keys of `{where}` among {', '.join(known)}, got {name!r}.{registry.hint(name, known)}"
+            )
+        if isinstance(known[name], FreeSpace) and isinstance(change, Mapping):
+            made[name] = _changed(known[name], dict(change), f"{where}.{name}")
+        elif isinstance(known[name], float) and isinstance(change, int | float) and change is not True:
+            made[name] = float(change)
+        elif isinstance(known[name], str) and isinstance(change, str):
+            made[name] = change
+        else:
+            raise ConfigError(f"Expected `{where}.{name}` like {known[name]!r}, got {change!r}.")
+    return replace(value, **made)
+
+
+def _differences(preset: Any, made: Any) -> list[str]:
+    changed = []
+    for f in fields(preset):
+        before, after = getattr(preset, f.name), getattr(made, f.name)
+        if isinstance(before, FreeSpace):
+            changed += _differences(before, after)
+        elif before != after:
+            changed.append(f"{f.name}={after:g}" if isinstance(after, float) else f"{f.name}={after}")
+    return changed
+
+
+def _is_blind(planner: Part) -> bool:
+    return bool(getattr(registry.find("planner", planner.part).target, "blind", False))
+
+
+def _as_blind(trial: Trial) -> Trial:
+    """One trial for every model and risk setting: what a blind planner is given is not looked at."""
+    model = Part(part="oracle", label=NOT_USED)
+    return replace(trial, model=model, risk=Part(part="mean", label=NOT_USED), blind=True)
+
+
+def _labelled(trial: Trial, name: str) -> Any:
+    if name == "world":
+        return trial.world, trial.rules
+    return trial.value[name] if name in PART_KINDS else None
+
+
+def _words(trial: Trial) -> str:
+    return ", ".join(f"{trial.labels[name]}" for name in ("scenario", "model", "planner", "risk", "world"))

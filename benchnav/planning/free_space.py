@@ -1,0 +1,79 @@
+"""Ground that is not free: one rule for every planner.
+
+S_free is where a map exceeds a threshold, and around the goal. A planner may cross other ground at a high
+finite price, so that all planners face the same question and none gives up where no free way is
+predicted. The λ̂ that motion and path costs are given is at least `slowest`, so that a robot on ground
+predicted to hold it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.terrain import Grid
+
+# Of a step, and of a metre, on ground that is not free; the paper's penalty a step. Higher than what any
+# way over free ground costs.
+PRICE = 1e4
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeSpace:
+    """Which ground is free.
+
+    Args:
+        by: `risk`, the map λ̂ of the risk setting, or `mean`, E[λ] of the prediction.
+        above: a cell is free where that map exceeds this; the paper's λ_stuck.
+    """
+
+    by: str = "risk"
+    above: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Refuses rules that mean nothing."""
+        if self.by not in ("risk", "mean"):
+            raise ConfigError(f"Expected `free_space.by` 'risk' or 'mean', got {self.by!r}.")
+        if not 0 <= self.above < 1:
+            raise ConfigError(f"Expected `free_space.above` in [0, 1), got {self.above}.")
+
+    def mask(self, risk_map: Tensor, mixture: TraversabilityMixture) -> Tensor:
+        """Tells which cells are free, bool [B, H, W], from λ̂ [B, H, W] and the prediction."""
+        return (risk_map if self.by == "risk" else mixture.mean()) > self.above
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """The rules of a task that are neither robot nor objective; the defaults are the paper's.
+
+    Args:
+        free_space: which ground is free.
+        slowest: least λ̂ that motion and path costs are given.
+        goal_radius_m: a robot this near to the goal has arrived.
+    """
+
+    free_space: FreeSpace = FreeSpace()
+    slowest: float = 0.3
+    goal_radius_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuses rules under which nothing moves or arrives."""
+        if not 0 < self.slowest <= 1:
+            raise ConfigError(f"Expected `slowest` in (0, 1], got {self.slowest}.")
+        if not 0 < self.goal_radius_m < float("inf"):
+            raise ConfigError(f"Expected `goal_radius_m` > 0 and finite, got {self.goal_radius_m}.")
+
+
+def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
+    """Cells that the goal's disc touches, bool [B, H, W], from goals (x, y) [B, 2]."""
+    rows = torch.arange(grid.height, device=goal_m.device)
+    columns = torch.arange(grid.width, device=goal_m.device)
+    x, y = grid.centre_of(rows, columns)
+    half = grid.resolution_m / 2
+    beside_x = ((x - goal_m[:, :1]).abs() - half).clamp(min=0)
+    beside_y = ((y - goal_m[:, 1:]).abs() - half).clamp(min=0)
+    return torch.hypot(*torch.broadcast_tensors(beside_x[:, None, :], beside_y[:, :, None])) < radius_m

@@ -1,0 +1,1 @@
+"""Planners: the protocol they share, and the shipped ones."""

@@ -1,0 +1,1 @@
+"""Closed-loop rapidly-exploring random trees."""

@@ -1,0 +1,289 @@
+"""Closed-loop rapidly-exploring random trees (CL-RRT).
+
+A tree is grown not by steering states but by simulating the robot with its controller: a node is chosen
+for a sampled point, a Dubins reference is drawn from the node to the point, and the closed loop of pure
+pursuit and a PID on speed (`pursuit`) drives along it through F with predicted traversability. The edge
+stays as far as it is free of collision; what the robot then executes is the same controller on the same
+references. The best path is the one of least simulated time; J is not read. Source: Kuwata et al. (2009),
+"Real-time motion planning with applications to autonomous urban driving"; paper IV-A2.
+
+Read on in `tree`, whose `search` is one plan, and in `edges`, which simulates and judges. This module is what
+the source calls the execution loop: when to plan, and from what.
+
+- Sampled points carry no heading, so references are the shortest paths to a point with free heading: the
+  least over all end headings of the Dubins length, and no random heading makes a detour.
+- A plan without a way to the goal leads along the best partial path, and is tried anew at the next steps with
+  references of half the radius each time, down to the robot's own tightest turn: at full radius a robot
+  that faces ground that is not free has no way at all, and one that can slow down can turn tighter. After
+  `most_failures` such plans a partial path is driven to its end. It is left a little before its end, and not
+  tried anew from ground that is not free: a robot that slid into a wall could leave it on the other side.
+- Where `most_failures` plans in a row found no partial path either, the next ones may cross: their edges go
+  on over ground that is not free, at its price a metre, and the cheapest path is driven as a partial one.
+  Before that the tree stays on free ground, so that a free way is taken wherever one is found; and once
+  the robot is across, it looks for one again. The planner never gives up.
+- Expansions go in rounds: all samples of a round, of all episodes, are simulated at once. Samples are a pure
+  function of the plan state's seed and step, the same for each episode of a batch.
+- A path has at most one edge a round, so that a plan reaches as far as `rounds` edges do (100 m by default);
+  a goal farther off is approached along partial paths.
+
+Letters in shapes: B episodes, M of which plan anew, D edges of a path, R edges of a round.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchnav import rng
+from benchnav.errors import ConfigError
+from benchnav.planning.objective import distance
+from benchnav.planning.planners.cl_rrt.edges import SPACING_M, ClosedLoop
+from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
+from benchnav.planning.planners.cl_rrt.tree import Route, map_tensors, no_route, search
+from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import SPEED, TURN_RATE
+
+_STALL_M = 0.25  # progress less than this in `stall_s` is none
+
+
+@dataclass(frozen=True, kw_only=True)
+class CLRRTConfig:
+    """Settings of CL-RRT; the defaults are the paper's where it gives them.
+
+    Args:
+        expansions: edges tried in a plan.
+        expansions_per_round: edges simulated at once; divides `expansions`.
+        step_m: greatest length of an edge along its reference.
+        edge_time_s: greatest duration of an edge; one that takes longer ends there.
+        goal_bias: share of the expansions that aim at the goal.
+        turning_radius_m: of the references, as long as they lead to the goal.
+        replan_distance_m: a robot farther than this from the nearest predicted position plans anew.
+        stall_s: so does one that makes no progress for so long.
+        most_failures: plans in a row without a way to the goal after which a partial path is driven to its
+            end and, without one, edges may cross ground that is not free.
+        follower: of the controller, in simulation and on the way.
+    """
+
+    expansions: int = 500
+    expansions_per_round: int = 25
+    step_m: float = 5.0
+    edge_time_s: float = 10.0
+    goal_bias: float = 0.25
+    turning_radius_m: float = 1.0
+    replan_distance_m: float = 1.0
+    stall_s: float = 5.0
+    most_failures: int = 5
+    follower: FollowerConfig = FollowerConfig()
+
+    def __post_init__(self) -> None:
+        """Refuses settings that grow no tree."""
+        for name in (
+            *("expansions", "expansions_per_round", "step_m", "edge_time_s", "turning_radius_m"),
+            *("replan_distance_m", "stall_s", "most_failures"),
+        ):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"Expected `{name}` > 0 for CL-RRT, got {getattr(self, name)}.")
+        if self.expansions % self.expansions_per_round:
+            raise ConfigError(
+                f"Expected `expansions` as a multiple of `expansions_per_round` = {self.expansions_per_round} "
+                f"for CL-RRT, got {self.expansions}."
+            )
+        if not 0 <= self.goal_bias <= 1:
+            raise ConfigError(f"Expected `goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.")
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of a plan, which is also the most edges that a path can have: D."""
+        return self.expansions // self.expansions_per_round
+
+
+@dataclass(frozen=True, kw_only=True)
+class CLRRTState:
+    """What CL-RRT carries from step to step.
+
+    Args:
+        problem: what is being solved.
+        route: what is being followed.
+        edge: which edge of the path, int64, shape [B].
+        tracking: of the controller, along that edge.
+        failures: plans in a row without a way to the goal, int64, shape [B].
+        mark_m: progress along the path when last some was seen, shape [B].
+        mark_step: the step of it, int64, shape [B].
+        seed: root of the samples.
+        step: steps planned so far.
+    """
+
+    problem: Problem
+    route: Route
+    edge: Tensor
+    tracking: Tracking
+    failures: Tensor
+    mark_m: Tensor
+    mark_step: Tensor
+    seed: int
+    step: int
+
+
+class CLRRT:
+    """CL-RRT as a planner.
+
+    Args:
+        config: settings.
+    """
+
+    steers = ((SPEED, TURN_RATE),)
+    follows = "travel time"
+
+    def __init__(self, config: CLRRTConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config = config or CLRRTConfig()
+
+    def init(self, problem: Problem, generator: torch.Generator) -> CLRRTState:
+        """Starts with no path, so that the first step plans; see `Planner`.
+
+        Raises:
+            ConfigError: the robot cannot follow references, or none of the turning radius.
+        """
+        config, tightest_m = self.config, self._tightest_m(self._follower(problem))
+        if config.turning_radius_m < tightest_m:
+            raise ConfigError(
+                f"Expected `turning_radius_m` ≥ {tightest_m:g}, the radius of the robot's tightest turn, "
+                f"for CL-RRT, got {config.turning_radius_m}."
+            )
+        none = torch.zeros(len(problem), dtype=torch.int64, device=problem.start.device)
+        tracking = Tracking.standing(problem.start)
+        return CLRRTState(
+            problem=problem,
+            route=no_route(self._closed_loop(problem, none), config.rounds, config.expansions),
+            edge=none,
+            tracking=tracking,
+            failures=none,
+            mark_m=tracking.progress_m,
+            mark_step=none,
+            seed=int(torch.randint(2**62, (), generator=generator)),
+            step=0,
+        )
+
+    def plan(self, step: Step, plan_state: CLRRTState) -> tuple[Tensor, CLRRTState, Plan]:
+        """Follows the path, planning anew where that is due; see `Planner`."""
+        config, problem, state = self.config, plan_state.problem, step.state
+        now = self._follow(state, plan_state)
+        ground = problem.ground_at(state)
+        arrived = distance(state, problem.goal_m) < problem.goal_radius_m
+        lost = self._off_route(state, now)
+        partial = now.route.status == PlanStatus.PARTIAL
+        again = partial & (now.failures < config.most_failures) & (ground > 0)
+        due = ((lost | again) & ~arrived & (ground != 0)).nonzero()[:, 0]  # not off the map
+        if len(due):
+            now = self._replan(state, now, due, lost[due])
+        route, follower = now.route, self._follower(problem)
+        reference = _reference(route, now.edge)
+        progress = now.tracking.progress_m  # moved already, but on references that begin now
+        progress = torch.where(progress > 0, progress, follower.advance(reference, state, progress))
+        action, tracking = follower.act(reference, state, now.tracking, progress)
+        driving = (route.depth > 0) & ~arrived
+        low, high = problem.action_bounds
+        action = torch.where(driving[:, None], action, 0).clamp(low, high)
+        layers = {"path": route.path, "reference": route.line, "tree": route.tree} if step.draw else {}
+        plan = Plan.empty(len(state), state.device, status=route.status, **layers)
+        return action, replace(now, tracking=tracking, step=now.step + 1), plan
+
+    def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
+        """Moves the progress to where the robots are, on to the next edge where one is done."""
+        tracking = now.tracking
+        reference = _reference(now.route, now.edge)
+        progress = self._follower(now.problem).advance(reference, state, tracking.progress_m)
+        last = now.route.end_m.shape[1] - 1
+        done = progress >= now.route.end_m.gather(1, now.edge.clamp(max=last)[:, None])[:, 0]
+        edge = torch.minimum(now.edge + done, now.route.depth)
+        progress = torch.where(done, 0, progress)
+        along = edge * self.config.step_m + progress
+        moved = along >= now.mark_m + _STALL_M
+        # A robot that drives over ground that is not free looks for a free way when it is across.
+        astray = (now.route.depth > 0) & ~now.problem.free_at(state)
+        return replace(
+            now,
+            edge=edge,
+            tracking=replace(tracking, progress_m=progress),
+            failures=torch.where(astray, 0, now.failures),
+            mark_m=torch.where(moved, along, now.mark_m),
+            mark_step=torch.where(moved, now.step, now.mark_step),
+        )
+
+    def _off_route(self, state: Tensor, now: CLRRTState) -> Tensor:
+        """Tells who needs a plan: at the end of the path, too far from it, or stalled; bool [B]."""
+        offset = now.route.path - state[:, None, :2]
+        square = (offset * offset).sum(dim=-1).nan_to_num(nan=math.inf).amin(dim=1)
+        stalled = (now.step - now.mark_step) * now.problem.dt_s > self.config.stall_s
+        return (now.edge >= now.route.depth) | (square > self.config.replan_distance_m**2) | stalled
+
+    def _replan(self, state: Tensor, now: CLRRTState, due: Tensor, lost: Tensor) -> CLRRTState:
+        """Plans for some episodes, indices [M]; those not lost, bool [M], change for a way to the goal alone."""
+        used_up = lost & (now.route.depth[due] > 0)
+        failures = torch.where(used_up, 0, now.failures[due])
+        route = self._search(state[due], now, due, failures)
+        found = route.status == PlanStatus.OK
+        crosses = (failures >= self.config.most_failures) & (route.depth > 0)
+        failures = torch.where(found | crosses, 0, failures + 1)
+        taken = (found | lost).nonzero()[:, 0]
+        members = due[taken]
+        tracking = now.tracking
+        return replace(
+            now,
+            route=_update(now.route, members, map_tensors(lambda values: values[taken], route)),
+            edge=now.edge.index_fill(0, members, 0),
+            tracking=replace(tracking, progress_m=tracking.progress_m.index_fill(0, members, 0)),
+            failures=now.failures.index_copy(0, due, failures),
+            mark_m=now.mark_m.index_fill(0, members, 0),
+            mark_step=now.mark_step.index_fill(0, members, now.step),
+        )
+
+    def _search(self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor) -> Route:
+        """Grows trees from root states [M, S] of some episodes and takes the best path of each."""
+        config = self.config
+        loop = self._closed_loop(now.problem.select(members), failures)
+        tracking = map_tensors(lambda values: values[members], now.tracking)
+        key = rng.stream_key(now.seed, "cl_rrt", now.step)
+        draws = rng.uniform(key, np.zeros(1, dtype=np.int64), (config.rounds, config.expansions_per_round, 3))
+        chance = torch.from_numpy(draws[0]).to(root)
+        sample_m = chance[..., :2] * root.new_tensor(now.problem.grid.extent_m)
+        goal_edges = math.ceil(config.goal_bias * config.expansions_per_round)
+        return search(loop, root, tracking, sample_m, chance[..., 2], goal_edges)
+
+    def _closed_loop(self, problem: Problem, failures: Tensor) -> ClosedLoop:
+        """What trees are grown with after so many failed plans, int64 [B]."""
+        config, follower = self.config, self._follower(problem)
+        least_m = max(self._tightest_m(follower), min(config.turning_radius_m, SPACING_M))
+        tries = failures % config.most_failures
+        return ClosedLoop(
+            problem=problem,
+            follower=follower,
+            radius_m=(config.turning_radius_m * 0.5 ** tries.to(problem.start)).clamp(min=least_m),
+            crossing=failures >= config.most_failures,
+            step_m=config.step_m,
+            edge_time_s=config.edge_time_s,
+        )
+
+    def _follower(self, problem: Problem) -> PathFollower:
+        return PathFollower(self.config.follower, problem.robot)
+
+    @staticmethod
+    def _tightest_m(follower: PathFollower) -> float:
+        return follower.speed_mps[0] / follower.turn_rate_radps
+
+
+def _update(route: Route, members: Tensor, new: Route) -> Route:
+    """Puts new routes in the place of those of some episodes, indices of shape [M]."""
+    if len(members) == len(route.status):
+        return new
+    return map_tensors(lambda old, changed: old.index_copy(0, members, changed), route, new)
+
+
+def _reference(route: Route, edge: Tensor) -> Reference:
+    """References of one edge [B] of each path."""
+    batch, depth, count, _ = route.rows.shape
+    path = torch.arange(batch, device=edge.device) * depth + edge.clamp(max=depth - 1)
+    return Reference(route.rows.reshape(-1, 4), path * count, count, SPACING_M)

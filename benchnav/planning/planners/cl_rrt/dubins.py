@@ -1,0 +1,122 @@
+"""Dubins paths to a point: shortest ways of a vehicle that drives forward and turns no tighter than a radius.
+
+A path is a row of arcs and straights, "segments", each with a curvature and a length. From a pose (x, y, θ)
+to a point at which any heading will do the shortest has two: an arc of the least radius and a straight or,
+for a point inside the turning circle, an arc away from it and one back. A point to the right is solved by
+mirroring it to the left.
+
+Sources: Dubins (1957), "On curves of minimal length with a constraint on average curvature"; Boissonnat and
+Bui (1994), "Accessibility region for a car that only moves forwards along optimal paths" (free heading).
+Letters in shapes: N points, G segments.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Arcs and straights, one after another.
+
+    Args:
+        curvature: signed, positive to the left, in 1/m, shape [*B, G].
+        length_m: shape [*B, G].
+    """
+
+    curvature: Tensor
+    length_m: Tensor
+
+    @property
+    def total_m(self) -> Tensor:
+        """Length of the whole path, shape [*B]."""
+        return self.length_m.sum(dim=-1)
+
+
+def dubins_length_to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> Tensor:
+    """Length of the shortest path to points with free heading; see `dubins_segments_to_point`."""
+    arc, rest, _, _ = _to_point(start, point, radius)
+    return (arc + rest) * radius
+
+
+def dubins_segments_to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> Segments:
+    """Finds the shortest path from poses to points at which any heading will do.
+
+    Args:
+        start: poses (x, y, θ) in metres and radians, shape [*B, 3].
+        point: positions (x, y), shape [*B, 2]; the leading dimensions of both broadcast.
+        radius: least turning radius in metres, a number or a tensor that broadcasts to [*B].
+
+    Returns:
+        Two segments, an arc and a straight or two arcs.
+    """
+    radius = torch.as_tensor(radius, dtype=start.dtype, device=start.device)
+    arc, rest, side, inside = _to_point(start, point, radius)
+    first = torch.where(inside, -side, side)
+    return Segments(
+        torch.stack((first, torch.where(inside, side, 0)), dim=-1) / radius[..., None],
+        torch.stack((arc, rest), dim=-1) * radius[..., None],
+    )
+
+
+def sample_segments(start: Tensor, segments: Segments, spacing: float, count: int) -> Tensor:
+    """Samples paths by arc length.
+
+    Args:
+        start: poses (x, y, θ) in metres and radians, shape [*B, 3].
+        segments: of shape [*B, G].
+        spacing: arc length from one point to the next in metres.
+        count: number of points N; those past the end repeat the end pose.
+
+    Returns:
+        Poses, shape [*B, N, 3]; headings run on without wrapping.
+    """
+    arc = torch.arange(count, dtype=start.dtype, device=start.device) * spacing
+    x, y, heading = (start[..., i, None] for i in range(3))
+    begin, at_begin = torch.zeros_like(heading), heading
+    for curvature, length in zip(segments.curvature.unbind(-1), segments.length_m.unbind(-1), strict=True):
+        within = torch.minimum((arc - begin).clamp(min=0), length[..., None])
+        half_turn = within * (0.5 * curvature[..., None])
+        chord = within * torch.sinc(half_turn / math.pi)
+        x = x + chord * (at_begin + half_turn).cos()
+        y = y + chord * (at_begin + half_turn).sin()
+        heading = heading + 2 * half_turn
+        begin = begin + length[..., None]
+        at_begin = at_begin + (curvature * length)[..., None]
+    return torch.stack((x, y, heading), dim=-1)
+
+
+def _to_frame(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Positions seen from poses, ahead and to the left, in units of the radius."""
+    scale = 1 / radius
+    offset_x, offset_y = (point[..., 0] - start[..., 0]) * scale, (point[..., 1] - start[..., 1]) * scale
+    cos, sin = start[..., 2].cos(), start[..., 2].sin()
+    return offset_x * cos + offset_y * sin, offset_y * cos - offset_x * sin
+
+
+def _to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Lengths of both segments in radii, the side of the point (±1), whether its circle holds it."""
+    x, y = _to_frame(start, point, radius)
+    side = torch.where(y < 0, -1.0, 1.0).to(y)
+    y = y.abs()
+    power = x * x + y * (y - 2)  # of the point over the left circle, centre (0, 1)
+    inside = power < 0
+    straight = power.clamp(min=0).sqrt()
+    arc = _wrap(torch.atan2(y - 1, x) + torch.atan2(torch.ones_like(straight), straight))
+    rest = straight
+    if bool(inside.any()):
+        # Triangle of the right circle's centre (0, -1), the last circle's centre (2 away) and the point.
+        square = x * x + (y + 1) * (y + 1)
+        apex = torch.acos(((square + 3) / (4 * square.sqrt())).clamp(-1, 1))
+        away = _wrap(math.pi / 2 + apex - torch.atan2(y + 1, x))
+        back = math.tau - torch.acos(((5 - square) / 4).clamp(-1, 1))
+        arc, rest = torch.where(inside, away, arc), torch.where(inside, back, rest)
+    return arc, rest, side, inside
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    """Angles in [0, 2π); rounding just under a full turn counts as none."""
+    wrapped = torch.remainder(angle, math.tau)
+    return torch.where(wrapped > math.tau - torch.finfo(angle.dtype).eps ** 0.75, 0, wrapped)

@@ -1,0 +1,214 @@
+"""Edges of the tree: references are drawn, simulated in closed loop, and judged.
+
+An edge is what becomes of the robot when its controller follows a reference from a node: it is driven
+through F with predicted traversability, step by step, and ends where its reference ends, at the goal, after
+its time, or where it collides.
+
+- An edge collides where it leaves the map or *enters* ground that is not free. One that begins on such
+  ground, because the truth differs from the prediction, may leave it, and goes on.
+- A loop that may cross does not collide with ground that is not free. How far an edge drives on such
+  ground is counted, since a metre of it has a price.
+- Of an edge that collides the nearer half of its free part stays, as the source keeps the safe nodes along
+  the way: in tight places no edge of full length is free.
+
+Source: Kuwata et al. (2009), algorithm 1, lines 4–9. Letters in shapes: B episodes, R edges driven at once,
+T time steps, N points of a reference, P drawn points of an edge, S state dimensions.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchnav.planning.objective import distance
+from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
+from benchnav.planning.planners.cl_rrt.pursuit import PathFollower, Reference, Tracking
+from benchnav.planning.problem import Problem
+
+SPACING_M = 0.1  # between the points of a reference
+DRAWN_M = 0.5  # between the drawn points of an edge
+_CHECK_STEPS = 8  # between looks at whether all edges of a round have ended
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoop:
+    """The robots and their controller on predicted ground, for all edges of a tree.
+
+    Args:
+        problem: B problems.
+        follower: the controller.
+        radius_m: turning radius of the references, shape [B].
+        crossing: whether edges may enter ground that is not free, bool, shape [B].
+        step_m: greatest length of an edge along its reference.
+        edge_time_s: greatest duration of an edge.
+    """
+
+    problem: Problem
+    follower: PathFollower
+    radius_m: Tensor
+    crossing: Tensor
+    step_m: float
+    edge_time_s: float
+
+    @property
+    def reference_points(self) -> int:
+        """Points N of a reference: as far as the controller looks ahead from an edge's end."""
+        return 2 + math.ceil((self.step_m + self.follower.config.lookahead_m) / SPACING_M)
+
+    @property
+    def drawn_points(self) -> int:
+        """Drawn points P of an edge."""
+        return 1 + math.ceil(self.step_m / DRAWN_M)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopState:
+    """All that it takes to drive on from somewhere. Shapes begin with [B, R].
+
+    Args:
+        state: of the robot, shape [B, R, S].
+        tracking: of the controller.
+        free: the robot stands on free ground, bool, shape [B, R].
+    """
+
+    state: Tensor
+    tracking: Tracking
+    free: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edges:
+    """Edges that were driven.
+
+    Args:
+        kept: whether anything is left of the edge, bool, shape [B, R].
+        end: where it ends.
+        time_s: its duration, shape [B, R].
+        blocked_m: metres of it on ground that is not free, shape [B, R].
+        arrived: it ends at the goal, bool, shape [B, R].
+        end_m: arc length along its reference at which it ends, shape [B, R].
+        drawn: positions along it, NaN past its end, shape [B, R, P, 2].
+    """
+
+    kept: Tensor
+    end: LoopState
+    time_s: Tensor
+    blocked_m: Tensor
+    arrived: Tensor
+    end_m: Tensor
+    drawn: Tensor
+
+
+def draw_references(loop: ClosedLoop, pose: Tensor, target_m: Tensor) -> tuple[Reference, Tensor]:
+    """Draws the shortest paths to points at which any heading will do.
+
+    Args:
+        loop: gives radii and lengths.
+        pose: where they begin, shape [B, R, 3].
+        target_m: points to reach, shape [B, R, 2].
+
+    Returns:
+        The references, and the length of each path, shape [B, R]; references run straight on past it.
+    """
+    segments = dubins_segments_to_point(pose, target_m, loop.radius_m[:, None])
+    poses = sample_segments(pose, segments, SPACING_M, loop.reference_points)
+    return Reference.along(poses, segments.total_m, SPACING_M), segments.total_m
+
+
+def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor) -> Edges:
+    """Drives along references and keeps what is free of collision.
+
+    Args:
+        loop: robots, controller and ground.
+        begin: where the edges begin; the progress of its tracking is not read.
+        reference: what to follow, of shape [B, R].
+        length_m: length of each reference, shape [B, R].
+
+    Returns:
+        The edges.
+    """
+    problem, end_m = loop.problem, length_m.clamp(max=loop.step_m)
+    path, progress, free, collided, integral, error = _simulate(loop, begin, reference, end_m)
+    at_goal = distance(path, problem.goal_m[:, None]) < problem.goal_radius_m
+    over = (progress >= end_m) | at_goal
+    over[-1] = True
+    last = _first(over)  # the step at which each edge ends
+    half = (_first(collided) - 1).clamp(min=0) // 2
+    last = torch.where(_at(collided, last), half, last)
+    before = (last - 1).clamp(min=0)
+    tracking = Tracking(
+        torch.zeros_like(end_m), _at(path, before)[..., :2], _at(integral, last), _at(error, last)
+    )
+    return Edges(
+        kept=last > 0,
+        end=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
+        time_s=last.to(path) * problem.dt_s,
+        blocked_m=_at(_blocked_m(path, free), last),
+        arrived=_at(at_goal, last),
+        end_m=_at(progress, last),
+        drawn=_thin(path[..., :2], progress, last, loop.drawn_points),
+    )
+
+
+def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: Tensor) -> list[Tensor]:
+    """Drives until all edges have ended or collided.
+
+    Returns:
+        At each of T steps: states, shape [T, B, R, S]; progress; whether the robot is on free ground;
+        whether it has collided by then; integral and error of the controller; each of shape [T, B, R].
+    """
+    problem, follower, barred = loop.problem, loop.follower, ~loop.crossing[:, None]
+    state, tracking, progress = begin.state, begin.tracking, torch.zeros_like(end_m)
+    was_free, collided = begin.free, torch.zeros_like(begin.free)
+    log: list[tuple[Tensor, ...]] = []
+    for step in range(max(1, round(loop.edge_time_s / problem.dt_s)) + 1):
+        progress = follower.advance(reference, state, progress)
+        ground = problem.ground_at(state)
+        free = ground > 0
+        collided = collided | (was_free & barred & ~free) | (ground == 0)
+        was_free = was_free | free
+        log.append((state, progress, free, collided, tracking.integral, tracking.error_mps))
+        if step % _CHECK_STEPS == 0 and bool(((progress >= end_m) | collided).all()):
+            break
+        action, tracking = follower.act(reference, state, tracking, progress)
+        state = problem.robot(state, action, ground.abs())
+    return [torch.stack(values) for values in zip(*log, strict=True)]
+
+
+def _blocked_m(path: Tensor, free: Tensor) -> Tensor:
+    """Metres driven on ground that is not free up to each step, shape [T, B, R]."""
+    moved = torch.where(free[:-1], 0, distance(path[1:], path[:-1]))
+    return torch.nn.functional.pad(moved.cumsum(dim=0), (0, 0, 0, 0, 1, 0))
+
+
+def _first(condition: Tensor) -> Tensor:
+    """First step at which a condition [T, B, R] holds, int64, shape [B, R]; 0 where it never does."""
+    return condition.to(torch.uint8).argmax(dim=0)
+
+
+def _at(log: Tensor, step: Tensor) -> Tensor:
+    """Picks from the first dimension: a log [T, B, R, *F] at steps [B, R] gives [B, R, *F]."""
+    index = step.reshape(1, *step.shape, *[1] * (log.dim() - 3))
+    return log.gather(0, index.expand(1, *log.shape[1:]))[0]
+
+
+def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:
+    """Thins simulated positions to equal progress, the last position kept.
+
+    Args:
+        path: positions, shape [T, B, R, 2].
+        progress: shape [T, B, R].
+        last: step at which each edge ends, shape [B, R].
+        count: points P.
+
+    Returns:
+        Positions, NaN past the end, shape [B, R, P, 2].
+    """
+    level = torch.arange(count, dtype=progress.dtype, device=progress.device) * DRAWN_M
+    along = progress.movedim(0, -1).contiguous()
+    step = torch.searchsorted(along, level.expand(*last.shape, -1).contiguous())
+    step = torch.minimum(step, last[..., None])
+    thinned = path.movedim(0, 2).gather(2, step[..., None].expand(-1, -1, -1, 2))
+    used = torch.nn.functional.pad(step[..., :-1] < last[..., None], (1, 0), value=True)
+    return torch.where(used[..., None], thinned, math.nan)

@@ -1,0 +1,196 @@
+"""The dynamic window approach (DWA): the best constant (v, ω) within reach of the accelerations.
+
+From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision avoidance", comes the window:
+the velocity pairs that the robot can reach within one step. What is done with them is not theirs: each pair
+is held for the whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by the
+heading that it ends with. There are no admissible velocities by braking distance, no terms for clearance
+and speed; a pair that does not stay on free ground for the whole horizon pays the price of each step off
+it, which is why DWA creeps in narrow places and needs a recovery where it stands. Letters in shapes: B
+episodes, M velocity pairs, T horizon steps, S state dimensions.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Robot, action_limits
+
+# Of a trajectory's positions, every so many are drawn.
+_DRAW_EVERY = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class DWAConfig:
+    """Settings of DWA; the paper gives none, these are ours.
+
+    Args:
+        speeds: linear velocities in the window.
+        turn_rates: angular velocities in the window.
+        horizon: steps T.
+        acceleration: greatest change of linear velocity, m/s², of a robot without limits of its own.
+        turn_acceleration: greatest change of angular velocity, rad/s², of a robot without limits of its own.
+        heading_weight: cost of a radian between the last heading and the way-point; it lets a robot
+            turn on the spot, which changes no distance.
+        arrival_m: a trajectory this near to the way-point has arrived and costs no more, so that a
+            near way-point does not slow the robot.
+    """
+
+    speeds: int = 10
+    turn_rates: int = 10
+    horizon: int = 50
+    acceleration: float = 0.5
+    turn_acceleration: float = 0.5
+    heading_weight: float = 2.0
+    arrival_m: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuses an empty window."""
+        for name in ("speeds", "turn_rates", "horizon", "acceleration", "turn_acceleration"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"Expected `{name}` > 0 for DWA, got {getattr(self, name)}.")
+
+
+@dataclass(frozen=True)
+class DWAState:
+    """What DWA carries from step to step.
+
+    Args:
+        problem: what is being solved.
+        velocity: (v, ω) that the robots have, shape [B, 2].
+    """
+
+    problem: Problem
+    velocity: Tensor
+
+
+class DWA:
+    """DWA as a local planner, for robots with actions (v, ω).
+
+    Args:
+        config: settings.
+    """
+
+    name = "DWA"
+
+    def __init__(self, config: DWAConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config = config or DWAConfig()
+
+    def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
+        """Starts from standing robots; draws nothing. See `LocalPlanner`."""
+        return DWAState(problem, problem.start.new_zeros(len(problem), 2))
+
+    def plan_toward(
+        self, step: Step, plan_state: DWAState, target_m: Tensor
+    ) -> tuple[Tensor, DWAState, Plan]:
+        """Picks the window's best pair; see `LocalPlanner`."""
+        problem = plan_state.problem
+        window = velocity_window(problem, plan_state.velocity, self.config)
+        cost, positions = judge(problem, step.state, window, target_m, self.config)
+        best = cost.argmin(dim=1)[:, None, None]
+        action = window.gather(1, best.expand(-1, 1, 2))[:, 0]
+        plan = Plan.empty(len(problem), step.state.device)
+        if step.draw:
+            drawn = torch.stack(positions, dim=2)
+            path = drawn.gather(1, best[..., None].expand(-1, 1, *drawn.shape[2:]))[:, 0]
+            plan = Plan.empty(len(problem), step.state.device, path=path, samples=drawn[:, :, ::_DRAW_EVERY])
+        return action, plan_state, plan
+
+    def took(self, plan_state: DWAState, action: Tensor) -> DWAState:
+        """Notes the velocities that the robots now have; see `LocalPlanner`."""
+        problem, velocity = plan_state.problem, action
+        limits = action_limits(problem.robot)
+        if limits is not None:
+            change = [
+                (action[:, axis] - plan_state.velocity[:, axis]).clamp(
+                    -rate * problem.dt_s, rate * problem.dt_s
+                )
+                for axis, rate in enumerate(limits)
+            ]
+            velocity = plan_state.velocity + torch.stack(change, dim=1)
+        return DWAState(problem, velocity)
+
+    def remarks(self, robot: Robot) -> tuple[str, ...]:
+        """Names the accelerations of the window where they are not the robot's; see `Planner`."""
+        if action_limits(robot) is not None:
+            return ()
+        config = self.config
+        return (
+            f"DWA keeps to {config.acceleration:g} m/s² and {config.turn_acceleration:g} rad/s² of its own, "
+            "since the robot has no limits",
+        )
+
+
+def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
+    """Velocity pairs that the robot can reach within one step.
+
+    Args:
+        problem: for its robot's bounds, limits and time step.
+        velocity: current (v, ω), shape [B, 2].
+        config: settings.
+
+    Returns:
+        Pairs (v, ω) within the bounds, shape [B, M, 2].
+    """
+    robot = problem.robot
+    rates = action_limits(robot) or (config.acceleration, config.turn_acceleration)
+
+    def spread(axis: int, count: int) -> Tensor:
+        reach, low, high = rates[axis] * robot.dt_s, robot.action_low[axis], robot.action_high[axis]
+        least = (velocity[:, axis, None] - reach).clamp(low, high)
+        most = (velocity[:, axis, None] + reach).clamp(low, high)
+        share = torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
+        return least + (most - least) * share
+
+    speeds, turn_rates = spread(0, config.speeds), spread(1, config.turn_rates)
+    pairs = torch.stack(torch.broadcast_tensors(speeds[:, :, None], turn_rates[:, None, :]), dim=-1)
+    return pairs.flatten(1, 2)
+
+
+def judge(
+    problem: Problem, state: Tensor, window: Tensor, target_m: Tensor, config: DWAConfig
+) -> tuple[Tensor, list[Tensor]]:
+    """Rolls out the window's pairs and sums their costs.
+
+    Args:
+        problem: B problems.
+        state: shape [B, S].
+        window: pairs (v, ω), shape [B, M, 2].
+        target_m: way-points (x, y), shape [B, 2].
+        config: settings.
+
+    Returns:
+        Cost of each pair, shape [B, M]; positions after each step, the first included, T + 1 of shape
+        [B, M, 2].
+    """
+    target = target_m[:, None]
+    states = state[:, None].expand(-1, window.shape[1], -1)
+    positions = [states[..., :2]]
+    cost = torch.zeros_like(window[..., 0])
+    under_way = torch.ones_like(cost, dtype=torch.bool)
+    for _ in range(config.horizon):
+        ground = problem.ground_at(states)
+        cost = cost + problem.stage_cost(states, window, ground, target) * under_way
+        states = problem.robot(states, window, ground.abs())
+        positions.append(states[..., :2])
+        offset = states[..., :2] - target
+        under_way = under_way & ((offset * offset).sum(-1) > config.arrival_m**2)
+    last = problem.terminal_cost(states, target) + config.heading_weight * _turn_left(state, states, target)
+    return cost + last * under_way, positions
+
+
+def _turn_left(state: Tensor, last: Tensor, target: Tensor) -> Tensor:
+    """Angle by which the last heading misses the way-point, shape [B, M].
+
+    It is not wrapped: a turn past the way-point counts as such, else a robot that spins would find
+    another round as good as stopping.
+    """
+    offset = target - state[:, None, :2]
+    missing = torch.atan2(offset[..., 1], offset[..., 0]) - state[:, None, 2]
+    missing = torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
+    return (missing - (last[..., 2] - state[:, None, 2])).abs()

@@ -1,0 +1,260 @@
+"""Model predictive path integral control (MPPI).
+
+Samples K action sequences about the current mean, rolls each out through F under λ̂, and averages them by
+their exponentiated cost. No global path. Source: Williams et al. (2017), "Information theoretic MPC for
+model-based reinforcement learning", algorithms 1 and 2; paper IV-A3. Letters in shapes: B episodes, K
+samples, T horizon steps, S state, A action dimensions.
+
+Of the source it differs in one thing: samples are clipped to the action bounds before they are averaged;
+Williams averages them as drawn and clips within F. The control cost weighs the noise as drawn in both,
+since it is a ratio of the densities that the samples were drawn from.
+
+The samples' noise is shared by the episodes of a batch: it is drawn once a step, as a pure function of the
+plan state's seed and step, so an episode has the same noise alone as in any batch.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from benchnav import rng
+from benchnav.errors import ConfigError
+from benchnav.planning.objective import Objective
+from benchnav.planning.planners.compilation import Fused
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.problem import Problem, stage_cost
+from benchnav.planning.robots import Robot
+from benchnav.terrain import Grid
+
+# A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
+_CHUNK_STEPS = 10
+_DRAWN_SAMPLES = 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class MPPIConfig:
+    """Settings of MPPI; the paper gives none, these are ours.
+
+    Args:
+        horizon: steps T.
+        samples: action sequences K.
+        noise: standard deviation of each sampled action; by default for (v, ω) in m/s and rad/s.
+        temperature: scale of cost below which samples count alike.
+        control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the
+            current mean itself as the base distribution (α = 1 in the source).
+    """
+
+    horizon: int = 50
+    samples: int = 5000
+    noise: tuple[float, ...] = (0.5, 0.5)
+    temperature: float = 0.5
+    control_cost: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuses settings that sample nothing."""
+        for name in ("horizon", "samples", "temperature"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {getattr(self, name)}.")
+        if not self.noise or not all(0 < scale < math.inf for scale in self.noise):
+            raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
+        if not 0 <= self.control_cost < math.inf:
+            raise ConfigError(f"Expected `control_cost` ≥ 0 for MPPI, got {self.control_cost}.")
+
+
+@dataclass(frozen=True)
+class MPPIState:
+    """What MPPI carries from step to step.
+
+    Args:
+        problem: what is being solved.
+        mean: mean action sequence, shape [B, T, A].
+        scale: standard deviation of each action's noise, shape [A].
+        seed: root of the noise.
+        step: steps planned so far.
+    """
+
+    problem: Problem
+    mean: Tensor
+    scale: Tensor
+    seed: int
+    step: int
+
+
+class MPPI:
+    """MPPI as a planner to the goal, and as a local planner to way-points.
+
+    Args:
+        config: settings.
+    """
+
+    name = "MPPI"
+
+    def __init__(self, config: MPPIConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config = config or MPPIConfig()
+        self._advance = Fused(advance_chunk, self.config.samples)
+        self._average = Fused(average, self.config.samples)
+
+    @property
+    def compiled(self) -> bool | None:
+        """Whether it runs compiled; None before the first step."""
+        verdicts = (self._advance.compiled, self._average.compiled)
+        return None if None in verdicts else all(verdicts)
+
+    def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
+        """Starts from a standing robot; see `Planner`.
+
+        Raises:
+            ConfigError: the robot has another number of actions than there are noise scales.
+        """
+        names, config = problem.robot.action_names, self.config
+        if len(names) != len(config.noise):
+            raise ConfigError(
+                f"Expected option `noise` of MPPI with {len(names)} values, for {', '.join(names)}, "
+                f"got {config.noise}."
+            )
+        seed = int(torch.randint(2**62, (), generator=generator))
+        mean = problem.start.new_zeros(len(problem), config.horizon, len(names))
+        return MPPIState(problem, mean, problem.start.new_tensor(config.noise), seed, 0)
+
+    def plan(self, step: Step, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
+        """Solves one step toward the goal; see `Planner`."""
+        return self.plan_toward(step, plan_state, plan_state.problem.goal_m)
+
+    def plan_toward(
+        self, step: Step, plan_state: MPPIState, target_m: Tensor
+    ) -> tuple[Tensor, MPPIState, Plan]:
+        """Solves one step; see `LocalPlanner`."""
+        problem, config, earlier = plan_state.problem, self.config, plan_state.mean
+        noise = draw_noise(plan_state, config.samples)
+        cost = rollout_cost(problem, step.state, earlier, noise, target_m, self._advance)
+        if config.control_cost:
+            cost = cost + config.control_cost * control_cost(earlier, noise, plan_state.scale)
+        weights = torch.softmax(-cost / config.temperature, dim=1)
+        mean = self._average(earlier, noise, weights, *problem.action_bounds)
+        shifted = torch.cat((mean[:, 1:], mean[:, -1:]), dim=1)
+        plan = Plan.empty(len(problem), step.state.device)
+        if step.draw:
+            plan = _drawn(problem, step.state, mean, earlier, noise, weights)
+        return mean[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
+
+    def took(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
+        """Plans on as before; see `LocalPlanner`."""
+        return plan_state
+
+
+def draw_noise(plan_state: MPPIState, samples: int) -> Tensor:
+    """Draws the noise of one step, shape [T, A, K].
+
+    Each step's generator is seeded by a hash: PyTorch's on the CPU looks at 32 bits of a seed alone, so
+    that seeds in a row would repeat one another's steps.
+    """
+    mean, scale = plan_state.mean, plan_state.scale
+    generator = rng.generator(rng.stream_key(plan_state.seed, plan_state.step), mean.device)
+    shape = (*mean.shape[1:], samples)
+    return torch.randn(shape, generator=generator, device=mean.device, dtype=mean.dtype) * scale[:, None]
+
+
+def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
+    """The cost uᵀΣ⁻¹ε of drawing about the mean rather than about 0.
+
+    Args:
+        mean: mean action sequences u, shape [B, T, A].
+        noise: as drawn, not clipped, ε, shape [T, A, K].
+        scale: standard deviations, Σ = diag(scale²), shape [A].
+
+    Returns:
+        Shape [B, K].
+    """
+    return torch.einsum("bta,tak->bk", mean / scale**2, noise)
+
+
+def rollout_cost(
+    problem: Problem,
+    state: Tensor,
+    mean: Tensor,
+    noise: Tensor,
+    target_m: Tensor,
+    advance: Callable[..., tuple[Tensor, Tensor]] | None = None,
+) -> Tensor:
+    """Sums J and the price of ground that is not free along sampled action sequences.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        mean: mean action sequences, shape [B, T, A].
+        noise: added to every mean and clipped to the action bounds, shape [T, A, K].
+        target_m: (x, y) to be reached, shape [B, 2].
+        advance: `advance_chunk` or the same compiled.
+
+    Returns:
+        Cost of each sequence, shape [B, K].
+    """
+    advance = advance or advance_chunk
+    samples = noise.shape[2]
+    # State dimensions outermost in memory, so that each is contiguous in samples.
+    states = state.T[:, :, None].expand(-1, -1, samples).contiguous().movedim(0, -1)
+    target = target_m[:, None].contiguous()
+    cost = state.new_zeros(states.shape[:2])
+    for first in range(0, mean.shape[1], _CHUNK_STEPS):
+        chunk = slice(first, first + _CHUNK_STEPS)
+        states, cost = advance(
+            states, cost, mean[:, chunk].contiguous(), noise[chunk].contiguous(), *problem.action_bounds,
+            problem.padded_ground, target, problem.grid, problem.robot, problem.objective,
+        )  # fmt: skip
+    return cost + problem.terminal_cost(states, target)
+
+
+def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
+    """Positions along action sequences, the first included.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        actions: shape [B, T, A, K].
+
+    Returns:
+        Shape [B, K, T + 1, 2].
+    """
+    states = state[:, None].expand(-1, actions.shape[-1], -1)
+    positions = [states[..., :2]]
+    for action in actions.movedim(-1, 2).unbind(1):
+        states = problem.robot(states, action, problem.traversability_at(states))
+        positions.append(states[..., :2])
+    return torch.stack(positions, dim=2)
+
+
+def advance_chunk(
+    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
+    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Rolls samples out over a chunk of the horizon, adding up their costs."""
+    for step in range(mean.shape[1]):
+        action = _perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
+        ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
+        cost = cost + stage_cost(objective, states, action, ground, target)
+        states = robot(states, action, ground.abs())
+    return states.movedim(-1, 0).contiguous().movedim(0, -1), cost
+
+
+def average(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Averages the sampled action sequences by their weights [B, K], shape [B, T, A]."""
+    return (_perturb(mean[..., None], noise, low, high) * weights[:, None, None]).sum(-1)
+
+
+def _perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Samples actions: mean plus noise within the bounds, control dimension next to last."""
+    return torch.clamp(mean + noise, low[:, None], high[:, None])
+
+
+def _drawn(
+    problem: Problem, state: Tensor, mean: Tensor, earlier: Tensor, noise: Tensor, weights: Tensor
+) -> Plan:
+    """The path of the mean and those of the best samples."""
+    best = weights.topk(min(_DRAWN_SAMPLES, weights.shape[1]), dim=1).indices
+    samples = _perturb(earlier[..., None], noise[..., best].movedim(2, 0), *problem.action_bounds)
+    paths = rollout_path(problem, state, torch.cat((mean[..., None], samples), dim=3))
+    return Plan.empty(len(problem), state.device, path=paths[:, 0], samples=paths[:, 1:])

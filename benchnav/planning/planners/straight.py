@@ -1,0 +1,60 @@
+"""Driving straight at the goal: the floor that a planner has to beat.
+
+`Straight` looks at nothing but the goal. Planners with a global path recover by the same control law.
+Letters in shapes: B episodes, S state and A action dimensions.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot
+
+# Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
+_TURN_GAIN = 2.0
+# Least share of the top speed of a robot that steers: it cannot turn while it stands.
+_CREEP = 0.3
+
+STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
+
+
+def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
+    """Actions that turn toward a target and drive at it, the slower the farther the robot looks away.
+
+    Args:
+        state: shape [B, S], beginning with (x, y, θ).
+        target_m: (x, y), shape [B, 2].
+        robot: one of the actions `STEERS`.
+
+    Returns:
+        Actions within the bounds, shape [B, 2].
+    """
+    offset = target_m - state[:, :2]
+    missing = torch.atan2(offset[:, 1], offset[:, 0]) - state[:, 2]
+    missing = torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
+    least = 0.0 if TURN_RATE in robot.action_names else _CREEP
+    speed = robot.action_high[0] * missing.cos().clamp(min=least)
+    wanted = (speed, _TURN_GAIN * missing)
+    bounds = zip(wanted, robot.action_low, robot.action_high, strict=True)
+    return torch.stack([action.clamp(low, high) for action, low, high in bounds], dim=1)
+
+
+class Straight:
+    """The blind baseline: full speed straight at the goal, whatever the ground is."""
+
+    steers = STEERS
+    follows = "nothing: drives straight at the goal"
+    blind = True
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        """Keeps the problem, for its goals; draws nothing. See `Planner`."""
+        return problem
+
+    def plan(self, step: Step, plan_state: Problem) -> tuple[Tensor, Problem, Plan]:
+        """Steers toward the goal; see `Planner`."""
+        action = steer_toward(step.state, plan_state.goal_m, plan_state.robot)
+        line = torch.stack((step.state[:, :2], plan_state.goal_m), dim=1)
+        return action, plan_state, Plan.empty(len(action), action.device, path=line)

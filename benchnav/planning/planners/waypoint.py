@@ -1,0 +1,133 @@
+"""The way-point that a local planner heads for: the farthest point of a path that is worth a short cut.
+
+The way-point is the farthest point of the path, within the look-ahead, whose straight line costs at most
+1.1 times the path under A*'s own costs. Both are integrated exactly over the cells that they cross, so no
+corner between two sampled points is missed. Letters in shapes: B episodes, J lines, N points, H×W cells.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchnav.planning.free_space import PRICE
+from benchnav.planning.problem import Problem
+from benchnav.terrain import Grid
+
+# A straight line may cost this much more than the path that it shortens.
+_SHORT_CUT = 1.1
+
+
+@dataclass(frozen=True)
+class GroundCosts:
+    """What a metre of straight line costs in each cell; maps framed by `Grid.pad` for lookups.
+
+    A metre costs per_m · √(1 + (gradient · direction)²) + price_per_m.
+
+    Args:
+        grid: size and resolution of the maps.
+        per_m: seconds, or 1 for the length, shape [B, (H + 2)·(W + 2)].
+        price_per_m: of ground that is not free, shape [B, (H + 2)·(W + 2)].
+        gradient: rise of a metre along x and along y, which the 3D length needs, each of shape
+            [B, (H + 2)·(W + 2)]; None on flat ground.
+    """
+
+    grid: Grid
+    per_m: Tensor
+    price_per_m: Tensor
+    gradient: tuple[Tensor, Tensor] | None = None
+
+
+def ground_costs(problem: Problem, by_time: bool = False) -> GroundCosts:
+    """A*'s own costs a metre.
+
+    Args:
+        problem: B problems.
+        by_time: seconds at top speed under λ̂ rather than 3D length.
+    """
+    grid = problem.grid
+    price = grid.pad(PRICE * (~problem.free).to(problem.risk_map), outside=PRICE)
+    if by_time:
+        pace = 1 / (problem.traversability * problem.robot.top_speed_mps)
+        return GroundCosts(grid, grid.pad(pace, outside=0.0), price)
+    along_y, along_x = torch.gradient(problem.elevation_m, spacing=grid.resolution_m, dim=(1, 2))
+    gradient = grid.pad(along_x, outside=0.0), grid.pad(along_y, outside=0.0)
+    return GroundCosts(grid, torch.ones_like(price), price, gradient)
+
+
+def line_costs(ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: int) -> Tensor:
+    """Integrates the cost of straight lines over the cells that they cross.
+
+    Args:
+        ground: costs of a metre.
+        start_m: (x, y) of one end, shape [B, J, 2].
+        end_m: (x, y) of the other, shape [B, J, 2].
+        crossings: most columns, and most rows, into which a line may pass from its first.
+
+    Returns:
+        Shape [B, J].
+    """
+    offset = end_m - start_m
+    cuts = _grid_cuts(start_m, offset, ground.grid.resolution_m, crossings)
+    share = cuts.diff(dim=-1)
+    middle = start_m[:, :, None] + (0.5 * (cuts[..., 1:] + cuts[..., :-1]))[..., None] * offset[:, :, None]
+    length = torch.linalg.vector_norm(offset, dim=-1)[..., None]
+
+    def at_pieces(padded: Tensor) -> Tensor:
+        return ground.grid.lookup(padded, middle[..., 0], middle[..., 1])
+
+    per_m = at_pieces(ground.per_m)
+    if ground.gradient is not None:
+        rises = [at_pieces(along) * offset[..., axis, None] for axis, along in enumerate(ground.gradient)]
+        # Of a line without length any slope will do: it costs nothing.
+        slope = sum(rises) / length.clamp(min=1e-9)
+        per_m = per_m * torch.sqrt(1 + slope * slope)
+    return ((per_m + at_pieces(ground.price_per_m)) * share * length).sum(dim=-1)
+
+
+def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -> Tensor:
+    """Picks the farthest point of a path whose straight line costs hardly more than the path.
+
+    Args:
+        ground: A*'s costs of a metre.
+        points_m: the robot, then the centre of each next cell of its path, then the goal, shape [B, N, 2].
+        lookahead_m: how far along the path to look.
+
+    Returns:
+        (x, y), shape [B, 2]; the path's next point where no line is worth it.
+    """
+    grid = ground.grid
+    robot, ahead = points_m[:, :1], points_m[:, 1:]
+    row, column = grid.cell_of(robot[..., 0], robot[..., 1])
+    own = torch.stack(grid.centre_of(row, column), dim=-1).to(robot)
+    count = ahead.shape[1]
+    # Straight lines to each point, the path's legs, and the two legs by way of the own cell's centre.
+    begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, own), dim=1)
+    end = torch.cat((ahead, ahead[:, 1:], own, ahead[:, :1]), dim=1)
+    # Only what is within the look-ahead counts, and that spans no more columns or rows than this.
+    crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
+    costs = line_costs(ground, begin, end, crossings)
+    lines, legs, detour = costs[:, :count], costs[:, count:-2], costs[:, -2:].sum(dim=1, keepdim=True)
+    # The line to a neighbour across a corner may cut a cell that the path does not touch.
+    path = torch.cat((torch.minimum(lines[:, :1], detour), legs), dim=1).cumsum(dim=1)
+    steps = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2)
+    near = steps.cumsum(dim=1) <= lookahead_m
+    worth = (lines <= _SHORT_CUT * path) & near
+    rank = torch.arange(ahead.shape[1], device=ahead.device)
+    farthest = torch.where(worth, rank, 0).amax(dim=1)
+    return ahead.gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0]
+
+
+def _grid_cuts(start_m: Tensor, offset_m: Tensor, resolution_m: float, crossings: int) -> Tensor:
+    """Shares of a line at which it begins, crosses the grid's lines, and ends; sorted, [B, J, 2·crossings + 2]."""
+    lines = torch.arange(crossings, device=start_m.device) + 1
+    cuts = [torch.zeros_like(start_m[..., :1]), torch.ones_like(start_m[..., :1])]
+    for axis in (0, 1):
+        begin, along = start_m[..., axis, None], offset_m[..., axis, None]
+        low = torch.minimum(begin, begin + along)
+        crossed = ((low / resolution_m).floor() + lines) * resolution_m
+        # A line along this axis's grid lines crosses none of them: not a number, or infinite.
+        share = (crossed - begin) / along
+        cuts.append(share.nan_to_num(1.0, 1.0, 1.0).clamp(0, 1))
+    return torch.cat(cuts, dim=-1).sort(dim=-1).values

@@ -1,0 +1,49 @@
+"""How episodes end.
+
+Letters in shapes: B episodes, N steps.
+"""
+
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+STUCK_WINDOW_S = 10.0
+STUCK_DISTANCE_M = 0.5
+
+
+class Outcome(IntEnum):
+    """How an episode stands, or how it ended. All but SUCCESS count as failures."""
+
+    RUNNING = 0
+    SUCCESS = 1
+    TIMEOUT = 2
+    STUCK = 3  # a timeout whose last 10 s drove and moved under 0.5 m: the ground held the robot
+    OUT_OF_BOUNDS = 4
+    PLANNER_FAILURE = 5  # the planner gave up
+    STALLED = 6  # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner held it
+    PLANNER_ERROR = 7  # the planner raised, ran out of time, or returned what no robot can do
+    MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
+
+
+FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCESS))
+
+
+def tell_standstill(outcome: Tensor, positions_m: Tensor, driven_m: Tensor, dt_s: float) -> Tensor:
+    """Tells timeouts in which the robot stood: stuck where it drove, stalled where it did not.
+
+    Args:
+        outcome: shape [B].
+        positions_m: shape [B, N + 1, 2], to the end of the time budget.
+        driven_m: how far each step would have moved the robot on ground of λ = 1, shape [B, N].
+        dt_s: time step.
+
+    Returns:
+        Outcomes, shape [B].
+    """
+    window = max(1, round(STUCK_WINDOW_S / dt_s))
+    recent = positions_m[:, -(window + 1) :]
+    moved = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
+    drove = driven_m[:, -window:].sum(dim=1)
+    standing = torch.where(drove >= STUCK_DISTANCE_M, Outcome.STUCK, Outcome.STALLED)
+    return torch.where((outcome == Outcome.TIMEOUT) & (moved < STUCK_DISTANCE_M), standing, outcome)

@@ -1,0 +1,117 @@
+"""The simulation: true episodes, stepped as one batch.
+
+It holds the true terrain; λ is read where the robot stands and scales its motion. Letters in shapes: B
+episodes, S state and A action dimensions.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from benchnav.planning.objective import distance
+from benchnav.planning.problem import Task
+from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.realisation import Realisation
+from benchnav.planning.world.world import World
+from benchnav.terrain import Terrain
+
+
+@dataclass(frozen=True)
+class SimulationState:
+    """Where a batch of episodes stands.
+
+    Args:
+        state: robot states, shape [B, S].
+        outcome: `Outcome` of each, int64, shape [B].
+        step: steps taken by each, int64, shape [B].
+    """
+
+    state: Tensor
+    outcome: Tensor
+    step: Tensor
+
+    @property
+    def running(self) -> Tensor:
+        """Which episodes go on, bool, shape [B]."""
+        return self.outcome == Outcome.RUNNING
+
+
+class Simulation:
+    """B true episodes on B maps.
+
+    Args:
+        terrain: the true maps.
+        task: robot, goal radius; the same that planners are given.
+        world: what λ does.
+        goal_m: goals, shape [B, 2].
+        noise_key: root of the noise; see `rng.stream_key`.
+        instances: names each episode's stream under that root, B of them.
+    """
+
+    def __init__(
+        self,
+        terrain: Terrain,
+        task: Task,
+        world: World,
+        goal_m: Tensor,
+        noise_key: int,
+        instances: Sequence[int],
+    ) -> None:
+        """Draws the luck of all steps."""
+        self.robot = task.robot
+        self.steps = world.steps(task.robot.dt_s)
+        self._grid, self._goal_m, self._goal_radius_m = terrain.grid, goal_m, task.rules.goal_radius_m
+        self._realisation = Realisation(terrain, world, self.steps, noise_key, instances)
+        self._low = goal_m.new_tensor(task.robot.action_low)
+        self._high = goal_m.new_tensor(task.robot.action_high)
+
+    def init(self, start: Tensor) -> SimulationState:
+        """Puts the robots at their initial states, shape [B, S]."""
+        zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)
+        return SimulationState(start.clone(), zero, zero)
+
+    def step(self, now: SimulationState, action: Tensor) -> tuple[SimulationState, Tensor]:
+        """Advances the running episodes by one step; ended ones stay as they are.
+
+        Args:
+            now: where the episodes stand; not changed.
+            action: shape [B, A]; clipped to the bounds.
+
+        Returns:
+            Where they stand next, and the λ that each robot met, shape [B].
+        """
+        traversability = self._realisation.at(now.state, now.step)
+        moved = self.robot(now.state, action.clamp(self._low, self._high), traversability)
+        state = torch.where(now.running[:, None], moved, now.state)
+        step = now.step + now.running
+        arrived = distance(state, self._goal_m) < self._goal_radius_m
+        inside = self._grid.contains(state[:, 0], state[:, 1])
+        outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
+        outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
+        outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
+        return SimulationState(state, torch.where(now.running, outcome, now.outcome), step), traversability
+
+    def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
+        """Where an action would take the robots on ground of λ = 1, shape [B, S]; what was commanded."""
+        action = action.clamp(self._low, self._high)
+        return self.robot(now.state, action, torch.ones_like(now.state[:, 0]))
+
+    def exchange(self, members: Tensor, others: "Simulation") -> "Simulation":
+        """Gives some episodes the maps, goals and luck of another simulation; the rest keep theirs.
+
+        Args:
+            members: indices of the episodes, int64, shape [M].
+            others: M episodes of the same task and world.
+        """
+        made = copy.copy(self)
+        made._goal_m = self._goal_m.index_copy(0, members, others._goal_m)
+        made._realisation = self._realisation.exchange(members, others._realisation)
+        return made
+
+
+def end(now: SimulationState, which: Tensor, outcome: Outcome) -> SimulationState:
+    """Ends running episodes, bool [B], with an outcome that the simulation cannot see itself."""
+    return replace(now, outcome=torch.where(now.running & which, outcome, now.outcome))

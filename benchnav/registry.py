@@ -1,0 +1,347 @@
+"""The one registry: how every replaceable part is named, found, configured and identified.
+
+Parts are of five kinds: planners, models, risk measures, robots and objectives. A part is named by one
+of four forms:
+
+- a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
+  package; the shipped parts are entry points too;
+- `package.module:Name`, from anything that can be imported;
+- `path/to/file.py:Name`, from a file that stands alone;
+- any of these followed by `:VALUE`, which sets its first option: `cvar:0.5` is `cvar` at level 0.5.
+
+What stands at the name is a class or a function. Its keyword parameters are its options; where the one
+parameter is a dataclass named `config`, the fields of that are. A class is made with them; a risk measure
+that is a function is called with them beside its mixture.
+"""
+
+import importlib
+import inspect
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache, partial
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+import benchnav
+from benchnav.errors import ConfigError
+from benchnav.options import (
+    NO_DEFAULT,
+    Option,
+    call,
+    config_class,
+    hint,
+    list_options,
+    one_line,
+    parameters,
+    plain,
+    refuse_unknown,
+    type_name,
+    typed,
+)
+from benchnav.sources import (
+    attribute,
+    digest_of,
+    digest_of_package,
+    digest_of_target,
+    distribution_of,
+    load_file,
+)
+
+__all__ = [
+    "KINDS",
+    "NO_DEFAULT",
+    "Found",
+    "Option",
+    "Part",
+    "complete",
+    "digest_of",
+    "find",
+    "hint",
+    "make",
+    "names",
+    "options_of",
+    "read_part",
+    "register",
+    "type_name",
+]
+
+KINDS = ("planner", "model", "risk", "robot", "objective")
+
+_GIVEN = ("robot",)  # parameters that the program gives, so no options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part as it was asked for.
+
+    Args:
+        part: a name, `package.module:Name` or `path/to/file.py:Name`.
+        label: what tables call it.
+        options: values of its options.
+    """
+
+    part: str
+    label: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A part that was found.
+
+    Args:
+        target: the class or function.
+        origin: where it comes from, for people.
+        digest: SHA-256 of the file or of the packages it comes from; empty for the parts of this package,
+            and where no source is to be had.
+        shipped: it is one of ours.
+        everywhere: other processes find it too.
+    """
+
+    target: Any
+    origin: str
+    digest: str
+    shipped: bool = False
+    everywhere: bool = True
+
+
+_REGISTERED: dict[tuple[str, str], Any] = {}
+
+
+def register(kind: str, name: str, target: Any) -> None:
+    """Makes a part known by name in this process alone, as a notebook needs it.
+
+    Args:
+        kind: one of `KINDS`.
+        name: what it is to be called.
+        target: the class or function.
+    """
+    _REGISTERED[_checked(kind), name] = target
+
+
+def names(kind: str) -> list[str]:
+    """Names of a kind that are known here, sorted."""
+    registered = {name for known, name in _REGISTERED if known == kind}
+    return sorted(registered | {point.name for point in _points(kind)})
+
+
+def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
+    """Reads a part as users write it: `NAME`, or `{part: NAME, label: L, options: {…}}`.
+
+    Args:
+        kind: one of `KINDS`.
+        given: the text or the mapping.
+
+    Returns:
+        The part, with a value after its last colon moved to its options. Without a label it is called as
+        it was written, less the module or file.
+
+    Raises:
+        ConfigError: it is of neither form.
+    """
+    if isinstance(given, Part):
+        return given
+    fields: Any = {"part": given} if isinstance(given, str) else given
+    if (
+        not isinstance(fields, Mapping)
+        or not {"part"} <= set(fields) <= {"part", "label", "options"}
+        or not isinstance(fields["part"], str)
+        or not isinstance(fields.get("options") or {}, Mapping)
+    ):
+        raise ConfigError(
+            f"Expected a {kind} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
+        )
+    text = fields["part"]
+    source, value = _split_value(kind, text)
+    options = dict(fields.get("options") or {})
+    if value is not None:
+        name, option = _first_option(kind, source, text)
+        if name in options:
+            raise ConfigError(f"Expected option {name!r} of {kind} {text!r} once, got {options[name]!r} too.")
+        options = {name: typed(f"{kind} {source!r}", name, option, value), **options}
+    place = source.rpartition(":")[0]
+    label = fields.get("label") or (text[len(place) + 1 :] if place else text)
+    return Part(part=source, label=str(label), options=options)
+
+
+def complete(kind: str, part: Part) -> Part:
+    """Checks a part's options and fills in their defaults, so that like parts have like options.
+
+    Raises:
+        ConfigError: there is no such part or option, or a value is of another type.
+    """
+    owner = f"{kind} {part.part!r}"
+    known = options_of(kind, find(kind, part.part).target)
+    given = _typed_options(kind, part, known)
+    options = {}
+    for name, option in known.items():
+        value = given.get(name, option.default)
+        if value is NO_DEFAULT:
+            raise ConfigError(
+                f"Expected option {name!r} of {owner} as {type_name(option.kind)}, got none. It has no default."
+            )
+        try:
+            options[name] = plain(value)
+        except ConfigError as error:
+            raise ConfigError(f"Option {name!r} of {owner} cannot be recorded. {error}") from error
+    return Part(part=part.part, label=part.label, options=options)
+
+
+def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
+    """Makes a part.
+
+    Args:
+        kind: one of `KINDS`.
+        part: which, in any form that `read_part` reads.
+        given: what the part is made for, such as `robot`; passed on where a parameter bears the name.
+
+    Returns:
+        The object; of a risk measure a function of the mixture alone.
+
+    Raises:
+        ConfigError: there is no such part or option, or it refuses its options.
+    """
+    part = read_part(kind, part)
+    owner = f"{kind} {part.part!r}"
+    target = find(kind, part.part).target
+    complete(kind, part)
+    arguments = _typed_options(kind, part, options_of(kind, target))
+    config = config_class(target, _GIVEN)
+    if config:
+        arguments = {"config": call(f"options of {owner}", config, arguments)}
+    arguments |= {name: value for name, value in given.items() if name in parameters(target)}
+    if kind == "risk" and not inspect.isclass(target):
+        return partial(target, **arguments)
+    return call(owner, target, arguments)
+
+
+def find(kind: str, source: str) -> Found:
+    """Finds a part by name, module or file.
+
+    Args:
+        kind: one of `KINDS`.
+        source: a name, `package.module:Name` or `path/to/file.py:Name`.
+
+    Raises:
+        ConfigError: there is none, or it cannot be imported.
+    """
+    if (_checked(kind), source) in _REGISTERED:
+        target = _REGISTERED[kind, source]
+        return Found(target=target, origin="this process", digest=digest_of_target(target), everywhere=False)
+    points = [point for point in _points(kind) if point.name == source]
+    if len(points) > 1:
+        raise ConfigError(
+            f"Expected one {kind} {source!r}, got several: {', '.join(point.value for point in points)}. "
+            "Write package.module:Name."
+        )
+    place, colon, name = points[0].value.partition(":") if points else source.rpartition(":")
+    if place.endswith(".py"):
+        return _found_in_file(kind, Path(place), name)
+    if colon and place:
+        return _found_in_module(kind, place, name.partition("[")[0].strip())
+    raise _unknown(kind, source)
+
+
+def options_of(kind: str, target: Any) -> dict[str, Option]:
+    """Lists the options of a class or function, in order, by name.
+
+    Parameters that are given by the caller (`robot`, and a risk measure's mixture) are none.
+    """
+    skipped: tuple[str, ...] = _GIVEN
+    if kind == "risk" and not inspect.isclass(target):
+        skipped += tuple(parameters(target))[:1]
+    return list_options(target, skipped)
+
+
+def _checked(kind: str) -> str:
+    if kind not in KINDS:
+        raise ConfigError(
+            f"Expected a kind of part among {', '.join(KINDS)}, got {kind!r}.{hint(kind, KINDS)}"
+        )
+    return kind
+
+
+def _points(kind: str) -> tuple[EntryPoint, ...]:
+    return _points_on(_checked(kind), tuple(sys.path))
+
+
+@cache
+def _points_on(kind: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Entry points of what is installed; asked again when the path has changed."""
+    return tuple(entry_points(group=f"benchnav.{kind}s"))
+
+
+def _split_value(kind: str, text: str) -> tuple[str, str | None]:
+    """Splits `NAME:VALUE`; a colon that belongs to a module or file stays."""
+    head, colon, tail = text.rpartition(":")
+    is_part = ":" in head or head in names(kind) or not tail[:1].isidentifier()
+    return (head, tail) if colon and is_part else (text, None)
+
+
+def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
+    known = options_of(kind, find(kind, source).target)
+    if not known:
+        raise ConfigError(f"Expected {kind} {source!r} without a value, got {text!r}: it has no options.")
+    return next(iter(known.items()))
+
+
+def _typed_options(kind: str, part: Part, known: Mapping[str, Option]) -> dict[str, Any]:
+    owner = f"{kind} {part.part!r}"
+    refuse_unknown(owner, part.options, known)
+    return {name: typed(owner, name, known[name], value) for name, value in part.options.items()}
+
+
+def _unknown(kind: str, source: str) -> ConfigError:
+    remedy = hint(source, names(kind))
+    if source.endswith(".py"):
+        remedy = f" Say which class or function of it: {source}:Name."
+    elif Path(f"{source}.py").is_file():
+        remedy = f" Did you mean './{source}.py:Name'?"
+    return ConfigError(
+        f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or path/to/file.py:Name, "
+        f"got {source!r}.{remedy}"
+    )
+
+
+def _found_in_module(kind: str, place: str, name: str) -> Found:
+    try:
+        module = importlib.import_module(place)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{place}.".startswith(f"{error.name}."):
+            file = Path(*place.split(".")).with_suffix(".py")
+            if file.is_file():
+                remedy = f" Did you mean './{file}:{name}'?"
+            else:
+                remedy = (
+                    hint(place, names(kind)) or " Install its package, or name a file: path/to/file.py:Name."
+                )
+            raise ConfigError(
+                f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or "
+                f"path/to/file.py:Name, got {place + ':' + name!r}, and there is no module {error.name!r}.{remedy}"
+            ) from error
+        raise ConfigError(f"module {place} could not be imported: {one_line(error)}") from error
+    target = attribute(module, place, name)
+    packages = {str(whose).partition(".")[0] for whose in (place, getattr(target, "__module__", place))}
+    if place.partition(".")[0] == "benchnav":
+        return Found(target=target, origin=f"benchnav {benchnav.__version__}", digest="", shipped=True)
+    foreign = sorted(packages - {"benchnav", "builtins"})
+    return Found(
+        target=target,
+        origin=distribution_of(place.partition(".")[0]) or f"module {place}",
+        digest=digest_of(digest_of_package(package).encode() for package in foreign),
+    )
+
+
+def _found_in_file(kind: str, path: Path, name: str) -> Found:
+    path = path.expanduser()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        near = hint(path.name, (other.name for other in path.parent.glob("*.py")))
+        raise ConfigError(
+            f"Expected a {kind} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
+        ) from error
+    target = attribute(load_file(path.resolve(), content), str(path), name)
+    return Found(target=target, origin=f"file {path}", digest=digest_of([content]))

@@ -1,0 +1,39 @@
+"""A robot F and an objective J of one's own.
+
+benchnav-eval run --robots '[examples/own_robot.py:Tracked]' --objectives '[examples/own_robot.py:Energy]' \
+  --planners '[straight,astar_dwa,mppi]' --risks '[mean]' --out runs/tracked
+"""
+
+from dataclasses import dataclass
+
+from benchnav.planning.objective import distance
+from benchnav.planning.robots import Unicycle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked(Unicycle):
+    """A tracked vehicle: it drives as a unicycle, but soft ground hinders its turning twice as much."""
+
+    speed_mps: tuple[float, float] = (-0.3, 0.8)
+    turn_loss: float = 2.0
+
+    def __call__(self, state, action, traversability):
+        turning = traversability.clamp(min=0.05) ** (self.turn_loss - 1)
+        slowed = (
+            action * action.new_tensor([1.0, 0.0])
+            + action * action.new_tensor([0.0, 1.0]) * turning[..., None]
+        )
+        return super().__call__(state, slowed, traversability)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Energy:
+    """Distance to the goal, and what the tracks waste where they slip."""
+
+    waste: float = 2.0
+
+    def stage(self, state, action, traversability, target):
+        return distance(state, target) + self.waste * action[..., 0].abs() * (1 - traversability)
+
+    def terminal(self, state, traversability, target):
+        return distance(state, target)

@@ -1,0 +1,104 @@
+"""Planners, models and risk measures that tests name as `tests.eval.parts:Name`."""
+
+import time
+import uuid
+from pathlib import Path
+
+import torch
+
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.problem import Problem
+
+
+class Spy:
+    """Stands still, and writes down what it is given."""
+
+    steers = (("speed_mps", "turn_rate_radps"),)
+
+    def __init__(self, log: str, gain: float = 1.0) -> None:
+        self.log, self.gain = Path(log), gain
+
+    def init(self, problem: Problem, generator: torch.Generator):  # type: ignore[no-untyped-def]
+        note = {
+            "risk_map": problem.risk_map,
+            "motion_map": problem.traversability,
+            "free": problem.free,
+            "start": problem.start,
+            "goal_m": problem.goal_m,
+            "time_budget_s": problem.time_budget_s,
+            "components": problem.mixture.weights.shape[1],
+            "rgb": problem.observation.rgb,
+            "robot": repr(problem.robot),
+            "objective": type(problem.objective).__name__,
+            "generator": generator.initial_seed(),
+            "gain": self.gain,
+        }
+        return note, []
+
+    def plan(self, step: Step, plan_state):  # type: ignore[no-untyped-def]
+        note, felt = plan_state
+        felt = [*felt, step.felt]
+        if len(felt) == 4:
+            torch.save({**note, "felt": torch.stack(felt[1:])}, self.log / f"{uuid.uuid4().hex}.pt")
+        return torch.zeros(len(step.state), 2), (note, felt), Plan.empty(len(step.state))
+
+
+class Faulty:
+    """Drives straight on until `after_s`, then does something wrong for the episode nearest to its goal."""
+
+    def __init__(self, fault: str = "none", after_s: float = 1.0) -> None:
+        self.fault, self.after_s = fault, after_s
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        if self.fault == "raise in init":
+            raise RuntimeError("no beginning")
+        if self.fault == "write in init":
+            problem.risk_map.zero_()
+            problem.start.zero_()
+            problem.goal_m.copy_(problem.start[:, :2])
+        return problem
+
+    def plan(self, step: Step, plan_state: Problem):  # type: ignore[no-untyped-def]
+        batch = len(step.state)
+        action = torch.tensor([[1.0, 0.0]]).repeat(batch, 1)
+        if step.time_s < self.after_s - 1e-6:
+            return action, plan_state, Plan.empty(batch)
+        if self.fault == "write":
+            step.state[:, :2] = plan_state.goal_m
+            step.felt.zero_()
+        if self.fault == "nan":
+            action[0] = torch.nan
+        if self.fault == "shape":
+            action = action[:, :1]
+        if self.fault == "raise":
+            raise RuntimeError("no way on")
+        if self.fault == "hang":
+            time.sleep(600)
+        if self.fault == "give up":
+            failed = torch.full((batch,), int(PlanStatus.FAILED))
+            return action, plan_state, Plan.empty(batch, status=failed)
+        return action, plan_state, Plan.empty(batch)
+
+
+class Gaussian:
+    """The same Gaussian everywhere."""
+
+    def __init__(self, mean: float = 0.77, std: float = 0.01) -> None:
+        self.mean, self.std = mean, std
+
+    def predict(self, observation):  # type: ignore[no-untyped-def]
+        ones = torch.ones_like(observation.slope_deg).unsqueeze(1)
+        return TraversabilityMixture(ones, self.mean * ones, self.std * ones)
+
+
+class Broken:
+    """A model that raises."""
+
+    def predict(self, observation):  # type: ignore[no-untyped-def]
+        raise ValueError("no idea")
+
+
+def least(mixture: TraversabilityMixture, factor: float = 1.0) -> torch.Tensor:
+    """A risk measure: the least component mean, times a factor."""
+    return (mixture.means.amin(dim=1) * factor).clamp(0, 1)

@@ -1,0 +1,91 @@
+"""Hand-made rows, snapshots and recordings."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from benchnav.eval.report.drawn_plan import drawn_plan
+from benchnav.eval.report.recording import Recording
+from benchnav.eval.stats.intervals import LABELS
+from benchnav.terrain import Grid
+
+PAPER = {
+    "world": {"noise": "resampled", "time_budget_s": 100.0},
+    "rules": {"free_space": {"by": "risk", "above": 0.3}, "slowest": 0.3, "goal_radius_m": 1.0},
+}
+
+
+def trial(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
+    """Labels of a trial."""
+    same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle"}
+    return (
+        same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
+    )
+
+
+def row(
+    labels: dict[str, str], instance: int = 0, time_s: float | None = 30.0, **changes: Any
+) -> dict[str, Any]:
+    """An episode; a time of None is a timeout."""
+    success = time_s is not None
+    made: dict[str, Any] = {
+        "trial": "+".join(labels[name] for name in LABELS), **labels, "seed": 0, "realisation": 0,
+        "instance": instance, "outcome": "success" if success else "timeout", "success": success,
+        "total_time_s": time_s if success else 100.0, "end_time_s": time_s if success else 100.0,
+        "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
+        "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
+        "roughness_radps2": 2.0, "planning_ms": 1.0, "compiled": True, "error": "",
+    }  # fmt: skip
+    return made | changes
+
+
+def rows(*episodes: dict[str, Any] | Iterable[dict[str, Any]]) -> pd.DataFrame:
+    """A table of episodes."""
+    flat = [e for group in episodes for e in ([group] if isinstance(group, dict) else group)]
+    return pd.DataFrame(flat)
+
+
+def trials(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What `run.json` says of the trials; `follows` and `remarks` by planner."""
+    return {
+        name: {"value": PAPER, "labels": {label: group[label].iloc[0] for label in LABELS}}
+        | {"follows": "", "remarks": [], "seeds": sorted(set(group["seed"].tolist()))}
+        | notes.get(group["planner"].iloc[0], {})
+        for name, group in episodes.groupby("trial", sort=False)
+    }
+
+
+def recording(
+    steps: int = 200, dt_s: float = 0.1, labels: dict[str, str] | None = None, **changes: Any
+) -> Recording:
+    """An episode on a map that is not square, of a robot with five states and two actions."""
+    labels = labels or trial()
+    grid = Grid(40, 60, 0.5)
+    generator = np.random.default_rng(3)
+    x = 2 + np.arange(steps + 1) * dt_s
+    states = np.stack((x, 3 + 0.5 * x, np.full(steps + 1, 0.46)), axis=1)
+    states = np.concatenate((states, np.zeros((steps + 1, 2))), axis=1).astype(np.float32)
+    predicted = generator.random((40, 60)).astype(np.float32) ** 0.5
+    made: dict[str, Any] = {
+        "about": {"trial": "t", **labels, "seed": "0", "realisation": "0", "instance": "4", "outcome": "success"},
+        "grid": grid, "rgb": (255 * generator.random((3, 40, 60))).astype(np.uint8),
+        "elevation_m": generator.random((40, 60)).astype(np.float32), "predicted": predicted,
+        "free": predicted > 0.3, "goal_m": np.array([24.0, 15.0], np.float32), "dt_s": dt_s,
+        "action_names": ("speed_mps", "steering_rad"),
+        "states": states, "actions": generator.random((steps, 2)).astype(np.float32),
+        "traversability": generator.random(steps).astype(np.float32),
+        "plans": [plan(step, states[min(step, steps)]) for step in range(0, max(steps, 1), 5)],
+    }  # fmt: skip
+    return Recording(**(made | changes))
+
+
+def plan(step: int, state: np.ndarray) -> Any:
+    """A plan of 20 points ahead, with a reference that has two unused ones, and three samples."""
+    ahead = torch.tensor(state[:2]) + torch.linspace(0, 4, 20)[:, None] * torch.tensor([0.9, 0.45])
+    reference = torch.cat((ahead, torch.full((2, 2), torch.nan)))
+    spread = torch.stack([ahead + torch.linspace(0, 1, 20)[:, None] * k for k in (-1.0, 0.5, 1.0)])
+    layers = {"path": ahead[None], "samples": spread, "reference": reference[None]}
+    return drawn_plan(step, layers | {"tree": torch.empty(0, 0, 2)})

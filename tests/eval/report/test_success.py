@@ -1,0 +1,97 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchnav.eval.report.success import success_figure
+from benchnav.eval.stats.intervals import summarise
+from tests.eval.report import made
+
+BLIND = {"planner": "straight", "risk": "–", "model": "–"}
+
+
+def shares(labels: dict[str, str], successes: int) -> list[dict]:  # type: ignore[type-arg]
+    return [made.row(labels, i, 30.0 if i < successes else None) for i in range(10)]
+
+
+def panels(figure: Figure) -> list[Axes]:
+    return [axes for axes in figure.axes if axes.get_visible()]
+
+
+def points(panel: Axes) -> dict[str, float]:
+    """Rates by the name of their row."""
+    names = {
+        place: label.get_text()
+        for place, label in zip(panel.get_yticks(), panel.get_yticklabels(), strict=True)
+    }
+    marked = [line for line in panel.lines if line.get_marker() == "o"]
+    return {names[float(line.get_ydata()[0])]: float(line.get_xdata()[0]) for line in marked}
+
+
+def test_each_rate_stands_at_its_name_with_its_interval() -> None:
+    summary = summarise(
+        made.rows(
+            shares(made.trial(**BLIND), 2), shares(made.trial("astar_dwa", "mean"), 9), shares(made.trial(), 7),
+            shares(made.trial("astar_dwa"), 8),
+        )
+    )  # fmt: skip
+    (panel,) = panels(success_figure(summary))
+    expected = {"straight": 20, "A* + DWA, mean": 90, "A* + DWA, cvar": 80, "MPPI, cvar": 70}
+    assert points(panel) == pytest.approx(expected)
+    ends = {tuple(np.round(line.get_xdata(), 6)) for line in panel.lines if line.get_marker() == "None"}
+    for low, high in summary[["success_low", "success_high"]].to_numpy():
+        assert (round(100 * low, 6), round(100 * high, 6)) in ends
+
+
+def test_the_blind_baseline_is_a_line_through_its_own_panel() -> None:
+    summary = summarise(
+        made.rows(
+            *(shares(made.trial(**BLIND, scenario=name), count) for name, count in (("std", 4), ("hg", 1))),
+            *(shares(made.trial(scenario=name), 10) for name in ("std", "hg")),
+        )
+    )
+    drawn = {panel.get_title(): panel for panel in panels(success_figure(summary))}
+    for scenario, rate in (("std", 40), ("hg", 10)):
+        (line,) = [line for line in drawn[scenario].lines if line.get_linestyle() == "--"]
+        assert list(line.get_xdata()) == [rate, rate]
+
+
+@pytest.mark.parametrize(("planners", "risks", "scenarios"), [(1, 1, 1), (4, 20, 2), (12, 4, 3), (2, 2, 9)])
+def test_any_number_of_planners_risks_and_scenarios_fit(
+    planners: int, risks: int, scenarios: int, tmp_path
+) -> None:  # type: ignore[no-untyped-def]
+    summary = summarise(
+        made.rows(
+            made.row(made.trial(f"planner_{p}", f"cvar:{r}", scenario=f"scenario-{s}"))
+            for p in range(planners) for r in range(risks) for s in range(scenarios)
+        )
+    )  # fmt: skip
+    figure = success_figure(summary)
+    assert len(panels(figure)) == scenarios
+    for panel in panels(figure):
+        assert len(points(figure.axes[0])) == planners * risks
+        assert panel.get_title()
+    figure.draw_without_rendering()
+    heights = [label.get_window_extent() for label in figure.axes[0].get_yticklabels()]
+    assert all(not above.overlaps(below) for above, below in pairwise(heights))
+    assert all(panel.get_window_extent().width > 100 for panel in panels(figure))
+    width, height = figure.get_size_inches()
+    assert width < 13
+    assert height < 25
+
+
+def test_models_and_worlds_are_told_apart() -> None:
+    several = [made.trial(model=model, world=world) for model in ("a", "b") for world in ("paper", "stakes")]
+    figure = success_figure(summarise(made.rows(*(shares(labels, n) for n, labels in enumerate(several)))))
+    assert [panel.get_title() for panel in panels(figure)] == ["std, paper", "std, stakes"]
+    first, second = panels(figure)
+    assert points(first) == {"MPPI, a, cvar": 0, "MPPI, b, cvar": 20}
+    expected = {"MPPI, a, cvar": 10, "MPPI, b, cvar": 30}
+    assert dict(zip(points(first), points_by_height(second), strict=True)) == expected
+
+
+def points_by_height(panel: Axes) -> list[float]:
+    marked = [line for line in panel.lines if line.get_marker() == "o"]
+    return [float(line.get_xdata()[0]) for line in sorted(marked, key=lambda line: line.get_ydata()[0])]

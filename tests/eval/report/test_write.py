@@ -1,0 +1,155 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from benchnav.errors import ConfigError
+from benchnav.eval.report.playback import write_playback
+from benchnav.eval.report.write import print_report, read_report, write_report
+from benchnav.eval.stats.intervals import summarise
+from tests.eval.report import made
+
+VERSION_1 = Path(__file__).parent.parent.parent / "data" / "run-1"
+
+
+def episodes() -> pd.DataFrame:
+    blind = made.trial("straight", "–", model="–")
+    return made.rows(
+        (made.row(made.trial(p), i, seed=s) for p in ("mppi", "cl_rrt") for i in range(2) for s in (0, 7)),
+        (made.row(blind, i, None, seed=s, outcome="stuck") for i in range(2) for s in (0, 7)),
+    )
+
+
+def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
+    """A run folder with what a report reads of it; parts of the trials stand in for any."""
+    parts = {
+        kind: {"part": kind, "options": {}} for kind in ("model", "risk", "planner", "robot", "objective")
+    }
+    known = made.trials(rows, cl_rrt={"follows": "its own time"})
+    known = {
+        name: about
+        | {
+            "value": {"data": "paper-v1", "split": "test/std", **parts, **made.PAPER},
+            "realisations": 1,
+            "instances": 2,
+        }
+        for name, about in known.items()
+    }
+    about = {
+        "format": "benchnav-run", "format_version": 2, "run_id": "r", "trials": known, "suite": {},
+        "commands": ["benchnav-eval run --seeds '[0,7]'"],
+    }  # fmt: skip
+    folder.mkdir()
+    (folder / "run.json").write_text(json.dumps(about | changes))
+    rows.to_parquet(folder / "episodes.parquet")
+    return folder
+
+
+def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run", episodes())
+    summary = write_report(folder)
+    pd.testing.assert_frame_equal(summary, summarise(episodes()))
+    again = pd.read_csv(folder / "summary.csv")
+    assert list(again.columns) == list(summary.columns)
+    np.testing.assert_allclose(again["success_low"], summary["success_low"], rtol=1e-5)
+    text = (folder / "summary.md").read_text()
+    for line in (
+        "- World paper: noise resampled, T = 100 s, free where the risk map is above 0.3.",
+        "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
+        "- Each trial: 4 episodes on 2 maps.",
+        "¹ follows its own time",
+        "    benchnav-eval run --seeds '[0,7]'",
+    ):
+        assert line in text.splitlines()
+    assert "| std | cl_rrt¹ | cvar | 100 |" in text
+    assert "figures/success.png" in text
+    assert "trajectories" not in text
+    assert r"\begin{tabular}" in (folder / "summary.tex").read_text()
+    assert [path.name for path in (folder / "figures").iterdir()] == ["success.png"]
+    assert not list(folder.rglob("*partial*"))
+
+
+def test_options_of_planners_stand_in_the_header(tmp_path: Path) -> None:
+    suite = {"planner_options": {"mppi": {"samples": 64, "horizon": 20}}}
+    folder = run_folder(tmp_path / "run", episodes(), suite=suite)
+    assert "Planner options: mppi samples = 64, mppi horizon = 20." in read_report(folder).header
+
+
+def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
+    rows = episodes()
+    folder = run_folder(tmp_path / "run", rows)
+    for name, group in rows.groupby("trial", sort=False):
+        labels = {label: group[label].iloc[0] for label in ("planner", "risk", "scenario", "model", "data")}
+        about = {
+            "trial": str(name),
+            **labels,
+            "instance": "0",
+            "seed": "0",
+            "realisation": "0",
+            "outcome": "stuck",
+        }
+        write_playback(folder, labels["planner"], made.recording(20, about=about))
+    write_report(folder)
+    assert (folder / "figures" / "trajectories.png").stat().st_size > 10_000
+    text = (folder / "summary.md").read_text()
+    assert "![trajectories](figures/trajectories.png)" in text
+    assert "3 of 3 recorded episodes" in text
+
+
+@pytest.mark.parametrize("outcome", ["planner_error", "model_error"])
+def test_tracebacks_are_pointed_at(outcome: str, tmp_path: Path) -> None:
+    rows = made.rows(made.row(made.trial(), 0), made.row(made.trial(), 1, None, outcome=outcome))
+    folder = run_folder(tmp_path / "run", rows)
+    (warning,) = read_report(folder).warnings
+    assert warning.startswith("In 1 episode a planner or model failed")
+    assert str(folder / "errors.txt") in warning
+    write_report(folder)
+    assert warning in (folder / "summary.md").read_text()
+
+
+def test_without_faults_there_is_nothing_to_point_at(tmp_path: Path) -> None:
+    assert read_report(run_folder(tmp_path / "run", episodes())).warnings == ()
+
+
+def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    print_report(run_folder(tmp_path / "run", episodes()))
+    printed = capsys.readouterr().out
+    assert printed.startswith("World paper: noise resampled, T = 100 s")
+    assert "T if success [s]" in printed
+    assert "¹ follows its own time" in printed
+
+
+def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run", episodes())
+    (folder / "episodes.parquet").unlink()
+    with pytest.raises(ConfigError, match="finished"):
+        write_report(folder)
+    with pytest.raises(ConfigError, match="run folder"):
+        write_report(tmp_path)
+
+
+def test_a_run_of_0_1_is_reported(tmp_path: Path) -> None:
+    folder = tmp_path / "run-1"
+    shutil.copytree(VERSION_1, folder)
+    (row,) = write_report(folder).to_dict("records")
+    assert (row["data"], row["model"], row["planner"], row["risk"]) == ("paper-v1", "oracle", "mppi", "mean")
+    assert (row["robot"], row["objective"], row["world"]) == (
+        "unicycle", "goal_distance", "paper time_budget_s=30"
+    )  # fmt: skip
+    assert (row["n_episodes"], row["n_maps"], row["success_rate"], row["timeout_count"]) == (2, 2, 0.5, 1)
+    assert row["total_time_mean_s"] == pytest.approx(29.75)
+    assert row["success_time_mean_s"] == pytest.approx(29.5)
+    old = pd.read_parquet(VERSION_1 / "episodes.parquet")
+    assert row["traversability_mean"] == pytest.approx(old["traversability"].mean())
+    # A change of the turn rate a step of 0.1 s, and now a second.
+    assert row["roughness_mean_radps2"] == pytest.approx(10 * old["roughness"].mean())
+    assert (row["score_n"], np.isnan(row["planning_ms_median"])) == (0, True)
+    text = (folder / "summary.md").read_text()
+    assert "- World paper time_budget_s=30: noise resampled, T = 30 s." in text
+    assert "mppi samples = 64" in text
+    assert "| std | mppi¹ | mean | 50 | 9–91 | 29.8 ± 0.4 | 29.5 | 82.8 ± 6.6 | 1 timeout |" in text
+    assert "benchnav-eval run --model oracle" in text
+    assert (folder / "figures" / "success.png").stat().st_size > 1000

@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+import torch
+
+from benchnav.eval.run.rollout import Episodes
+from benchnav.eval.run.rows import episode_rows, error_rows, score, step_columns
+from benchnav.eval.run.unit import Unit
+from benchnav.eval.suite import Suite
+from benchnav.eval.trial import trials_of
+from benchnav.planning.robots import Unicycle
+from benchnav.planning.world.outcome import Outcome
+from tests import factories
+
+
+def unit(**changes: object) -> Unit:
+    suite = Suite(model="oracle", planners=("tests.eval.parts:Faulty",), risks=("cvar",), scenarios=("std",))
+    (trial,) = trials_of(suite, lambda data: ["std"])
+    given = {"trial": trial, "seed": 7, "realisation": 2, "instances": (4, 9)} | changes
+    return Unit(**given)  # type: ignore[arg-type]
+
+
+def made(**changes: object) -> tuple:  # type: ignore[type-arg]
+    problem = factories.problem(torch.full((2, 16, 16), 0.8), **changes)  # type: ignore[arg-type]
+    states = torch.zeros(2, 5, 3)
+    states[0, :, 0] = torch.tensor([0.0, 3.0, 3.0, 3.0, 3.0])
+    states[0, 2:, 1] = 4.0
+    episodes = Episodes(
+        states=states,
+        actions=torch.tensor([[[1.0, 0.0], [1.0, 0.5], [9, 9], [9, 9]], [[0.0, 0.0]] * 4]),
+        traversability=torch.tensor([[0.2, 0.8, 9, 9], [0.3, 0.1, 0.31, 0.5]]),
+        turn_rate_radps=torch.tensor([[0.0, 0.5, 9, 9], [0.0, 0.1, 0.0, 0.1]]),
+        outcome=torch.tensor([Outcome.SUCCESS, Outcome.STUCK]),
+        steps=torch.tensor([2, 4]),
+        planning_s=1.6,
+        errors=("", "late"),
+    )
+    return problem, episodes
+
+
+def test_metrics_are_those_of_the_episodes_own_steps() -> None:
+    problem, episodes = made()
+    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), True)
+    first, second = table.to_dict("records")
+    assert (first["instance"], first["outcome"], first["success"]) == (4, "success", True)
+    assert (first["seed"], first["realisation"], first["trial"]) == (7, 2, unit().trial.id)
+    assert (first["risk"], first["scenario"], first["robot"]) == ("cvar", "std", "unicycle")
+    assert first["total_time_s"] == pytest.approx(0.2)
+    assert first["time_ratio"] == pytest.approx(2.0)
+    assert first["score"] == pytest.approx(0.25)
+    assert first["traversability"] == pytest.approx(0.5)
+    assert first["path_length_m"] == pytest.approx(7.0)
+    assert first["stuck_share"] == pytest.approx(0.5)
+    assert first["roughness_radps2"] == pytest.approx(5.0)
+    assert first["planning_ms"] == pytest.approx(1e3 * 1.6 / 8)
+    assert (first["compiled"], first["error"]) == (True, "")
+    assert (second["instance"], second["outcome"], second["success"]) == (9, "stuck", False)
+    assert second["total_time_s"] == 100.0
+    assert second["end_time_s"] == pytest.approx(0.4)
+    assert np.isnan(second["time_ratio"])
+    assert second["score"] == 0
+    assert second["stuck_share"] == pytest.approx(0.5)
+    assert second["roughness_radps2"] == pytest.approx(1.0)
+    assert second["error"] == "late"
+
+
+def test_times_are_measured_by_the_robots_top_speed() -> None:
+    problem, episodes = made(robot=Unicycle(speed_mps=(0.0, 2.0)))
+    first = episode_rows(unit(), problem, episodes, np.array([0.4, 20.0]), False).iloc[0]
+    assert first["reference_time_s"] == pytest.approx(0.4)
+    assert first["time_ratio"] == pytest.approx(1.0)
+    assert first["score"] == pytest.approx(0.5)
+
+
+def test_an_episode_that_ends_at_once_has_no_flattering_zeros() -> None:
+    problem, episodes = made()
+    at_once = Episodes(**{**vars(episodes), "steps": torch.tensor([0, 1])})
+    table = episode_rows(unit(), problem, at_once, np.array([0.1, 20.0]), False)
+    nothing = table.iloc[0][["traversability", "path_length_m", "stuck_share", "roughness_radps2"]]
+    assert nothing.isna().all()
+    assert np.isnan(table.iloc[1]["roughness_radps2"])
+    assert table.iloc[1]["path_length_m"] == 0
+
+
+def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
+    problem, episodes = made()
+    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), True)
+    failed = error_rows(unit(), 50.0, "ValueError: no idea")
+    assert list(failed.columns) == list(table.columns)
+    assert [str(t) for t in failed.dtypes] == [str(t) for t in table.dtypes]
+    assert set(failed["outcome"]) == {"model_error"}
+    assert failed["total_time_s"].tolist() == [50.0, 50.0]
+    assert not failed["success"].any()
+    assert failed["error"].tolist() == ["ValueError: no idea"] * 2
+
+
+def test_score_is_barns() -> None:
+    # OT = 5 s: nothing is better than arriving in 10 s, nothing worse than in 40 s.
+    assert [score(t, 10.0) for t in (4.0, 10.0, 20.0, 40.0, 90.0)] == [0.5, 0.5, 0.25, 0.125, 0.125]
+
+
+def test_steps_hold_the_driven_path_and_the_robots_own_actions() -> None:
+    problem, episodes = made()
+    first, second = step_columns(problem, episodes)
+    assert first["x_m"].tolist() == [0, 3, 3]
+    assert first["y_m"].tolist() == [0, 0, 4]
+    assert first["speed_mps"].tolist()[:2] == [1, 1]
+    assert first["turn_rate_radps"].tolist()[:2] == [0, 0.5]
+    assert np.isnan(first["traversability"][-1])
+    assert np.isnan(first["speed_mps"][-1])
+    assert len(second["time_s"]) == 5
+    assert second["time_s"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])

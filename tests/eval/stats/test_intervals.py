@@ -1,0 +1,155 @@
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from benchnav.eval.stats.intervals import design_effect, summarise, wilson_interval
+from tests.eval.report.made import row, rows, trial
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 20), (18, 20), (20, 20), (7, 13)])
+def test_wilson_interval_is_scipys(successes: int, n: int) -> None:
+    expected = binomtest(successes, n).proportion_ci(0.95, method="wilson")
+    assert wilson_interval(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+def test_a_fraction_of_an_episode_counts_as_that() -> None:
+    whole, half, more = (wilson_interval(0.8, n) for n in (20, 20.5, 21))
+    assert whole[0] < half[0] < more[0]
+    assert whole[1] > half[1] > more[1]
+
+
+def drawn(
+    generator: np.random.Generator, maps: int, each: int, correlation: float, rate: float
+) -> np.ndarray:
+    """Successes, shape [maps, each], from the beta-binomial of a given intra-class correlation."""
+    size = 1 / correlation - 1
+    chance = generator.beta(rate * size, (1 - rate) * size, size=maps)
+    return generator.random((maps, each)) < chance[:, None]
+
+
+def effect_of(success: np.ndarray) -> float:
+    return design_effect(success.ravel(), np.repeat(np.arange(len(success)), success.shape[1]))
+
+
+@pytest.mark.parametrize(("correlation", "each"), [(0.05, 5), (0.3, 5), (0.6, 3)])
+def test_design_effect_is_that_of_a_simulation(correlation: float, each: int) -> None:
+    generator = np.random.default_rng(1)
+    found = [effect_of(drawn(generator, 300, each, correlation, 0.8)) for _ in range(60)]
+    assert np.mean(found) == pytest.approx(1 + (each - 1) * correlation, abs=0.04)
+
+
+def test_design_effect_of_maps_with_unequal_numbers_of_episodes() -> None:
+    generator = np.random.default_rng(2)
+    size = np.tile([1, 2, 9], 150)
+    found = []
+    for _ in range(60):
+        success = drawn(generator, len(size), 9, 0.3, 0.7)
+        kept = np.arange(9) < size[:, None]
+        maps = np.broadcast_to(np.arange(len(size))[:, None], kept.shape)
+        found.append(design_effect(success[kept], maps[kept]))
+    assert np.mean(found) == pytest.approx(1 + ((size**2).sum() / size.sum() - 1) * 0.3, abs=0.15)
+
+
+def test_interval_holds_what_it_promises_on_maps_that_are_alike_in_themselves() -> None:
+    generator = np.random.default_rng(3)
+    held, naive = 0, 0
+    for _ in range(600):
+        success = drawn(generator, 60, 5, 0.3, 0.8)
+        low, high = wilson_interval(success.mean(), success.size / effect_of(success))
+        held += low <= 0.8 <= high
+        low, high = wilson_interval(success.mean(), success.size)
+        naive += low <= 0.8 <= high
+    assert held / 600 > 0.93
+    assert naive / 600 < 0.88
+
+
+def test_design_effect_at_its_ends() -> None:
+    both = np.array([True, False, True, True])
+    assert design_effect(both, np.arange(4)) == 1  # each episode on a map of its own
+    assert design_effect(np.array([True, False] * 3), np.repeat([0, 1, 2], 2)) == 1  # below 0 there is none
+    assert design_effect(np.repeat(both, 3), np.repeat(np.arange(4), 3)) == pytest.approx(3)  # all alike
+    # What cannot be seen is taken to be as bad as it can be: one map, or nothing but successes.
+    assert design_effect(both, np.zeros(4)) == 4
+    assert design_effect(np.ones(12, dtype=bool), np.repeat(np.arange(4), 3)) == pytest.approx(3)
+
+
+def summary_of(*episodes: dict) -> pd.Series:  # type: ignore[type-arg]
+    summary = summarise(rows(*episodes))
+    assert len(summary) == 1
+    return summary.iloc[0]
+
+
+def test_success_and_times() -> None:
+    times = (30.0, 40.0, None, 44.0)
+    found = summary_of(*(row(trial(), instance, time) for instance, time in enumerate(times)))
+    assert (found["n_episodes"], found["n_maps"]) == (4, 4)
+    assert found["success_rate"] == 0.75
+    assert (found["success_low"], found["success_high"]) == pytest.approx(wilson_interval(0.75, 4))
+    assert found["total_time_mean_s"] == pytest.approx((30 + 40 + 100 + 44) / 4)
+    assert found["total_time_std_s"] == pytest.approx(np.std([30, 40, 100, 44], ddof=1))
+    assert found["success_time_mean_s"] == pytest.approx(38)
+    assert found["success_time_std_s"] == pytest.approx(np.std([30, 40, 44], ddof=1))
+    assert (found["total_time_n"], found["success_time_n"], found["time_ratio_n"]) == (4, 3, 3)
+    assert found["time_ratio_mean"] == pytest.approx(38 / 25)
+    assert found["score_mean"] == pytest.approx((12.5 / 30 + 12.5 / 40 + 0 + 12.5 / 44) / 4)
+
+
+def test_what_an_episode_does_not_have_is_not_averaged() -> None:
+    names = ("traversability", "path_length_m", "stuck_share", "roughness_radps2")
+    at_once = row(trial(), 1, None, outcome="planner_failure", **dict.fromkeys(names, np.nan))
+    found = summary_of(row(trial(), 0, traversability=0.6), at_once, row(trial(), 2, traversability=0.8))
+    assert found["traversability_mean"] == pytest.approx(0.7)
+    assert found["path_length_mean_m"] == 22
+    assert found["stuck_share_mean"] == pytest.approx(0.1)
+    assert found["roughness_mean_radps2"] == 2
+    for name in ("traversability", "path_length", "stuck_share", "roughness"):
+        assert found[f"{name}_n"] == 2
+    assert found["total_time_n"] == found["score_n"] == found["n_episodes"] == 3
+
+
+def test_failures_are_counted_by_their_outcome() -> None:
+    outcomes = [
+        "timeout",
+        "stuck",
+        "stuck",
+        "out_of_bounds",
+        "planner_failure",
+        "stalled",
+        "stalled",
+        "stalled",
+    ]
+    outcomes += ["planner_error", "model_error", "model_error"]
+    found = summary_of(*(row(trial(), i, None, outcome=o) for i, o in enumerate(outcomes)), row(trial(), 99))
+    assert {name: found[f"{name}_count"] for name in dict.fromkeys(outcomes)} == {
+        "timeout": 1, "stuck": 2, "out_of_bounds": 1, "planner_failure": 1, "stalled": 3, "planner_error": 1,
+        "model_error": 2,
+    }  # fmt: skip
+    assert "success_count" not in found
+
+
+def test_episodes_of_one_map_are_not_maps() -> None:
+    # Under five seeds each, one of two maps is always solved: that is two maps, not ten.
+    episodes = [row(trial(), m, 30.0 if m else None, seed=seed) for m in (0, 1) for seed in range(5)]
+    found = summary_of(*episodes)
+    assert (found["n_episodes"], found["n_maps"]) == (10, 2)
+    assert found["design_effect"] == pytest.approx(5)
+    assert (found["success_low"], found["success_high"]) == pytest.approx(wilson_interval(0.5, 2))
+
+
+def test_a_row_a_trial_in_order_of_appearance() -> None:
+    order = [trial("mppi", scenario="std"), trial("cl_rrt", scenario="std"), trial("cl_rrt", scenario="hg")]
+    summary = summarise(rows(*(row(labels, i) for i in range(2) for labels in order)))
+    assert summary[["planner", "scenario"]].to_numpy().tolist() == [
+        ["mppi", "std"], ["cl_rrt", "std"], ["cl_rrt", "hg"]
+    ]  # fmt: skip
+    assert summary["model"].tolist() == ["paper-v1"] * 3
+    assert summary["n_episodes"].tolist() == [2, 2, 2]
+
+
+def test_planning_time_is_the_median_and_compilation_a_share() -> None:
+    found = summary_of(
+        *(row(trial(), i, planning_ms=ms, compiled=i > 0) for i, ms in enumerate((1.0, 2.0, 9.0, 3.0)))
+    )
+    assert found["planning_ms_median"] == 2.5
+    assert found["compiled_share"] == 0.75

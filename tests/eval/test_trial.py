@@ -1,0 +1,177 @@
+"""Trials as values, and how a suite becomes a list of them."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from benchnav.errors import ConfigError
+from benchnav.eval.suite import Suite
+from benchnav.eval.trial import Trial, trial_from, trials_of
+
+FAN = "tests.eval.parts:Faulty"
+
+
+def trials(**changes: object) -> list[Trial]:
+    given = {"model": "oracle", "planners": (FAN,), "risks": ("mean",)} | changes
+    return trials_of(Suite(**given), lambda data: ["std", "hg"])  # type: ignore[arg-type]
+
+
+def one(**changes: object) -> Trial:
+    (trial,) = trials(**({"scenarios": ("std",)} | changes))
+    return trial
+
+
+def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
+    trial = one()
+    assert one().id == trial.id
+    assert one(planners=({"part": FAN, "label": "other"},)).id == trial.id
+    assert one(risks=("cvar:0.9",)).id == one(risks=("cvar",)).id
+    changes = (
+        {"scenarios": ("hg",)},
+        {"data": "other"},
+        {"model": "tests.eval.parts:Gaussian"},
+        {"risks": ("cvar",)},
+        {"risks": ("cvar:0.5",)},
+        {"planners": ({"part": FAN, "options": {"after_s": 2.0}},)},
+        {"robots": ("differential_drive",)},
+        {"robots": ({"part": "unicycle", "options": {"dt_s": 0.2}},)},
+        {"objectives": ("travel_time",)},
+        {"noise": "stored"},
+        {"time_budget_s": 50.0},
+        {"world": {"noise": "stored", "time_budget_s": 50.0}},
+        {"task": {"slowest": 0.05}},
+        {"task": {"goal_radius_m": 0.5}},
+        {"task": {"free_space": {"by": "mean"}}},
+        {"task": {"free_space": {"above": 0.1}}},
+    )
+    ids = [trial.id, *(one(**change).id for change in changes)]
+    assert len(set(ids)) == len(ids)
+
+
+def test_a_trial_is_read_back_from_what_a_run_holds() -> None:
+    for trial in trials(
+        planners=({"part": FAN, "label": "late", "options": {"after_s": 2.0}}, "straight"),
+        task={"free_space": {"by": "mean", "above": 0.1}},
+        world={"noise": "stored"},
+        robots=({"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}},),
+    ):
+        again = trial_from({"value": trial.value, "labels": trial.labels})
+        assert again.id == trial.id
+        assert again == trial
+
+
+def test_every_setting_reaches_its_place() -> None:
+    trial = one(
+        task={"free_space": {"by": "mean", "above": 0.1}, "slowest": 0.05, "goal_radius_m": 2},
+        world={"preset": "paper", "noise": "stored"},
+        time_budget_s=30.0,
+        robots=({"part": "unicycle", "options": {"dt_s": 0.2}},),
+        planner_options={FAN: {"after_s": 3.0}},
+    )
+    assert (trial.rules.free_space.by, trial.rules.free_space.above) == ("mean", 0.1)
+    assert (trial.rules.slowest, trial.rules.goal_radius_m) == (0.05, 2.0)
+    assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 30.0)
+    assert trial.make_task().robot.dt_s == 0.2
+    assert trial.make_planner().after_s == 3.0
+    assert (
+        trial.world_label
+        == "paper noise=stored time_budget_s=30 by=mean above=0.1 slowest=0.05 goal_radius_m=2"
+    )
+    travel = one(objectives=("travel_time",), robots=({"part": "unicycle", "options": {"dt_s": 0.2}},))
+    assert travel.make_task().objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
+
+
+def test_what_a_world_says_itself_goes_before_the_short_forms() -> None:
+    assert one(world={"noise": "resampled"}, noise="stored").world.noise == "resampled"
+
+
+def test_a_product_has_every_combination_once_in_the_order_of_tables() -> None:
+    made = trials(
+        planners=(FAN, "mppi"), risks=("mean", "cvar"), models=("oracle", "tests.eval.parts:Gaussian")
+    )
+    names = ("scenario", "model", "risk", "planner")
+    keys = [tuple(trial.labels[name] for name in names) for trial in made]
+    assert len(set(keys)) == len(keys) == 16
+    assert keys[:3] == [
+        ("std", "oracle", "mean", "Faulty"), ("std", "oracle", "mean", "mppi"), ("std", "oracle", "cvar", "Faulty"),
+    ]  # fmt: skip
+
+
+def test_products_side_by_side_take_what_they_leave_out_from_the_suite() -> None:
+    made = trials(
+        risks=("mean",),
+        trials=(
+            {"planners": ["mppi"], "risks": ["cvar", "var"], "scenario": "std"},
+            {"planner": FAN, "world": ["paper", {"noise": "stored"}], "scenarios": "hg"},
+        ),
+    )
+    seen = [(t.labels["planner"], t.labels["risk"], t.scenario, t.world.noise) for t in made]
+    assert seen == [
+        ("mppi", "cvar", "std", "resampled"), ("mppi", "var", "std", "resampled"),
+        ("Faulty", "mean", "hg", "resampled"), ("Faulty", "mean", "hg", "stored"),
+    ]  # fmt: skip
+
+
+def test_a_blind_planner_is_one_trial_for_all_models_and_risks() -> None:
+    made = trials(
+        planners=("straight", FAN), risks=("mean", "cvar"), models=("oracle", "tests.eval.parts:Gaussian")
+    )
+    blind = [trial for trial in made if trial.blind]
+    assert [(t.scenario, t.labels["risk"], t.labels["model"]) for t in blind] == [
+        ("std", "–", "–"),
+        ("hg", "–", "–"),
+    ]
+    assert len(made) == 2 + 2 * 2 * 2
+    alone = trials(planners=("straight",), risks=("cvar",), model="tests.eval.parts:Gaussian")
+    assert [t.id for t in alone] == [t.id for t in blind]
+
+
+def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
+    few, many = (
+        {"part": "mppi", "label": name, "options": {"samples": n}} for name, n in (("few", 8), ("many", 9))
+    )
+    made = trials(planners=(few, many), scenarios=("std",))
+    assert [(t.labels["planner"], t.make_planner().config.samples) for t in made] == [("few", 8), ("many", 9)]
+    for first, second in pairwise(made):
+        assert first.id != second.id
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"risks": ("cvar", "cvar:0.9")}, "twice"),
+        ({"risks": ("cvr",)}, "Did you mean 'cvar'"),
+        ({"planners": ("mpi",)}, "Did you mean 'mppi'"),
+        ({"planners": ("mppi", {"part": "mppi", "options": {"samples": 8}})}, "label"),
+        ({"planners": ({"part": "mppi", "options": {"sample": 8}},)}, "Did you mean 'samples'"),
+        ({"planners": ({"part": "mppi", "option": {}},)}, "options"),
+        ({"planner_options": {"mppi": {"samples": 8}}}, "planner_options"),
+        ({"model": "no-such-model"}, "no-such-model"),
+        ({"model": "fused"}, "family"),
+        ({"model": {"part": "paper-v1", "options": {"a": 1}}}, "no options"),
+        ({"noise": "frozen"}, "stored"),
+        ({"noise": "loud"}, "loud"),
+        ({"world": "papr"}, "Did you mean 'paper'"),
+        ({"world": {"nois": "stored"}}, "Did you mean 'noise'"),
+        ({"task": {"slowst": 0.1}}, "Did you mean 'slowest'"),
+        ({"task": {"free_space": {"by": "luck"}}}, "luck"),
+        ({"task": {"slowest": "much"}}, "slowest"),
+        ({"trials": ({"planer": "mppi"},)}, "Did you mean 'planner"),
+    ],
+)
+def test_what_cannot_be_had_is_refused(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        trials(**changes)
+
+
+def test_a_suite_refuses_what_means_nothing() -> None:
+    for bad in (
+        {"planners": ()},
+        {"realisations": 0},
+        {"instances": -1},
+        {"seeds": (1, 1)},
+        {"recorded": -1},
+    ):
+        with pytest.raises(ConfigError):
+            replace(Suite(), **bad)

@@ -1,0 +1,93 @@
+import math
+
+import pytest
+import torch
+
+from benchnav.planning.world.outcome import STUCK_DISTANCE_M, Outcome, tell_standstill
+
+DT_S = 0.1
+
+
+def tell(
+    moved_mps: list[float], drove_mps: list[float], outcome: Outcome = Outcome.TIMEOUT, dt_s: float = DT_S
+) -> Outcome:
+    """The outcome of an episode of these speeds over ground and as commanded, a value a step."""
+    moved, drove = (dt_s * torch.tensor([speeds], dtype=torch.float64) for speeds in (moved_mps, drove_mps))
+    x = torch.nn.functional.pad(moved.cumsum(dim=1), (1, 0))
+    positions = torch.stack((2 + x, torch.full_like(x, 3.0)), dim=2)
+    return Outcome(int(tell_standstill(torch.tensor([outcome]), positions, drove, dt_s)[0]))
+
+
+def test_a_robot_that_drove_and_did_not_move_is_stuck_and_one_that_did_not_drive_is_stalled() -> None:
+    assert tell([0.0] * 300, [1.0] * 300) == Outcome.STUCK
+    assert tell([0.0] * 300, [0.0] * 300) == Outcome.STALLED
+    assert tell([0.3] * 300, [1.0] * 300) == Outcome.TIMEOUT
+
+
+def test_the_last_ten_seconds_count_alone() -> None:
+    before, after = 200, 100
+    assert tell([1.0] * before + [0.0] * after, [1.0] * 300) == Outcome.STUCK
+    assert tell([1.0] * before + [0.0] * after, [1.0] * before + [0.0] * after) == Outcome.STALLED
+    assert tell([0.0] * before + [0.1] * after, [1.0] * 300) == Outcome.TIMEOUT
+    # A step of driving before the last 10 s is not of them, but the first of them is.
+    big = STUCK_DISTANCE_M / DT_S + 0.1
+    assert tell([0.0] * 300, [0.0] * 199 + [big] + [0.0] * 100) == Outcome.STALLED
+    assert tell([0.0] * 300, [0.0] * 200 + [big] + [0.0] * 99) == Outcome.STUCK
+    assert tell([0.0] * 199 + [big] + [0.0] * 100, [1.0] * 300) == Outcome.STUCK
+    assert tell([0.0] * 200 + [big] + [0.0] * 99, [1.0] * 300) == Outcome.TIMEOUT
+
+
+@pytest.mark.parametrize("dt_s", [0.1, 0.5, 2.0, 30.0])
+def test_the_window_is_in_seconds(dt_s: float) -> None:
+    steps = max(1, round(10 / dt_s))
+    still = [0.0] * steps
+    assert tell([1.0] * 5 + still, [1.0] * 5 + still, dt_s=dt_s) == Outcome.STALLED
+    assert tell([1.0] * 5 + still, [1.0] * 5 + [0.0] * (steps - 1) + [1 / dt_s], dt_s=dt_s) == Outcome.STUCK
+
+
+def test_the_distances_are_half_a_metre() -> None:
+    for moved, drove, outcome in (
+        (0.049, 0.049, Outcome.STALLED),
+        (0.049, 0.051, Outcome.STUCK),
+        (0.051, 0.051, Outcome.TIMEOUT),
+    ):
+        assert tell([moved] * 100, [drove] * 100) == outcome
+
+
+def test_a_robot_that_spins_in_place_is_stalled() -> None:
+    """It turns, but its wheels would take it nowhere."""
+    assert tell([0.0] * 200, [0.0] * 200) == Outcome.STALLED
+
+
+def test_going_round_in_a_wide_circle_is_moving_and_in_a_narrow_one_is_not() -> None:
+    for radius, expected in ((0.3, Outcome.TIMEOUT), (0.2, Outcome.STUCK)):
+        angle = torch.arange(201, dtype=torch.float64) * 2 * math.pi / 50
+        positions = torch.stack((5 + radius * angle.cos(), 5 + radius * angle.sin()), dim=1)[None]
+        drove = torch.full((1, 200), 2 * math.pi * radius / 50, dtype=torch.float64)
+        told = tell_standstill(torch.tensor([Outcome.TIMEOUT]), positions, drove, DT_S)
+        assert told.tolist() == [expected]
+
+
+@pytest.mark.parametrize("outcome", [o for o in Outcome if o != Outcome.TIMEOUT])
+def test_other_outcomes_stay(outcome: Outcome) -> None:
+    assert tell([0.0] * 200, [0.0] * 200, outcome) == outcome
+    assert tell([0.0] * 200, [1.0] * 200, outcome) == outcome
+
+
+def test_an_episode_shorter_than_the_window_and_one_without_steps_are_told() -> None:
+    assert tell([0.0] * 5, [2.0] * 5) == Outcome.STUCK
+    assert tell([0.0] * 5, [0.1] * 5) == Outcome.STALLED
+    none = tell_standstill(
+        torch.tensor([Outcome.PLANNER_ERROR]), torch.zeros(1, 1, 2), torch.zeros(1, 0), DT_S
+    )
+    assert none.tolist() == [Outcome.PLANNER_ERROR]
+
+
+def test_each_episode_of_a_batch_is_told_by_itself() -> None:
+    outcome = torch.tensor([Outcome.TIMEOUT, Outcome.SUCCESS, Outcome.TIMEOUT, Outcome.TIMEOUT])
+    x = torch.zeros(4, 201)
+    x[3] = torch.arange(201) * 0.01
+    drove = torch.tensor([[0.1], [0.1], [0.0], [0.1]]).expand(4, 200)
+    told = tell_standstill(outcome, torch.stack((x, torch.zeros_like(x)), dim=2), drove, DT_S)
+    assert told.tolist() == [Outcome.STUCK, Outcome.SUCCESS, Outcome.STALLED, Outcome.TIMEOUT]
+    assert outcome.tolist() == [Outcome.TIMEOUT, Outcome.SUCCESS, Outcome.TIMEOUT, Outcome.TIMEOUT]

@@ -1,0 +1,108 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from benchnav import rng
+from benchnav.errors import ConfigError
+from benchnav.planning.world.realisation import Realisation
+from benchnav.planning.world.world import World
+from tests import factories
+
+KEY = rng.stream_key(0, "luck")
+MIDDLE = torch.tensor([[4.0, 4.0, 0.0]])
+
+
+def realisation(mean: torch.Tensor, std: float = 0.1, noise: str = "resampled", steps: int = 200, **given):  # type: ignore[no-untyped-def]
+    settings = {"key": KEY, "instances": range(len(mean)), **given}
+    return Realisation(factories.terrain(mean, std), World(noise=noise), steps, **settings)
+
+
+def met(one: Realisation, batch: int, steps: int) -> torch.Tensor:
+    """λ of robots that stand in the middle, shape [steps, B]."""
+    state = MIDDLE.repeat(batch, 1)
+    return torch.stack([one.at(state, torch.full((batch,), step)) for step in range(steps)])
+
+
+def even(batch: int, value: float = 0.5) -> torch.Tensor:
+    return torch.full((batch, 16, 16), value)
+
+
+def test_resampled_noise_has_the_latent_distribution_at_each_step() -> None:
+    drawn = met(realisation(even(40)), 40, 200)
+    assert drawn.mean().item() == pytest.approx(0.5, abs=0.005)
+    assert drawn.std().item() == pytest.approx(0.1, abs=0.005)
+    # Neither steps nor episodes are alike.
+    assert len(drawn.unique()) > 7900
+
+
+def test_luck_is_keyed_by_instance_and_step_whatever_the_batch() -> None:
+    together = met(realisation(even(40)), 40, 5)
+    alone = met(realisation(even(1), instances=[7]), 1, 5)
+    assert torch.equal(alone[:, 0], together[:, 7])
+    turned = met(realisation(even(2), instances=[9, 7]), 2, 5)
+    assert torch.equal(turned, together[:, [9, 7]])
+
+
+def test_another_root_is_another_luck() -> None:
+    first, second = (met(realisation(even(3), key=rng.stream_key(seed, "luck")), 3, 4) for seed in (0, 1))
+    assert not (first == second).any()
+
+
+def test_another_time_budget_leaves_the_luck_as_it_is() -> None:
+    short, long = (met(realisation(even(2), steps=steps), 2, 10) for steps in (10, 1000))
+    assert torch.equal(short, long)
+
+
+def test_luck_scales_with_each_cells_standard_deviation_and_mean() -> None:
+    narrow, wide = (met(realisation(even(2, 0.5), std), 2, 20) - 0.5 for std in (0.01, 0.1))
+    torch.testing.assert_close(10 * narrow, wide, atol=1e-5, rtol=0)
+    lower = met(realisation(even(2, 0.4), 0.01), 2, 20)
+    torch.testing.assert_close(lower - 0.4, narrow, atol=1e-6, rtol=0)
+
+
+def test_traversability_is_clipped_to_its_range() -> None:
+    drawn = met(realisation(torch.cat((even(20, 1.0), even(20, 0.0)))), 40, 20)
+    assert drawn.min() == 0
+    assert drawn.max() == 1
+    assert ((drawn > 0) & (drawn < 1)).any()
+
+
+def test_lambda_is_read_in_the_cell_where_the_robot_stands() -> None:
+    mean = torch.rand(2, 12, 20)
+    one = realisation(mean, 0.0)
+    state = torch.tensor([[7.3, 1.2, 0.0], [0.1, 5.9, 0.0]])
+    assert one.at(state, torch.zeros(2, dtype=torch.int64)).tolist() == [mean[0, 2, 14], mean[1, 11, 0]]
+    off = torch.tensor([[-0.1, 1.2, 0.0], [3.0, 6.1, 0.0]])
+    assert one.at(off, torch.zeros(2, dtype=torch.int64)).tolist() == [0, 0]
+
+
+def test_stored_noise_is_the_maps_realised_traversability() -> None:
+    terrain = factories.terrain(torch.full((1, 16, 16), 0.5))
+    terrain = replace(terrain, traversability=torch.rand(1, 16, 16))
+    one = Realisation(terrain, World(noise="stored"), 10, KEY, [0])
+    for step in range(3):
+        at = one.at(torch.tensor([[3.3, 1.2, 0.0]]), torch.tensor([step]))
+        assert at[0] == terrain.traversability[0, 2, 6]
+
+
+def test_stored_noise_needs_every_cell_observed() -> None:
+    terrain = factories.terrain(even(1))
+    holed = terrain.traversability.clone()
+    holed[0, 3, 3] = torch.nan
+    terrain = replace(terrain, traversability=holed)
+    Realisation(terrain, World(noise="resampled"), 10, KEY, [0])
+    with pytest.raises(ConfigError, match="not observed"):
+        Realisation(terrain, World(noise="stored"), 10, KEY, [0])
+
+
+@pytest.mark.parametrize("noise", ["resampled", "stored"])
+def test_some_episodes_are_exchanged_and_the_others_stay(noise: str) -> None:
+    ground = torch.rand(3, 16, 16)
+    one = realisation(ground, noise=noise)
+    other = realisation(torch.rand(2, 16, 16), noise=noise, instances=[20, 21])
+    before = met(one, 3, 5)
+    mixed = met(one.exchange(torch.tensor([2, 0]), other), 3, 5)
+    assert torch.equal(mixed[:, 1], before[:, 1])
+    assert torch.equal(mixed[:, [2, 0]], met(other, 2, 5))
+    assert torch.equal(met(one, 3, 5), before)
