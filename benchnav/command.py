@@ -3,14 +3,18 @@
 Bad input ends in one line on standard error and exit status 2; an interruption in status 130.
 """
 
+import errno
 import inspect
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, get_args, get_origin, get_type_hints
+from pathlib import Path
+from typing import Any, get_type_hints
 
-from benchnav.errors import BenchnavError
+from benchnav.arguments import Known, explain, know, spell
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.options import hint
 
 
 @dataclass(frozen=True)
@@ -23,17 +27,19 @@ class Command:
         positionals: names of its parameters that are given by place rather than by flag; one that is a
             list takes what is left.
         settings: a dataclass whose fields become flags; one of it is the function's first argument.
+        configs: folder of shipped YAML files, which `--config NAME` finds where there is no such file.
     """
 
     function: Callable[..., int | None]
     positionals: tuple[str, ...] = ()
     settings: type | None = None
+    configs: Path | None = None
 
 
 def run(
     program: str, description: str, commands: dict[str, Command], argv: Sequence[str] | None = None
 ) -> int:
-    """Parses a command line and runs the subcommand it names.
+    """Parses a command line and runs the subcommand it names; without one it prints the help.
 
     Args:
         program: name of the command.
@@ -48,50 +54,40 @@ def run(
 
     # Notices of libraries to their own developers would bury what a user has to read.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
-    argv = _as_parsed(sys.argv[1:] if argv is None else argv, commands)
+    argv = list(sys.argv[1:] if argv is None else argv)
     parser = ArgumentParser(prog=program, description=description, exit_on_error=False)
     subcommands = parser.add_subcommands(required=True, metavar="COMMAND", dest="command")
+    known: dict[str, Known] = {}
     for name, command in commands.items():
-        child = ArgumentParser(exit_on_error=False, description=_summary(command.function))
-        child.add_argument("--config", action="config", help="Path of a YAML file with these settings.")
-        hints = get_type_hints(command.function)
-        for positional in command.positionals:
-            rest = {"type": str, "nargs": "*", "default": []} if hints[positional] == list[str] else {}
-            child.add_argument(
-                positional,
-                **({"type": hints[positional]} | rest),
-                help=_argument_help(command.function, positional),
-            )
-        skip: set[str | int] = set(command.positionals)
-        if command.settings:
-            child.add_class_arguments(command.settings, as_group=False)
-            skip.add(next(iter(hints)))
-        child.add_function_arguments(command.function, as_group=False, skip=skip)
-        subcommands.add_subcommand(name, child, help=_summary(command.function))
+        known[name] = know(f"{program} {name}", *(getattr(command, item.name) for item in fields(command)))
+        subcommands.add_subcommand(name, _subparser(command, known[name]), help=_summary(command.function))
     if not argv:
         parser.print_help()
-        return 2
+        return 0
+    asked, words = argv[0], argv[1:]
     try:
-        parsed = parser.instantiate_classes(parser.parse_args(argv))
-        command = commands[parsed.command]
-        arguments = dict(vars(parsed[parsed.command]))
+        if asked not in commands and asked not in ("-h", "--help"):
+            raise ConfigError(
+                f"Expected a command among {', '.join(commands)}, got {asked!r}.{hint(asked, commands)}"
+            )
+        spelled = spell(words, known[asked]) if asked in commands else words
+        parsed = parser.instantiate(parser.parse_args([asked, *spelled]))
+        command = commands[asked]
+        arguments = dict(vars(parsed[asked]))
         arguments.pop("config", None)
         if command.settings is None:
             return command.function(**arguments) or 0
         settings = command.settings(**{f.name: arguments.pop(f.name) for f in fields(command.settings)})
         return command.function(settings, **arguments) or 0
-    except (ArgumentError, BenchnavError, UnicodeDecodeError) as error:
-        print(f"{program}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    except ArgumentError as error:
+        return _refuse(program, explain(str(error), words, known[asked]))
+    except (BenchnavError, UnicodeDecodeError) as error:
+        return _refuse(program, str(error))
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except OSError as error:
-        print(
-            f"{program}: error: could not use {error.filename or 'a file'}: {error.strerror or error}",
-            file=sys.stderr,
-        )
-        return 2
+        return _refuse(program, _unusable(error, known[asked]))
     except KeyboardInterrupt:
         print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
         return 130
@@ -130,34 +126,46 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
             print(f"{what}: {done}/{total}", file=sys.stderr, flush=True)
 
 
-def _as_parsed(argv: Sequence[str], commands: dict[str, Command]) -> list[str]:
-    """Spells flags as the parser knows them.
+def _subparser(command: Command, known: Known) -> Any:
+    from jsonargparse import ArgumentParser
 
-    `--contact-sheet` for `--contact_sheet true`, and `--maps 3` for `--maps [3]`.
-    """
-    hints = [get_type_hints(command.function) for command in commands.values()]
-    hints += [get_type_hints(command.settings) for command in commands.values() if command.settings]
-    kinds = {f"--{name}": kind for types in hints for name, kind in types.items()}
-    switches = {name for name, kind in kinds.items() if kind is bool}
-    lists = {name for name, kind in kinds.items() if _is_list(kind)}
-    spelled: list[str] = []
-    for word, following in zip(argv, [*argv[1:], ""], strict=True):
-        if spelled and spelled[-1] in lists and not word.startswith(("[", "(", "-")):
-            spelled.append(f"[{word}]")
-            continue
-        name, equals, value = word.partition("=")
-        if not name.startswith("--"):
-            spelled.append(word)
-            continue
-        name = "--" + name[2:].replace("-", "_")
-        if name in switches and not equals and following.lower() not in ("true", "false", "yes", "no"):
-            equals, value = "=", "true"
-        spelled.append(name + equals + value)
-    return spelled
+    parser = ArgumentParser(exit_on_error=False, description=_summary(command.function))
+    shipped = f", or one of {', '.join(known.shipped)}" if known.shipped else ""
+    parser.add_argument(
+        "--config", action="config", help=f"Path of a YAML file with these settings{shipped}."
+    )
+    hints = get_type_hints(command.function)
+    for positional in command.positionals:
+        rest = {"type": str, "nargs": "*", "default": []} if hints[positional] == list[str] else {}
+        parser.add_argument(
+            positional,
+            **({"type": hints[positional]} | rest),
+            help=_argument_help(command.function, positional),
+        )
+    skip: set[str | int] = set(command.positionals)
+    if command.settings:
+        parser.add_class_arguments(command.settings, as_group=False)
+        skip.add(next(iter(hints)))
+    parser.add_function_arguments(command.function, as_group=False, skip=skip)
+    return parser
 
 
-def _is_list(kind: Any) -> bool:
-    return any(get_origin(part) in (list, tuple) for part in (kind, *get_args(kind)))
+def _refuse(program: str, message: str) -> int:
+    print(f"{program}: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _unusable(error: OSError, known: Known) -> str:
+    """Says which file or folder the system refused, and what to do."""
+    reason = error.strerror or str(error)
+    if not error.filename:
+        return f"could not use a file: {reason}"
+    path = Path(str(error.filename))
+    if error.errno not in (errno.EACCES,):
+        return f"could not use {path}: {reason}"
+    there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    remedy = "Choose another place with --out, or change" if "out" in known.kinds else "Change"
+    return f"could not use {path.absolute()}: {reason}. {remedy} the permissions of {there}."
 
 
 def _summary(function: Callable[..., Any]) -> str:

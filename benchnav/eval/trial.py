@@ -108,7 +108,7 @@ class Trial:
         """Makes the model, or loads its checkpoint."""
         from benchnav.models.predictor import load_model
 
-        return registry.make("model", self.model) if self.model.options else load_model(self.model.part)
+        return load_model(self.model)
 
     def make_risk(self) -> RiskMeasure:
         """Makes the risk measure."""

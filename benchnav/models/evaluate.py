@@ -128,8 +128,11 @@ def _check_targets(out: str, json: str, overwrite: bool) -> None:
         )
     for path in [target] * bool(json) + [folder / REPORT] * bool(out):
         nearest = next(parent for parent in path.absolute().parents if parent.exists())
-        with tempfile.TemporaryFile(dir=nearest):
-            pass
+        try:
+            with tempfile.TemporaryFile(dir=nearest):
+                pass
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:

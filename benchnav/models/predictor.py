@@ -201,7 +201,7 @@ def class_mismatch(
         Empty where the tables are the same, or the model has none.
     """
     own = tuple(getattr(model, "class_names", ()))
-    recipe: Recipe = getattr(data, "recipe", data)
+    recipe: Any = getattr(data, "recipe", data)
     names = tuple(item.name for item in recipe.classes)
     if not own or own == names:
         return ""

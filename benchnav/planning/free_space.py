@@ -6,9 +6,7 @@ predicted. The λ̂ that motion and path costs are given is at least `slowest`, 
 predicted to hold it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor

@@ -4,7 +4,7 @@ It holds what is *predicted* alone: the truth stays with the simulation. Letters
 cells, K components, S state and A action dimensions, *K any further dimensions.
 """
 
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -33,7 +33,7 @@ class Task:
 
     robot: Robot
     objective: Objective
-    rules: Rules = Rules()
+    rules: Rules = field(default_factory=Rules)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,9 +177,7 @@ class Problem:
         return _with_tensors(self, lambda value: value.to(device))
 
 
-def stage_cost(
-    objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor
-) -> Tensor:
+def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
     """J of a step and the price of ground that is not free; see `Problem.stage_cost`."""
     return objective.stage(state, action, ground.abs(), target) + PRICE * (ground <= 0)
 
@@ -227,10 +225,10 @@ def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
 def _with_tensors(value: T, change: Any) -> T:
     """Changes every tensor of a dataclass and of the dataclasses in it, but for the task's."""
     changed: dict[str, Any] = {}
-    for field in fields(value):  # type: ignore[arg-type]
-        item = getattr(value, field.name)
+    for each in fields(value):  # type: ignore[arg-type]
+        item = getattr(value, each.name)
         if isinstance(item, Tensor):
-            changed[field.name] = change(item)
+            changed[each.name] = change(item)
         elif is_dataclass(item) and not isinstance(item, Task | Grid):
-            changed[field.name] = _with_tensors(item, change)
+            changed[each.name] = _with_tensors(item, change)
     return replace(value, **changed)  # type: ignore[type-var]

@@ -66,9 +66,13 @@ def apply(measure: RiskMeasure, mixture: TraversabilityMixture) -> Tensor:
     """
     risk_map = measure(mixture)
     shape = mixture.weights.select(-3, 0).shape
-    if not isinstance(risk_map, Tensor) or risk_map.shape != shape or not risk_map.is_floating_point():
+    if not isinstance(risk_map, Tensor) or risk_map.shape != shape:
         got = list(risk_map.shape) if isinstance(risk_map, Tensor) else type(risk_map).__name__
         raise ConfigError(f"Expected a risk measure to give λ̂ of shape {list(shape)}, got {got}.")
+    if not risk_map.is_floating_point():
+        raise ConfigError(
+            f"Expected a risk measure to give λ̂ as floating-point numbers, got {risk_map.dtype}."
+        )
     if not bool(((risk_map >= 0) & (risk_map <= 1)).all()):
         raise ConfigError("Expected a risk measure to give λ̂ in [0, 1], got values outside or not a number.")
     return risk_map.to(mixture.weights.dtype)

@@ -209,10 +209,11 @@ def test_what_is_no_model_gets_a_hint(source: str, expected: str, checkpoint_pat
 
 @pytest.mark.usefixtures("_own_file")
 def test_a_checkpoint_runs_no_code_that_it_names(checkpoint_path: Path) -> None:
-    for name in ("./mine_of_tests.py:Family", "mine_of_tests:Family", "oracle"):
+    Path("hostile_of_tests.py").write_text(MINE)
+    for name in ("./hostile_of_tests.py:Family", "hostile_of_tests:Family", "oracle"):
         with pytest.raises(CheckpointError, match="Install the package"):
             open_checkpoint(replace(load_checkpoint(checkpoint_path), model=name))
-    assert not [name for name in sys.modules if "mine_of_tests" in name]
+    assert not [name for name in sys.modules if "hostile_of_tests" in name]
 
 
 def test_a_checkpoint_has_no_options(checkpoint_path: Path) -> None:

@@ -1,4 +1,5 @@
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,10 @@ ID = "benchnav/OffRoad-v0"
 AHEAD = np.array([1.0, 0.0], np.float32)
 
 
-@pytest.fixture(scope="module")
-def test_splits_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of test splits alone, such as the shipped one."""
+def dataset_of(path: Path, *names: str) -> Path:
+    """A dataset of some splits, in this order."""
     recipe = factories.tiny_recipe()
-    splits = {name: split for name, split in recipe.splits.items() if name.startswith("test/")}
-    made = type(recipe)(**{**vars(recipe), "splits": splits})
-    return factories.tiny_dataset(tmp_path_factory.mktemp("data") / "tests.h5", made)
+    return factories.tiny_dataset(path, replace(recipe, splits={name: recipe.splits[name] for name in names}))
 
 
 def make(path: Path, **settings: Any) -> Any:
@@ -208,21 +206,28 @@ def test_a_robot_is_taken_by_name_and_its_state_and_actions_are_seen(dataset_pat
         assert observation["state"][3:].tolist() == pytest.approx([0.1, 0.2])
 
 
-def test_the_split_is_train_unless_there_is_none(dataset_path: Path, test_splits_path: Path) -> None:
-    train = TerrainDataset(dataset_path).read("train", [2], ["rgb"])["rgb"][0]
-    env = make(dataset_path)
-    np.testing.assert_array_equal(env.reset(seed=0, options={"instance": 2})[0]["rgb"], train)
-    first = TerrainDataset(test_splits_path)
-    assert "train" not in first.splits
-    with pytest.warns(UserWarning, match="no split 'train'"):
-        env = gymnasium.make(ID, data=test_splits_path).unwrapped
-    shown = first.read(next(iter(first.splits)), [1], ["rgb"])["rgb"][0]
-    np.testing.assert_array_equal(env.reset(seed=0, options={"instance": 1})[0]["rgb"], shown)
+def shown(env: Any, instance: int) -> np.ndarray:
+    return env.reset(seed=0, options={"instance": instance})[0]["rgb"]
+
+
+def test_the_split_is_train_wherever_there_is_one(tmp_path: Path) -> None:
+    path = dataset_of(tmp_path / "both.h5", "test/std", "train")
+    stored = TerrainDataset(path)
+    assert next(iter(stored.splits)) == "test/std"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        named = make_vector(test_splits_path, 1, split="test/hs")
-    shown = first.read("test/hs", [1], ["rgb"])["rgb"]
-    np.testing.assert_array_equal(named.reset(seed=0, options={"instance": 1})[0]["rgb"], shown)
+        np.testing.assert_array_equal(shown(make(path), 2), stored.read("train", [2], ["rgb"])["rgb"][0])
+        first = stored.read("test/std", [1], ["rgb"])["rgb"]
+        np.testing.assert_array_equal(shown(make(path, split="test/std"), 1), first[0])
+        np.testing.assert_array_equal(shown(make_vector(path, 1, split="test/std"), 1), first)
+
+
+def test_a_dataset_without_train_gives_its_first_split_and_says_so(tmp_path: Path) -> None:
+    path = dataset_of(tmp_path / "tests.h5", "test/hs", "test/std")
+    with pytest.warns(UserWarning, match="no split 'train'; its split 'test/hs' is taken"):
+        env = make(path)
+    stored = TerrainDataset(path).read("test/hs", [1], ["rgb"])["rgb"][0]
+    np.testing.assert_array_equal(shown(env, 1), stored)
 
 
 def test_time_budget_and_goal_radius_end_episodes(dataset_path: Path) -> None:

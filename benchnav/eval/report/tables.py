@@ -12,6 +12,8 @@ from benchnav.planning.world.outcome import FAILURES
 
 NOT_USED = "–"
 
+# What `follows` is where a planner follows the user's objective alone.
+_USERS_OWN = ("", "J")
 _ALWAYS = ("scenario", "planner", "risk")
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -59,7 +61,7 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
     rows = []
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
         labels = [str(row[name]) + (mark if name == "planner" else "") for name in shown]
-        rows.append((*labels, *(str(row[name]) for name in reversed(counts)), *_results(row)))
+        rows.append((*labels, *(str(row[name]) for name in counts), *_results(row)))
     return ResultTable(headings=headings, labels=len(shown), rows=tuple(rows), notes=tuple(notes))
 
 
@@ -106,7 +108,7 @@ def _notes(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> tu
     marks = []
     for trial in summary["trial"]:
         about = trials[trial]
-        texts = [f"follows {about['follows']}"] if about["follows"] else []
+        texts = [f"follows {about['follows']}"] if about["follows"] not in _USERS_OWN else []
         own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]
         marks.append(",".join(_raised(number) for number in own))
     return marks, [f"{_raised(number)} {text}" for text, number in numbers.items()]

@@ -53,7 +53,7 @@ def check_suite(
     for trial in _distinct(trials, ("model",)):
         model = trial.make_model()
         for data in {other.data for other in trials if other.model == trial.model and not other.blind}:
-            _tell(say, class_mismatch(model, datasets[data]))
+            _tell(say, class_mismatch(model, datasets[data], f"model {trial.model.label}"))
     for line in dict.fromkeys(line for trial in trials for line in _doubts(trial, datasets[trial.data])):
         say(line)
     wanted = {}

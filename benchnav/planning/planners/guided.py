@@ -1,8 +1,8 @@
 """A global path that gives way-points to any local planner, and the recovery of a robot that stands.
 
 A* gives the cheapest path from wherever the robot stands; the local planner heads for a way-point on it.
-Where a local planner has held a robot in place for a second, the robot is steered straight to the path's
-next cell until it has left the place; one that drives and is held by the ground is left to its planner.
+Where a local planner has held a robot in place for a second, the robot is steered along the path, cell by
+cell, until it has left the place; one that drives and is held by the ground is left to its planner.
 Source: paper IV-A1, after Fan et al. (2021), "STEP"; the recovery is ours. Letters in shapes: B episodes,
 S state and A action dimensions.
 """
@@ -26,7 +26,7 @@ from benchnav.planning.robots import Robot
 _STANDING_M = 0.05
 # for so long,
 _PATIENCE_S = 1.0
-# at less than this share of its top speed as commanded, is steered to the next cell,
+# at less than this share of its top speed as commanded, is steered along the path,
 _IDLE = 0.2
 # until it is this far away
 _LEFT_M = 0.5
@@ -174,10 +174,10 @@ class Guided(Generic[Local]):
         problem, field, state = plan_state.problem, plan_state.field, step.state
         count = 2 + int(self.guide.lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
-        target = choose_waypoint(plan_state.ground, points, self.guide.lookahead_m)
+        target, onward = choose_waypoint(plan_state.ground, points, self.guide.lookahead_m)
         action, local, plan = self.local.plan_toward(step, plan_state.local, target)
         recovery = watch(plan_state.recovery, state, action, problem.robot)
-        away = steer_toward(state, points[:, 1], problem.robot)
+        away = steer_toward(state, onward, problem.robot)
         action = torch.where(recovery.active[:, None], away, action)
         if step.draw:
             # Long enough for a path that crosses the map twice; longer ones are cut.

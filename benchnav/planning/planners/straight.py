@@ -11,10 +11,12 @@ from torch import Tensor
 
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
-from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot
+from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot, action_limits
 
 # Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
-_TURN_GAIN = 2.0
+_TURN_GAIN = 4.0
+# A robot that looks farther away than this turns before it drives, so that it leaves narrow places straight.
+_AWAY_RAD = 0.2
 # Least share of the top speed of a robot that steers: it cannot turn while it stands.
 _CREEP = 0.3
 
@@ -22,7 +24,7 @@ STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
 
 
 def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
-    """Actions that turn toward a target and drive at it, the slower the farther the robot looks away.
+    """Actions that turn toward a target and drive at it, once the robot looks there.
 
     Args:
         state: shape [B, S], beginning with (x, y, θ).
@@ -35,11 +37,13 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     offset = target_m - state[:, :2]
     missing = torch.atan2(offset[:, 1], offset[:, 0]) - state[:, 2]
     missing = torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
+    low, high, limits = robot.action_low, robot.action_high, action_limits(robot)
+    # A robot of limited acceleration has to be able to end its turn in time.
+    gain = _TURN_GAIN if limits is None else min(_TURN_GAIN, 2 * limits[1] / high[1])
     least = 0.0 if TURN_RATE in robot.action_names else _CREEP
-    speed = robot.action_high[0] * missing.cos().clamp(min=least)
-    wanted = (speed, _TURN_GAIN * missing)
-    bounds = zip(wanted, robot.action_low, robot.action_high, strict=True)
-    return torch.stack([action.clamp(low, high) for action, low, high in bounds], dim=1)
+    speed = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
+    actions = zip((speed, gain * missing), low, high, strict=True)
+    return torch.stack([action.clamp(least, most) for action, least, most in actions], dim=1)
 
 
 class Straight:

@@ -86,7 +86,7 @@ def line_costs(ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: i
     return ((per_m + at_pieces(ground.price_per_m)) * share * length).sum(dim=-1)
 
 
-def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -> Tensor:
+def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -> tuple[Tensor, Tensor]:
     """Picks the farthest point of a path whose straight line costs hardly more than the path.
 
     Args:
@@ -95,7 +95,9 @@ def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -
         lookahead_m: how far along the path to look.
 
     Returns:
-        (x, y), shape [B, 2]; the path's next point where no line is worth it.
+        The way-point (x, y), the path's next point where no line is worth it; and where to drive to follow
+        the path itself: its next point, or the centre of the robot's own cell where the line to that point
+        cuts across dearer ground. Each of shape [B, 2].
     """
     grid = ground.grid
     robot, ahead = points_m[:, :1], points_m[:, 1:]
@@ -109,14 +111,15 @@ def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -
     crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
     costs = line_costs(ground, begin, end, crossings)
     lines, legs, detour = costs[:, :count], costs[:, count:-2], costs[:, -2:].sum(dim=1, keepdim=True)
-    # The line to a neighbour across a corner may cut a cell that the path does not touch.
     path = torch.cat((torch.minimum(lines[:, :1], detour), legs), dim=1).cumsum(dim=1)
+    worth = lines <= _SHORT_CUT * path
     steps = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2)
-    near = steps.cumsum(dim=1) <= lookahead_m
-    worth = (lines <= _SHORT_CUT * path) & near
-    rank = torch.arange(ahead.shape[1], device=ahead.device)
-    farthest = torch.where(worth, rank, 0).amax(dim=1)
-    return ahead.gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0]
+    rank = torch.arange(count, device=ahead.device)
+    farthest = torch.where(worth & (steps.cumsum(dim=1) <= lookahead_m), rank, 0).amax(dim=1)
+    # At its centre already, as well as steering can tell, a robot has nothing to gain from it.
+    astray = torch.linalg.vector_norm(own - robot, dim=2) > grid.resolution_m / 4
+    onward = torch.where((astray & ~worth[:, :1])[..., None], own, ahead[:, :1])
+    return ahead.gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0], onward[:, 0]
 
 
 def _grid_cuts(start_m: Tensor, offset_m: Tensor, resolution_m: float, crossings: int) -> Tensor:

@@ -66,9 +66,10 @@ def test_numbers_of_maps_and_episodes_are_shown_where_they_are_not_the_same() ->
     same = table_of(made.rows(episodes, (made.row(many, i) for i in range(2))))
     assert "maps" not in same.headings
     assert "episodes" not in same.headings
-    more_maps = table_of(made.rows(episodes, (made.row(many, i) for i in range(3))))
+    more = (made.row(many, i, seed=seed) for i in range(3) for seed in range(4))
+    more_maps = table_of(made.rows(episodes, more))
     assert more_maps.headings[3:5] == ("maps", "episodes")
-    assert [row[3:5] for row in more_maps.rows] == [("2", "2"), ("3", "3")]
+    assert [row[3:5] for row in more_maps.rows] == [("2", "2"), ("3", "12")]
     more_seeds = table_of(
         made.rows(episodes, (made.row(many, i, seed=s) for i in range(2) for s in range(2)))
     )
@@ -84,6 +85,13 @@ def test_notes_are_numbered_once_and_marked_at_every_trial_they_hold_for() -> No
     table = table_of(episodes, a=shared, b=shared | {"remarks": ["slow"]})
     assert [row[1] for row in table.rows] == ["mppi", "mppi", "a¹", "a¹", "b¹,²", "b¹,²"]
     assert table.notes == ("¹ follows path length", "² slow")
+
+
+@pytest.mark.parametrize("follows", ["", "J"])
+def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows: str) -> None:
+    table = table_of(made.rows(made.row(made.trial())), mppi={"follows": follows})
+    assert table.rows[0][1] == "mppi"
+    assert table.notes == ()
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ workers; expectations are worked out here from the dataset and the random stream
 
 from collections import Counter
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,7 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
     return notes, pd.read_parquet(folder / "run" / "episodes.parquet")
 
 
+@lru_cache
 def risk_maps(dataset: TerrainDataset, scenario: str, risk: str) -> torch.Tensor:
     terrain = dataset.terrain(f"test/{scenario}")
     mean, std = (t.unsqueeze(1) for t in (terrain.traversability_mean, terrain.traversability_std))

@@ -51,6 +51,21 @@ def test_design_effect_of_maps_with_unequal_numbers_of_episodes() -> None:
     assert np.mean(found) == pytest.approx(1 + ((size**2).sum() / size.sum() - 1) * 0.3, abs=0.15)
 
 
+def test_correlation_is_the_anova_estimate_computed_by_hand() -> None:
+    # Three maps of 1, 2 and 3 episodes: means 1, 1/2, 2/3 about 2/3; sums of squares 1/6 between, 7/6 within.
+    success = np.array([1, 1, 0, 1, 1, 0], dtype=bool)
+    between, within, typical = (1 / 6) / 2, (7 / 6) / 3, (6 - 14 / 6) / 2
+    estimate = (between - within) / (between + (typical - 1) * within)
+    assert estimate < 0
+    assert design_effect(success, np.array([0, 1, 1, 2, 2, 2])) == 1
+    # Success and failure of the third map alike: 1, 1/2, 0 about 1/3, between 5/6, within 1/2.
+    success = np.array([1, 1, 0, 0, 0, 0], dtype=bool)
+    between, within = (5 / 6) / 2, (1 / 2) / 3
+    estimate = (between - within) / (between + (typical - 1) * within)
+    expected = 1 + (14 / 6 - 1) * estimate
+    assert design_effect(success, np.array([0, 1, 1, 2, 2, 2])) == pytest.approx(expected)
+
+
 def test_interval_holds_what_it_promises_on_maps_that_are_alike_in_themselves() -> None:
     generator = np.random.default_rng(3)
     held, naive = 0, 0

@@ -1,75 +1,222 @@
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from benchnav.planning import mppi
-from benchnav.planning.mppi import MPPI, MPPIConfig
+from benchnav.errors import ConfigError
+from benchnav.planning.planners import mppi
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
+from benchnav.planning.world.outcome import Outcome
 from tests import factories
+from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda
 
 SMALL = MPPIConfig(samples=256, horizon=20)
 
 
 def test_rollout_cost_equals_a_loop_over_samples() -> None:
-    generator = torch.Generator().manual_seed(0)
-    problem = factories.problem(torch.rand(2, 16, 16, generator=generator))
-    mean = torch.rand(2, 13, 2, generator=generator)
-    noise = torch.randn(13, 2, 5, generator=generator)
-    cost = mppi.rollout_cost(problem, problem.start, mean, noise)
+    problem = factories.problem(torch.rand(2, 16, 12, generator=generator()), goal=(4.25, 6.75))
+    target = problem.goal_m + 0.3
+    mean = torch.rand(2, 13, 2, generator=generator(1))
+    noise = torch.randn(13, 2, 5, generator=generator(2))
+    cost = mppi.rollout_cost(problem, problem.start, mean, noise, target)
     for b in range(2):
         for k in range(5):
             x, y, heading = problem.start[b].tolist()
             expected = 0.0
             for t in range(14):
                 row, column = int(y // 0.5), int(x // 0.5)
-                inside = 0 <= row < 16 and 0 <= column < 16 and x >= 0 and y >= 0
-                lam = problem.traversability[b, row, column].item() if inside else 0.0
-                gx, gy = problem.goal_m[b].tolist()
-                expected += ((x - gx) ** 2 + (y - gy) ** 2) ** 0.5 + (1e4 if lam <= 0.3 else 0)
+                inside = 0 <= row < 16 and 0 <= column < 12 and x >= 0 and y >= 0
+                free = inside and bool(problem.free[b, row, column])
+                lam = max(problem.risk_map[b, row, column].item(), 0.3) if inside else 0.0
+                gx, gy = target[b].tolist()
+                expected += math.hypot(x - gx, y - gy) + (0 if free else 1e4)
                 if t < 13:
                     v = min(max(mean[b, t, 0].item() + noise[t, 0, k].item(), 0), 1)
                     w = min(max(mean[b, t, 1].item() + noise[t, 1, k].item(), -1), 1)
-                    heading_now = torch.tensor(heading)
-                    x += 0.1 * lam * v * heading_now.cos().item()
-                    y += 0.1 * lam * v * heading_now.sin().item()
+                    x += 0.1 * lam * v * math.cos(heading)
+                    y += 0.1 * lam * v * math.sin(heading)
                     heading += 0.1 * lam * w
-            assert cost[b, k].item() == pytest.approx(expected, rel=1e-4)
+            assert cost[b, k].item() == pytest.approx(expected, rel=1e-5, abs=1e-2)
 
 
-def test_the_mean_is_the_softmax_average_of_the_samples() -> None:
+@pytest.mark.parametrize("control_cost", [0.0, 0.4])
+def test_the_mean_is_the_softmax_average_of_the_samples(control_cost: float) -> None:
+    config = replace(SMALL, control_cost=control_cost, noise=(0.3, 0.6))
     problem = factories.problem(torch.full((1, 16, 16), 0.8))
-    planner = MPPI(SMALL)
-    first = planner.init(problem, torch.Generator().manual_seed(3))
-    action, second, _ = planner.plan(problem.start, first)
-    noise = planner._noise(first, problem.start) * 0.5
-    cost = mppi.rollout_cost(problem, problem.start, first.mean, noise)[0].double()
-    weights = torch.exp(-(cost - cost.min()) / SMALL.temperature)
-    samples = noise.clamp(min=torch.tensor([0.0, -1.0])[:, None], max=torch.tensor([1.0, 1.0])[:, None])
+    planner = MPPI(config)
+    state = planner.init(problem, generator(3))
+    state = replace(state, mean=torch.rand(state.mean.shape, generator=generator(4)))
+    action, following, _ = planner.plan(first(problem), state)
+    noise = mppi.draw_noise(state, config.samples)
+    cost = mppi.rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)[0].double()
+    for step in range(20):
+        for axis, scale in enumerate(config.noise):
+            cost += control_cost * state.mean[0, step, axis] * noise[step, axis] / scale**2
+    weights = torch.exp(-(cost - cost.min()) / config.temperature)
+    low, high = torch.tensor([0.0, -1.0])[:, None], torch.tensor([1.0, 1.0])[:, None]
+    samples = (state.mean[0, :, :, None] + noise).clamp(low, high)
     mean = (samples * (weights / weights.sum())).sum(-1)
     torch.testing.assert_close(action[0].double(), mean[0], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(second.mean[0, :-1].double(), mean[1:], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(second.mean[0, -1].double(), mean[-1], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(following.mean[0, :-1].double(), mean[1:], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(following.mean[0, -1].double(), mean[-1], atol=1e-5, rtol=1e-4)
 
 
-def test_compiled_and_eager_rollouts_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    generator = torch.Generator().manual_seed(0)
-    problem = factories.problem(torch.rand(2, 16, 16, generator=generator))
-    mean, noise = torch.rand(2, 10, 2, generator=generator), torch.randn(10, 2, 64, generator=generator)
-    eager = mppi.rollout_cost(problem, problem.start, mean, noise)
-    monkeypatch.setattr(mppi, "worth_compiling", lambda *_: True)
-    fused = mppi.rollout_cost(problem, problem.start, mean, noise)
-    # A sample that stands within rounding of a cell's edge may read the neighbour.
-    close = torch.isclose(fused, eager, rtol=1e-4)
-    assert close.float().mean() > 0.95
+class Free:
+    """Costs nothing, wherever it leads."""
+
+    def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+        return 0 * traversability
+
+    def terminal(self, state, traversability, target):  # type: ignore[no-untyped-def]
+        return 0 * traversability
+
+
+def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
+    # γ = temperature weighs samples about the mean u as if they were drawn about 0, whatever u is; half of
+    # it as if about u/2.
+    robot = Unicycle(speed_mps=(-9, 9), turn_rate_radps=(-9, 9))
+    ground = torch.full((1, 99, 99), 0.5)
+    problem = factories.problem(ground, (24, 24), (30, 30), robot, Free())
+    config = MPPIConfig(horizon=2, samples=200_000, temperature=0.7)
+    mean = torch.tensor([[[0.4, -0.3], [-0.2, 0.5]]])
+    for share in (1.0, 0.5):
+        planner = MPPI(replace(config, control_cost=share * 0.7))
+        state = replace(planner.init(problem, generator()), mean=mean)
+        weighed = mppi.rollout_cost(problem, problem.start, mean, mppi.draw_noise(state, 9), problem.goal_m)
+        assert (weighed == 0).all()
+        planner._advance.compiled = planner._average.compiled = False
+        action, following, _ = planner.plan(first(problem), state)
+        torch.testing.assert_close(action[0], (1 - share) * mean[0, 0], atol=0.02, rtol=0)
+        torch.testing.assert_close(following.mean[0, 0], (1 - share) * mean[0, 1], atol=0.02, rtol=0)
+
+
+def test_noise_has_its_scale_and_is_new_at_each_step() -> None:
+    problem = factories.problem(torch.full((3, 16, 16), 0.8))
+    planner = MPPI(MPPIConfig(horizon=30, noise=(0.2, 0.7)))
+    state = planner.init(problem, generator())
+    noise = mppi.draw_noise(state, 4000)
+    assert noise.shape == (30, 2, 4000)
+    torch.testing.assert_close(noise.std(dim=(0, 2)), torch.tensor([0.2, 0.7]), atol=0.01, rtol=0)
+    later = mppi.draw_noise(replace(state, step=1), 4000)
+    assert (noise * later).mean().abs() < 0.005
+    # Plans of seeds in a row do not repeat one another's steps.
+    assert not torch.equal(mppi.draw_noise(replace(state, seed=state.seed + 1), 4000), later)
+    # Nor those of seeds that are alike in 32 bits, which is all that PyTorch's generator looks at.
+    assert not torch.equal(mppi.draw_noise(replace(state, seed=state.seed + 2**32), 4000), noise)
+    seeds = {planner.init(problem, generator(seed)).seed for seed in range(4)}
+    assert len(seeds) == 4
+
+
+def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
+    maps = 0.4 + 0.6 * torch.rand(3, 16, 16, generator=generator())
+    problem = factories.problem(maps)
+    alone = problem.select(torch.tensor([1]))
+    planner = MPPI(SMALL)
+    states = [planner.init(given, generator()) for given in (problem, alone)]
+    position = problem.start
+    for _ in range(4):
+        action, states[0], _ = planner.plan(replace(first(problem), state=position), states[0])
+        same, states[1], _ = planner.plan(replace(first(alone), state=position[1:2]), states[1])
+        torch.testing.assert_close(action[1], same[0], atol=1e-4, rtol=1e-4)
+        position = problem.robot(position, action, problem.traversability_at(position))
+
+
+def test_it_drives_at_the_target_that_it_is_given() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(7.0, 4.0))
+    planner = MPPI(SMALL)
+    state = planner.init(problem, generator())
+    aside = torch.tensor([[4.0, 7.0]])
+    turns = [
+        planner.plan_toward(first(problem), state, target)[0][0, 1] for target in (problem.goal_m, aside)
+    ]
+    assert turns[1] - turns[0] > 0.2
+    assert torch.equal(planner.plan(first(problem), state)[0][0, 1], turns[0])
+    assert planner.took(state, aside) is state
+
+
+@pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
+def test_it_drives_robots_of_two_actions(robot) -> None:  # type: ignore[no-untyped-def]
+    problem = factories.problem(torch.full((2, 16, 16), 0.85), robot=robot)
+    driven = drive(MPPI(replace(SMALL, horizon=30)), problem, time_budget_s=25)
+    assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
+
+
+def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
+    class Three(Unicycle):
+        @property
+        def action_names(self) -> tuple[str, ...]:
+            return ("speed_mps", "turn_rate_radps", "crab_mps")
+
+    problem = factories.problem(torch.full((1, 16, 16), 0.85), robot=Three())
+    with pytest.raises(ConfigError, match=r"`noise` of MPPI with 3 values, for .*crab_mps"):
+        MPPI(SMALL).init(problem, generator())
+    MPPI(replace(SMALL, noise=(0.5, 0.5, 0.2))).init(problem, generator())
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"horizon": 0},
+        {"samples": 0},
+        {"temperature": 0.0},
+        {"noise": ()},
+        {"noise": (0.5, 0.0)},
+        {"control_cost": -1},
+    ],
+)
+def test_settings_that_sample_nothing_are_refused(settings: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        MPPIConfig(**settings)  # type: ignore[arg-type]
+
+
+def test_a_low_temperature_takes_the_best_sample() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8))
+    planner = MPPI(replace(SMALL, temperature=1e-4))
+    state = planner.init(problem, generator())
+    action, _, _ = planner.plan(first(problem), state)
+    noise = mppi.draw_noise(state, 256)
+    cost = mppi.rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)
+    best = noise[0, :, cost.argmin()].clamp(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]))
+    torch.testing.assert_close(action[0], best, atol=1e-3, rtol=0)
 
 
 def test_drawing_changes_no_action() -> None:
     problem = factories.problem(torch.full((2, 16, 16), 0.8))
-    actions = []
-    for drawn in (0, 7):
-        planner = MPPI(replace(SMALL, drawn_samples=drawn))
-        action, _, plan = planner.plan(problem.start, planner.init(problem, torch.Generator().manual_seed(3)))
-        actions.append(action)
-        assert plan.samples.shape[1] == drawn
-    torch.testing.assert_close(actions[0], actions[1], atol=0, rtol=0)
-    assert plan.path.shape == (2, 21, 2)
+    planner = MPPI(SMALL)
+    state = planner.init(problem, generator())
+    action, _, plan = planner.plan(first(problem), state)
+    again, following, drawn = planner.plan(first(problem, draw=True), state)
+    assert torch.equal(action, again)
+    assert plan.samples.numel() == plan.path.numel() == 0
+    assert drawn.samples.shape == (2, 40, 21, 2)
+    assert drawn.path.shape == (2, 21, 2)
+    moved = problem.robot(problem.start, again, problem.traversability_at(problem.start))
+    moved = problem.robot(moved, following.mean[:, 0], problem.traversability_at(moved))
+    torch.testing.assert_close(drawn.path[:, 2], moved[:, :2])
+    # The best samples end nearer to the goal than a standing robot.
+    end = (drawn.samples[:, :, -1] - problem.goal_m[:, None]).norm(dim=-1)
+    assert (end < (problem.start[:, :2] - problem.goal_m).norm(dim=-1)[:, None]).all()
+
+
+def problem_on(robot) -> Problem:  # type: ignore[no-untyped-def]
+    return factories.problem(torch.full((2, 16, 20), 0.9), robot=robot)
+
+
+@pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
+def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+    # The generator alone needs a real device.
+    monkeypatch.setattr(
+        mppi, "draw_noise", lambda state, samples: state.mean.new_empty(*state.mean.shape[1:], samples)
+    )
+    monkeypatch.setattr(torch._dynamo.config, "disable", True)
+    with fake_cuda(problem_on(robot)) as problem:
+        planner = MPPI(replace(SMALL, control_cost=0.1))
+        action, state, plan = planner.plan(first(problem, draw=True), planner.init(problem, generator()))
+        assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)
+        cost = mppi.rollout_cost(
+            problem, problem.start, state.mean, mppi.draw_noise(state, 9), problem.goal_m
+        )
+        assert on_cuda(cost)

@@ -3,7 +3,11 @@ import math
 import pytest
 import torch
 
+from benchnav.planning.objective import distance
 from benchnav.planning.world.outcome import STUCK_DISTANCE_M, Outcome, tell_standstill
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import World
+from tests import factories
 
 DT_S = 0.1
 
@@ -55,8 +59,22 @@ def test_the_distances_are_half_a_metre() -> None:
 
 
 def test_a_robot_that_spins_in_place_is_stalled() -> None:
-    """It turns, but its wheels would take it nowhere."""
-    assert tell([0.0] * 200, [0.0] * 200) == Outcome.STALLED
+    """It turns, but its wheels take it nowhere; one that drives against soft ground is stuck."""
+    ground = torch.stack([torch.full((16, 16), value) for value in (0.9, 0.0)])
+    world = World(time_budget_s=12.0)
+    goal = torch.tensor([[90.0, 90.0]]).expand(2, 2)
+    simulation = Simulation(factories.terrain(ground, 0.0), factories.task(), world, goal, 0, range(2))
+    now = simulation.init(torch.tensor([[4.0, 4.0, 0.0]] * 2))
+    action = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
+    states, driven = [now.state], []
+    while now.running.any():
+        driven.append(distance(simulation.unhindered(now, action), now.state[:, :2]))
+        now, _ = simulation.step(now, action)
+        states.append(now.state)
+    assert now.state[0, 2] > 9
+    positions = torch.stack(states, dim=1)[..., :2]
+    told = tell_standstill(now.outcome, positions, torch.stack(driven, dim=1), 0.1)
+    assert told.tolist() == [Outcome.STALLED, Outcome.STUCK]
 
 
 def test_going_round_in_a_wide_circle_is_moving_and_in_a_narrow_one_is_not() -> None:

@@ -30,7 +30,7 @@ Letters in shapes: B episodes, M of which plan anew, D edges of a path, R edges 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -44,7 +44,7 @@ from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollow
 from benchnav.planning.planners.cl_rrt.tree import Route, map_tensors, no_route, search
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
 from benchnav.planning.problem import Problem
-from benchnav.planning.robots import SPEED, TURN_RATE
+from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
 
@@ -76,7 +76,7 @@ class CLRRTConfig:
     replan_distance_m: float = 1.0
     stall_s: float = 5.0
     most_failures: int = 5
-    follower: FollowerConfig = FollowerConfig()
+    follower: FollowerConfig = field(default_factory=FollowerConfig)
 
     def __post_init__(self) -> None:
         """Refuses settings that grow no tree."""
@@ -140,6 +140,13 @@ class CLRRT:
     def __init__(self, config: CLRRTConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or CLRRTConfig()
+
+    def remarks(self, robot: Robot) -> tuple[str, ...]:
+        """Notes for tables; see `Planner`."""
+        asked_m, used_m = self.config.follower.lookahead_m, PathFollower(self.config.follower, robot).lookahead_m
+        if used_m <= asked_m:
+            return ()
+        return (f"looks {used_m:g} m ahead, as far as the robot drives while its turn rate builds up",)
 
     def init(self, problem: Problem, generator: torch.Generator) -> CLRRTState:
         """Starts with no path, so that the first step plans; see `Planner`.

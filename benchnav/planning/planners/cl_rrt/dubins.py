@@ -105,15 +105,12 @@ def _to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Ten
     inside = power < 0
     straight = power.clamp(min=0).sqrt()
     arc = _wrap(torch.atan2(y - 1, x) + torch.atan2(torch.ones_like(straight), straight))
-    rest = straight
-    if bool(inside.any()):
-        # Triangle of the right circle's centre (0, -1), the last circle's centre (2 away) and the point.
-        square = x * x + (y + 1) * (y + 1)
-        apex = torch.acos(((square + 3) / (4 * square.sqrt())).clamp(-1, 1))
-        away = _wrap(math.pi / 2 + apex - torch.atan2(y + 1, x))
-        back = math.tau - torch.acos(((5 - square) / 4).clamp(-1, 1))
-        arc, rest = torch.where(inside, away, arc), torch.where(inside, back, rest)
-    return arc, rest, side, inside
+    # Triangle of the right circle's centre (0, -1), the last circle's centre (2 away) and the point.
+    square = x * x + (y + 1) * (y + 1)
+    apex = torch.acos(((square + 3) / (4 * square.sqrt())).clamp(-1, 1))
+    away = _wrap(math.pi / 2 + apex - torch.atan2(y + 1, x))
+    back = math.tau - torch.acos(((5 - square) / 4).clamp(-1, 1))
+    return torch.where(inside, away, arc), torch.where(inside, back, straight), side, inside
 
 
 def _wrap(angle: Tensor) -> Tensor:

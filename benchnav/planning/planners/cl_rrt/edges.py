@@ -54,7 +54,7 @@ class ClosedLoop:
     @property
     def reference_points(self) -> int:
         """Points N of a reference: as far as the controller looks ahead from an edge's end."""
-        return 2 + math.ceil((self.step_m + self.follower.config.lookahead_m) / SPACING_M)
+        return 2 + math.ceil((self.step_m + self.follower.lookahead_m) / SPACING_M)
 
     @property
     def drawn_points(self) -> int:

@@ -4,7 +4,9 @@ Pure pursuit drives the arc that is tangent to the robot and meets the path one 
 on. The PID compares the speed over ground with the wanted one, so it makes up for ground that slows
 the robot, as far as the bounds allow; where an arc asks for a turn rate out of bounds, the speed gives
 way and the arc is kept. Traversability that scales both velocities alike thus bears on when the robot
-is somewhere, hardly on where. The robot is driven by (v, ω), as a unicycle is.
+is somewhere, hardly on where. The robot is driven by (v, ω), as a unicycle is. One whose turn rate changes
+within a limit would weave about a path that it looks too short a way ahead on: the look-ahead distance is at
+least what it drives while its turn rate builds up.
 
 Where the robot is along the path is itself a state, its progress: an arc length that each step
 moves forward to the robot's projection on the path's tangent. It never goes back, so paths may cross
@@ -19,7 +21,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.robots import SPEED, TURN_RATE, Robot
+from benchnav.planning.robots import SPEED, TURN_RATE, Robot, action_limits
 
 _LEAST_CURVATURE = 1e-6
 _LEAST_SQUARE_M2 = 1e-6
@@ -30,7 +32,7 @@ class FollowerConfig:
     """Settings of a path follower.
 
     Args:
-        lookahead_m: distance along the path from the robot to the point that it steers for.
+        lookahead_m: distance along the path from the robot to the point that it steers for, at least.
         speed_mps: speed over ground that is wanted.
         speed_kp: proportional gain of the speed, on top of the wanted speed itself.
         speed_ki: integral gain in 1/s.
@@ -124,7 +126,7 @@ class PathFollower:
 
     Args:
         config: settings.
-        robot: gives the time step and the bounds of (v, ω).
+        robot: gives the time step and the bounds of (v, ω), and of their changes where it has some.
 
     Raises:
         ConfigError: the robot has other actions, cannot drive forward, or turns one way alone.
@@ -143,6 +145,9 @@ class PathFollower:
         self.dt_s = robot.dt_s
         self.speed_mps = low[0], high[0]
         self.turn_rate_radps = min(-low[1], high[1])
+        limits = action_limits(robot)
+        build_up_s = self.turn_rate_radps / limits[1] if limits else 0.0
+        self.lookahead_m = max(config.lookahead_m, min(config.speed_mps, high[0]) * build_up_s)
 
     def advance(self, reference: Reference, state: Tensor, progress_m: Tensor) -> Tensor:
         """Moves the progress forward to where the robot is now.
@@ -158,7 +163,7 @@ class PathFollower:
         near_x, near_y, cos, sin = reference.at(progress_m).unbind(-1)
         at = (progress_m * (1 / reference.spacing_m)).floor() * reference.spacing_m
         projected = at + (state[..., 0] - near_x) * cos + (state[..., 1] - near_y) * sin
-        last = (reference.count - 1) * reference.spacing_m - self.config.lookahead_m
+        last = (reference.count - 1) * reference.spacing_m - self.lookahead_m
         return torch.maximum(progress_m, projected).clamp(max=last)
 
     def act(
@@ -177,7 +182,7 @@ class PathFollower:
         """
         config = self.config
         x, y, heading = state[..., 0], state[..., 1], state[..., 2]
-        aim = reference.at(progress_m + config.lookahead_m)
+        aim = reference.at(progress_m + self.lookahead_m)
         aim_x, aim_y = aim[..., 0] - x, aim[..., 1] - y
         sideways = aim_y * heading.cos() - aim_x * heading.sin()
         curvature = 2 * sideways / (aim_x * aim_x + aim_y * aim_y + _LEAST_SQUARE_M2)

@@ -140,7 +140,7 @@ def search(
     tree = plant(loop, root, tracking)
     for points_m, chances in zip(sample_m, chance, strict=True):
         choice = choose(loop, tree, points_m, chances, goal_edges)
-        begin = map_tensors(lambda values: _take(values, choice.node), tree.at)
+        begin = stand(tree, choice.node)
         reference, length_m = draw_references(loop, begin.state[..., :3], choice.target_m)
         tree = add(loop, tree, choice, drive(loop, begin, reference, length_m))
     return best_route(loop, tree, len(sample_m))
@@ -180,7 +180,9 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
     best = tree.best_cost[:, None]
     found = best < math.inf
     top_mps = loop.follower.speed_mps[1]
-    straight_m = (distance(tree.at.state, loop.problem.goal_m[:, None]) - loop.problem.goal_radius_m).clamp(min=0)
+    straight_m = (distance(tree.at.state, loop.problem.goal_m[:, None]) - loop.problem.goal_radius_m).clamp(
+        min=0
+    )
     closed = tree.cost + straight_m / top_mps >= best  # cannot improve on the best way
     bar = torch.where(closed, math.inf, 0.0)
     taken_m = torch.where(closed, 0, min(loop.follower.config.speed_mps, top_mps) * tree.time_s)
@@ -206,6 +208,11 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
         target_m=torch.where(aimed[..., None], loop.problem.goal_m[:, None], target_m),
         aimed=aimed,
     )
+
+
+def stand(tree: Tree, node: Tensor) -> LoopState:
+    """Where the closed loop stands at nodes, int64 [B, R]."""
+    return map_tensors(lambda values: _take(values, node), tree.at)
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
@@ -284,7 +291,7 @@ def _best_partial(tree: Tree) -> Tensor:
 def _describe(loop: ClosedLoop, tree: Tree, status: Tensor, nodes: Tensor, end_m: Tensor) -> Route:
     """Describes paths through nodes, int64 [B, D], 0 past the end of each."""
     used = (nodes > 0)[..., None]
-    pose = _take(tree.at.state, tree.parent.gather(1, nodes))[..., :3]
+    pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
     reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
     rows = reference.rows.reshape(*nodes.shape, -1, 4)
     points = rows[:, :, :: round(DRAWN_M / SPACING_M), :2]

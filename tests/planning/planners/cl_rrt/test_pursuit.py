@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.dynamics import Unicycle
-from benchnav.planning.pure_pursuit import FollowerConfig, PathFollower, Reference, Tracking
+from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
+from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
 
 SPACING_M = 0.1
 
@@ -34,17 +34,18 @@ def drive(
     traversability: float,
     steps: int,
     config: FollowerConfig | None = None,
+    robot: Robot | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """States [N + 1, 3], actions [N, 2] and progress [N] of one robot."""
-    dynamics = Unicycle()
-    follower = PathFollower(config or FollowerConfig(), dynamics)
-    state = torch.tensor([start], dtype=torch.float32)
+    """States [N + 1, S], actions [N, 2] and progress [N] of one robot."""
+    robot = robot or Unicycle()
+    follower = PathFollower(config or FollowerConfig(), robot)
+    state = robot.initial_state(torch.tensor([start], dtype=torch.float32))
     tracking, ground = Tracking.standing(state), torch.tensor([traversability])
     states, actions, progresses = [state], [], []
     for _ in range(steps):
         progress = follower.advance(reference, state, tracking.progress_m)
         action, tracking = follower.act(reference, state, tracking, progress)
-        state = dynamics(state, action, ground)
+        state = robot(state, action, ground)
         states.append(state)
         actions.append(action)
         progresses.append(progress)
@@ -116,9 +117,25 @@ def test_reference_runs_straight_on_past_its_end() -> None:
     torch.testing.assert_close(reference.at(torch.tensor([0.2]))[0, :2], expected)
 
 
-def test_robots_that_are_not_driven_by_speed_and_turn_rate_are_refused() -> None:
-    with pytest.raises(ConfigError, match="actions"):
-        PathFollower(FollowerConfig(), Unicycle(turn_rate_radps=(0.1, 1.0)))
+def test_robot_with_acceleration_limits_joins_and_keeps_a_line() -> None:
+    states, actions, _ = drive(line(12), (0, 0.5, 0.3), 1.0, 120, robot=DifferentialDrive())
+    assert states[-1, 0] > 9
+    assert states[states[:, 0] > 4, 1].abs().max() < 0.02
+    assert (actions[0, 0] - states[1, 3]).abs() > 0.5  # it cannot do what it is told at first
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        Bicycle(),
+        Unicycle(turn_rate_radps=(0.1, 1.0)),
+        Unicycle(turn_rate_radps=(-1.0, 0.0)),
+        Unicycle(speed_mps=(-1.0, 0.0)),
+    ],
+)
+def test_robots_that_cannot_follow_a_path_are_refused(robot: Robot) -> None:
+    with pytest.raises(ConfigError, match="speed_mps, turn_rate_radps"):
+        PathFollower(FollowerConfig(), robot)
 
 
 @pytest.mark.parametrize("field", ["lookahead_m", "speed_mps", "speed_kp", "speed_ki", "speed_kd"])

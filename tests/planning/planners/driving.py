@@ -1,0 +1,78 @@
+"""Closed loops of a planner and the simulation, for tests."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
+
+from benchnav import rng
+from benchnav.planning.planners.planner import Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import World
+from tests import factories
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What happened: outcome [B], steps [B], states [B, N + 1, S], actions [B, N, A]."""
+
+    outcome: Tensor
+    steps: Tensor
+    states: Tensor
+    actions: Tensor
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return rng.generator(rng.stream_key(seed, "test"))
+
+
+def first(problem: Problem, draw: bool = False) -> Step:
+    return step_at(problem.start, draw)
+
+
+def step_at(state: Tensor, draw: bool = False) -> Step:
+    return Step(state=state, felt=torch.full_like(state[:, 0], torch.nan), time_s=0.0, draw=draw)
+
+
+def with_start(problem: Problem, *start: float) -> Problem:
+    """The problem with all robots at a state."""
+    return replace(problem, start=torch.tensor([start] * len(problem)))
+
+
+def drive(planner: Any, problem: Problem, truth: Tensor | None = None, time_budget_s: float = 60.0) -> Drive:
+    """Runs episodes where the truth is what is predicted, unless it is given, shape [B, H, W]."""
+    ground = problem.risk_map if truth is None else truth
+    terrain = replace(factories.terrain(ground, 0.05), grid=problem.grid)
+    world = World(time_budget_s=time_budget_s)
+    luck = rng.stream_key(0, "luck")
+    simulation = Simulation(terrain, problem.task, world, problem.goal_m, luck, range(len(problem)))
+    now = simulation.init(problem.start)
+    plan_state = planner.init(problem, generator())
+    states, actions = [now.state], []
+    felt = torch.full_like(problem.start[:, 0], torch.nan)
+    while bool(now.running.any()):
+        step = Step(state=now.state, felt=felt, time_s=len(actions) * problem.dt_s)
+        action, plan_state, _ = planner.plan(step, plan_state)
+        now, felt = simulation.step(now, action)
+        states.append(now.state)
+        actions.append(action)
+    return Drive(now.outcome, now.step, torch.stack(states, 1), torch.stack(actions, 1))
+
+
+@contextmanager
+def fake_cuda(problem: Problem) -> Iterator[Problem]:
+    """The problem on tensors of a CUDA device that need no GPU: shapes and devices alone are followed."""
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        moved = problem.to("cuda")
+        assert moved.start.device.type == "cuda"
+        assert isinstance(moved.free, FakeTensor)
+        yield moved
+
+
+def on_cuda(*tensors: Tensor) -> bool:
+    return all(tensor.device.type == "cuda" for tensor in tensors)

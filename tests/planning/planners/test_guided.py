@@ -1,0 +1,177 @@
+"""The guide and the recovery, with local planners that do as little as can be."""
+
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.planning.planners import astar
+from benchnav.planning.planners.guided import GuideConfig, Guided, Recovery, watch
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.waypoint import choose_waypoint, ground_costs
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Bicycle, Unicycle
+from benchnav.planning.world.outcome import Outcome
+from tests import factories
+from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda
+
+ROBOT = Unicycle()
+STAND, DRIVE = torch.tensor([[0.0, 0.5]]), torch.tensor([[1.0, 0.0]])
+
+
+@dataclass
+class Constant:
+    """Commands the same whatever it is told; keeps what it was told."""
+
+    action: tuple[float, float]
+    targets: list[Tensor] = field(default_factory=list)
+    name: str = "constant"
+
+    def init(self, problem: Problem, generator: torch.Generator) -> tuple[Tensor, ...]:
+        return ()
+
+    def plan_toward(
+        self, step: Step, plan_state: tuple[Tensor, ...], target_m: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, ...], Plan]:
+        self.targets.append(target_m)
+        action = step.state.new_tensor(self.action).expand(len(step.state), 2)
+        return action, plan_state, Plan.empty(len(action), action.device)
+
+    def took(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
+        return (*plan_state, action)
+
+
+# --- The recovery.
+
+
+def watched(moves_m: list[float], action: Tensor, robot: Unicycle = ROBOT) -> list[bool]:
+    """Whether a robot that moves so far along x in each step is being steered away."""
+    state = torch.zeros(1, 3)
+    recovery = Recovery.none(state)
+    active = []
+    for move in moves_m:
+        recovery = watch(recovery, state, action, robot)
+        active.append(bool(recovery.active))
+        state = state + torch.tensor([[move, 0.0, 0.1]])
+    return active
+
+
+def test_a_robot_that_is_held_for_a_second_is_steered_away() -> None:
+    assert watched([0.0] * 13, STAND) == [False] * 10 + [True] * 3
+    assert watched([0.0] * 8, STAND, Unicycle(dt_s=0.2)) == [False] * 5 + [True] * 3
+    # 4 mm a step are 4 cm a second; 6 mm are more than 5 cm.
+    assert any(watched([0.004] * 20, STAND))
+    assert not any(watched([0.006] * 40, STAND))
+
+
+def test_a_robot_that_drives_and_is_held_by_the_ground_is_not() -> None:
+    assert not any(watched([0.0] * 200, DRIVE))
+    assert any(watched([0.0] * 20, 0.1 * DRIVE))
+    assert not any(watched([0.0] * 20, 0.3 * DRIVE))
+    assert any(watched([0.0] * 20, 0.3 * DRIVE, Unicycle(speed_mps=(0, 2))))
+
+
+def test_it_is_steered_until_it_has_left_the_place() -> None:
+    active = watched([0.0] * 10 + [0.1] * 8, STAND)
+    # At the sixteenth look it is 0.5 m away.
+    assert active == [False] * 10 + [True] * 5 + [False] * 3
+
+
+def test_it_is_steered_for_ten_seconds_at_most() -> None:
+    active = watched([0.0] * 125, STAND)
+    assert active == [False] * 10 + [True] * 100 + [False] * 10 + [True] * 5
+
+
+def test_each_robot_of_a_batch_is_watched_by_itself() -> None:
+    state = torch.tensor([[1.0, 2.0, 0.0], [1.0, 2.0, 0.0]])
+    recovery = Recovery.none(state)
+    for _ in range(12):
+        recovery = watch(recovery, state, torch.cat((STAND, STAND)), ROBOT)
+        state = state + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.05, 0.0]])
+    assert recovery.active.tolist() == [True, False]
+
+
+def test_a_local_planner_that_does_nothing_arrives_by_recovery_alone() -> None:
+    walled = torch.full((2, 16, 24), 0.85)
+    walled[1, 7:9, :12] = 0.1
+    problem = factories.problem(walled, start=(2.0, 2.0), goal=(4.0, 6.5))
+    driven = drive(Guided(GuideConfig(), Constant((0.0, 0.0))), problem, time_budget_s=100)
+    assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
+    assert problem.free_at(driven.states).float().mean() > 0.97
+
+
+def test_one_that_drives_is_left_alone_on_ground_that_holds_it() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.85))
+    driven = drive(Guided(GuideConfig(), Constant((0.9, 0.1))), problem, 0 * problem.risk_map, 5.0)
+    assert (driven.actions == torch.tensor([0.9, 0.1])).all()
+
+
+def test_the_local_planner_is_told_what_was_taken_instead() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.85))
+    planner = Guided(GuideConfig(), Constant((0.0, 0.2)))
+    state = planner.init(problem, generator())
+    actions = []
+    for _ in range(12):
+        action, state, _ = planner.plan(first(problem), state)
+        actions.append(action)
+    assert torch.equal(torch.stack(state.local), torch.stack(actions))
+    assert actions[9].tolist() == [[0.0, pytest.approx(0.2)]]
+    assert actions[10][0, 0] > 0.5
+
+
+# --- The guide.
+
+
+def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
+    slow = torch.full((2, 12, 24), 1.0)
+    slow[0, 3:9, 5:8] = 0.31
+    slow[1, :9, 6] = 0.1
+    problem = factories.problem(slow, start=(1.75, 3.25), goal=(10.25, 3.25))
+    given = []
+    for config in (GuideConfig(), GuideConfig(lookahead_m=2.0), GuideConfig(by_time=True)):
+        local = Constant((0.5, 0.0))
+        planner = Guided(config, local)
+        planner.plan(first(problem), planner.init(problem, generator()))
+        points = astar.path_points(problem, astar.search(problem, config.by_time), problem.start, 30)
+        expected, _ = choose_waypoint(ground_costs(problem, config.by_time), points, config.lookahead_m)
+        torch.testing.assert_close(local.targets[0], expected)
+        given.append(expected[0])
+    assert not any(torch.equal(given[0], other) for other in given[1:])
+
+
+def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
+    problem = factories.problem(torch.full((2, 16, 24), 0.9), start=(1.1, 6.6), goal=(10.3, 2.2))
+    planner = Guided(GuideConfig(lookahead_m=1.0), Constant((0.5, 0.0)))
+    state = planner.init(problem, generator())
+    action, _, plan = planner.plan(first(problem), state)
+    assert plan.reference.numel() == 0
+    again, _, plan = planner.plan(first(problem, draw=True), state)
+    assert torch.equal(action, again)
+    torch.testing.assert_close(plan.reference[:, 0], problem.start[:, :2])
+    torch.testing.assert_close(plan.reference[:, -1], problem.goal_m)
+
+
+def test_it_says_whose_objectives_it_follows() -> None:
+    assert Guided(GuideConfig(), Constant((0, 0))).follows == "path length (A*), J (constant)"
+    assert Guided(GuideConfig(by_time=True), Constant((0, 0))).follows == "travel time (A*), J (constant)"
+    with pytest.raises(ConfigError, match="lookahead_m"):
+        GuideConfig(lookahead_m=0)
+
+
+@pytest.mark.parametrize("by_time", [False, True])
+def test_no_tensor_is_made_on_another_device_but_by_the_search(
+    monkeypatch: pytest.MonkeyPatch, by_time: bool
+) -> None:
+    real = factories.problem(torch.full((2, 16, 24), 0.9), robot=Bicycle())
+    searched = astar.search(real)
+    with fake_cuda(real) as problem:
+        moved = astar.CostToGo(searched.cost.to("cuda"), searched.following.to("cuda"))
+        monkeypatch.setattr(astar, "search", lambda *_: moved)
+        planner = Guided(GuideConfig(by_time=by_time), Constant((0.5, 0.0)))
+        state = planner.init(problem, generator())
+        action, following, plan = planner.plan(first(problem, draw=True), state)
+        recovery = following.recovery
+        assert on_cuda(action, plan.reference, planner.local.targets[0])
+        assert on_cuda(recovery.place_m, recovery.steps, recovery.driven_m, recovery.active)

@@ -1,0 +1,144 @@
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.free_space import PRICE, FreeSpace, Rules, cells_at_goal
+from benchnav.planning.objective import GoalDistance
+from benchnav.terrain import Grid
+from tests import factories
+
+
+def doubtful(mean: Tensor) -> TraversabilityMixture:
+    """Two halves 0.1 above and below the mean, so that any tail is below it."""
+    means = torch.stack((mean - 0.1, mean + 0.1), dim=1)
+    return TraversabilityMixture(torch.full_like(means, 0.5), means, torch.full_like(means, 1e-3))
+
+
+def test_ground_is_free_where_the_risk_map_or_the_mean_exceeds_the_threshold() -> None:
+    mean = torch.full((1, 3, 3), 0.5)
+    mean[0, 0, 0], mean[0, 1, 1] = 0.25, 0.35
+    mixture = doubtful(mean)
+    risk = mixture.cvar(0.9)
+    closed = torch.zeros(1, 3, 3, dtype=torch.bool)
+    closed[0, 0, 0] = True
+    assert torch.equal(~FreeSpace(by="mean").mask(risk, mixture), closed)
+    closed[0, 1, 1] = True
+    assert torch.equal(~FreeSpace(by="risk").mask(risk, mixture), closed)
+    assert torch.equal(~FreeSpace(by="risk", above=0.45).mask(risk, mixture), risk <= 0.45)
+    assert (risk <= 0.45).all()
+    assert FreeSpace(by="mean", above=0.2).mask(risk, mixture).all()
+    assert FreeSpace(by="risk", above=0.0).mask(risk, mixture).all()
+
+
+def test_a_cell_at_the_threshold_is_not_free() -> None:
+    risk = torch.tensor([[[0.3, 0.5, 0.0]]], dtype=torch.float64).expand(1, 3, 3)
+    assert FreeSpace(above=0.3).mask(risk, factories.certain(risk))[0, 0].tolist() == [False, True, False]
+    nothing = torch.zeros(1, 3, 3)
+    assert not FreeSpace(above=0.0).mask(nothing, factories.certain(nothing)).any()
+
+
+def test_cells_at_goal_are_those_that_the_disc_touches() -> None:
+    """Against points all over each cell."""
+    grid = Grid(7, 11, 0.5)
+    goals = torch.tensor([[2.3, 1.1], [0.05, 3.4], [5.0, 1.75]], dtype=torch.float64)
+    share = torch.linspace(0, 1, 41, dtype=torch.float64)
+    for radius in (0.1, 0.5, 1.3):
+        touched = cells_at_goal(grid, goals, radius)
+        for row in range(7):
+            for column in range(11):
+                x, y = torch.meshgrid((column + share) * 0.5, (row + share) * 0.5, indexing="xy")
+                nearest = torch.hypot(x - goals[:, 0, None, None], y - goals[:, 1, None, None]).amin(
+                    dim=(1, 2)
+                )
+                for member in range(3):
+                    # Points are as near as half their spacing to the nearest of all.
+                    if abs(nearest[member] - radius) > 0.01:
+                        assert bool(touched[member, row, column]) == bool(nearest[member] < radius)
+
+
+def test_the_goals_disc_is_free_whatever_is_predicted() -> None:
+    problem = factories.problem(torch.zeros(1, 16, 16), rules=Rules(goal_radius_m=0.7))
+    assert torch.equal(problem.free, cells_at_goal(problem.grid, problem.goal_m, 0.7))
+    assert problem.free.sum() > 4
+    bigger = factories.problem(torch.zeros(1, 16, 16), rules=Rules(goal_radius_m=2.0))
+    assert bigger.free.sum() > problem.free.sum()
+    at_goal = torch.tensor([[6.75, 6.75, 0.0]])
+    assert problem.free_at(at_goal).all()
+    cost = problem.stage_cost(at_goal, torch.zeros(1, 2), problem.ground_at(at_goal), problem.goal_m)
+    assert cost.tolist() == [0.0]
+
+
+def test_the_slowest_clamps_motion_alone() -> None:
+    ground = torch.full((1, 16, 16), 0.8)
+    ground[0, 2, 2], ground[0, 2, 3], ground[0, 2, 4] = 0.0, 0.4, 0.05
+    rules = Rules(free_space=FreeSpace(above=0.1), slowest=0.5)
+    problem = factories.problem(ground, rules=rules)
+    state = torch.tensor([[[1.25, 1.25, 0.0], [1.75, 1.25, 0.0], [2.25, 1.25, 0.0], [4.0, 4.0, 0.0]]])
+    assert problem.traversability_at(state)[0].tolist() == pytest.approx([0.5, 0.5, 0.5, 0.8])
+    assert problem.free_at(state)[0].tolist() == [False, True, False, True]
+    assert torch.equal(problem.risk_map, ground)
+    assert problem.traversability.min() == 0.5
+
+
+def test_ground_that_is_not_free_costs_its_price_a_step_beside_j() -> None:
+    ground = torch.full((2, 16, 16), 0.8)
+    ground[:, 2] = 0.1
+    problem = factories.problem(ground, goal=(1.25, 5.25))
+    state = torch.tensor([[[1.25, 1.25, 0.0], [1.25, 2.25, 0.0], [-1.0, 2.25, 0.0]]]).expand(2, 3, 3)
+    action, target = torch.zeros(2, 3, 2), problem.goal_m[:, None]
+    distances = torch.tensor([4.0, 3.0, (2.25**2 + 9) ** 0.5])
+    expected = distances + PRICE * torch.tensor([1.0, 0.0, 1.0])
+    cost = problem.stage_cost(state, action, problem.ground_at(state), target)
+    torch.testing.assert_close(cost, expected.expand(2, 3))
+    torch.testing.assert_close(problem.terminal_cost(state, target), expected.expand(2, 3))
+
+
+def test_a_users_objective_is_given_clamped_ground_and_the_price_is_added_to_it() -> None:
+    class Ground(GoalDistance):
+        def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+            return traversability
+
+        def terminal(self, state, traversability, target):  # type: ignore[no-untyped-def]
+            return 2 * traversability
+
+    ground = torch.full((1, 16, 16), 0.8)
+    ground[0, 2] = 0.1
+    problem = factories.problem(ground, objective=Ground(), rules=Rules(slowest=0.2))
+    state = torch.tensor([[[1.25, 1.25, 0.0], [1.25, 2.25, 0.0]]])
+    stage = problem.stage_cost(state, torch.zeros(1, 2, 2), problem.ground_at(state), problem.goal_m[:, None])
+    assert stage[0].tolist() == pytest.approx([PRICE + 0.2, 0.8])
+    assert problem.terminal_cost(state, problem.goal_m[:, None])[0].tolist() == pytest.approx(
+        [PRICE + 0.4, 1.6]
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"by": "luck"}, "'risk' or 'mean', got 'luck'"),
+        ({"above": 1.0}, "free_space.above"),
+        ({"above": -0.1}, "free_space.above"),
+        ({"above": float("nan")}, "free_space.above"),
+    ],
+)
+def test_free_space_that_means_nothing_is_refused(settings: dict[str, object], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        FreeSpace(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"slowest": 0.0}, "slowest"),
+        ({"slowest": 1.1}, "slowest"),
+        ({"goal_radius_m": 0.0}, "goal_radius_m"),
+        ({"goal_radius_m": float("inf")}, "goal_radius_m"),
+    ],
+)
+def test_rules_under_which_nothing_moves_or_arrives_are_refused(
+    settings: dict[str, float], expected: str
+) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        Rules(**settings)  # type: ignore[arg-type]

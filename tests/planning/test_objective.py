@@ -1,0 +1,73 @@
+import pytest
+import torch
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.planning.objective import GoalDistance, TravelTime, distance
+from benchnav.planning.robots import Bicycle, Unicycle
+
+STATE = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [0.0, 0.5, 2.0]])
+ACTION = torch.tensor([[1.0, 0.0]]).expand(3, 2)
+GROUND = torch.tensor([0.31, 0.3, 0.0])
+TARGET = torch.tensor([[3.0, 4.0]]).expand(3, 2)
+
+
+def test_the_papers_objective_is_the_distance_and_knows_no_penalty() -> None:
+    expected = [5.0, 0.0, (9 + 3.5**2) ** 0.5]
+    assert GoalDistance().stage(STATE, ACTION, GROUND, TARGET).tolist() == pytest.approx(expected)
+    assert GoalDistance().terminal(STATE, GROUND, TARGET).tolist() == pytest.approx(expected)
+
+
+def test_travel_time_counts_the_steps_before_arrival() -> None:
+    robot = Unicycle(dt_s=0.2)
+    cost = TravelTime(robot, arrival_m=4.7).stage(STATE, ACTION, GROUND, TARGET)
+    assert cost.tolist() == pytest.approx([0.2, 0.0, 0.0])
+
+
+def test_what_is_left_costs_the_time_at_top_speed() -> None:
+    left = TravelTime(Bicycle(speed_mps=(0.0, 2.0)), arrival_m=1.0).terminal(STATE, GROUND, TARGET)
+    assert left.tolist() == pytest.approx([2.0, 0.0, 0.5 * ((9 + 3.5**2) ** 0.5 - 1)])
+
+
+def test_travel_time_along_a_straight_line_is_the_time_it_takes() -> None:
+    """Whatever the horizon ends at, on ground of λ = 1 the sum is what is left of the way over the speed."""
+    robot = Unicycle()
+    objective = TravelTime(robot)
+    for steps in (0, 10, 35, 55):
+        state, total = torch.tensor([[0.0, 0.0, 0.0]]), torch.zeros(1)
+        for _ in range(steps):
+            total = total + objective.stage(state, ACTION[:1], torch.ones(1), torch.tensor([[5.25, 0.0]]))
+            state = robot(state, ACTION[:1], torch.ones(1))
+        total = total + objective.terminal(state, torch.ones(1), torch.tensor([[5.25, 0.0]]))
+        assert total.item() == pytest.approx((5.25 - 0.5) / 1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("arrival_m", [0.0, -1.0, float("nan")])
+def test_a_distance_at_which_nothing_arrives_is_refused(arrival_m: float) -> None:
+    with pytest.raises(ConfigError, match="arrival_m"):
+        TravelTime(Unicycle(), arrival_m=arrival_m)
+
+
+def test_the_registry_gives_an_objective_the_tasks_robot() -> None:
+    robot = Unicycle(dt_s=0.25)
+    made = registry.make("objective", {"part": "travel_time", "options": {"arrival_m": 2.0}}, robot=robot)
+    assert made == TravelTime(robot, 2.0)
+
+
+def test_distances_broadcast_and_agree_with_the_norm() -> None:
+    states, targets = torch.rand(4, 7, 5), torch.rand(4, 1, 2)
+    expected = torch.linalg.vector_norm(states[..., :2] - targets, dim=-1)
+    torch.testing.assert_close(distance(states, targets), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", registry.names("objective"))
+def test_an_objective_keeps_shape_and_dtype_for_any_leading_dimensions(name: str, dtype: torch.dtype) -> None:
+    objective = registry.make("objective", name, robot=Unicycle())
+    for leading in ((3,), (3, 4), (3, 4, 2)):
+        target = torch.rand(3, *[1] * (len(leading) - 1), 2, dtype=dtype)
+        given = torch.rand(*leading, 3, dtype=dtype), torch.rand(*leading, 2, dtype=dtype)
+        ground = torch.rand(leading, dtype=dtype)
+        for cost in (objective.stage(*given, ground, target), objective.terminal(given[0], ground, target)):
+            assert (cost.shape, cost.dtype) == (leading, dtype)
+            assert cost.isfinite().all()

@@ -1,0 +1,149 @@
+import math
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.problem import Problem, heading_to, pose_problem
+from benchnav.planning.robots import DifferentialDrive, Unicycle
+from benchnav.terrain import Grid, Observation
+from tests import factories
+
+BATCH, HEIGHT, WIDTH = 3, 12, 20
+
+
+def varied() -> Problem:
+    """Three problems of which no two tensors or episodes are alike, on a map that is not square."""
+    grid = Grid(HEIGHT, WIDTH, 0.5)
+    means = torch.rand(BATCH, 2, HEIGHT, WIDTH)
+    mixture = TraversabilityMixture(torch.full_like(means, 0.5), means, 0.1 + 0.1 * means)
+    rgb = torch.randint(255, (BATCH, 3, HEIGHT, WIDTH), dtype=torch.uint8)
+    observation = Observation(rgb, torch.rand(BATCH, HEIGHT, WIDTH), torch.rand(BATCH, HEIGHT, WIDTH), grid)
+    start_m, goal_m = (
+        torch.tensor([[1.0, 2.0], [3.0, 1.5], [6.0, 5.0]]),
+        torch.tensor([[9.0, 2.0], [3.0, 5.5], [1.0, 0.5]]),
+    )
+    task = factories.task(robot=DifferentialDrive())
+    return pose_problem(task, observation, mixture, mixture.cvar(0.5), start_m, goal_m, 42.0)
+
+
+def tensors(problem: Problem) -> dict[str, Tensor]:
+    """Every tensor of a problem, those that are derived from it included."""
+    derived = {name: getattr(problem, name) for name in ("traversability", "padded_ground", "elevation_m")}
+    held = {
+        f"{owner}{field.name}": getattr(value, field.name)
+        for owner, value in (
+            ("", problem),
+            ("mixture.", problem.mixture),
+            ("observation.", problem.observation),
+        )
+        for field in fields(value)  # type: ignore[arg-type]
+    }
+    return {name: value for name, value in {**held, **derived}.items() if torch.is_tensor(value)}
+
+
+def test_a_problem_is_posed_from_what_is_predicted() -> None:
+    problem = varied()
+    assert len(problem) == BATCH
+    assert problem.grid == Grid(HEIGHT, WIDTH, 0.5)
+    assert problem.start[:, :2].tolist() == [[1.0, 2.0], [3.0, 1.5], [6.0, 5.0]]
+    expected = [0.0, math.pi / 2, math.atan2(-4.5, -5.0)]
+    assert problem.start[:, 2].tolist() == pytest.approx(expected)
+    # The robot says what stands beside the pose.
+    assert problem.start[:, 3:].tolist() == [[0.0, 0.0]] * 3
+    assert problem.time_budget_s == 42.0
+    assert torch.equal(problem.risk_map, problem.mixture.cvar(0.5))
+    assert problem.dt_s == 0.1
+    assert torch.equal(problem.elevation_m, problem.observation.elevation_m)
+    low, high = problem.action_bounds
+    assert low.tolist() == [0, -1]
+    assert high.tolist() == [1, 1]
+    assert problem.action_bounds[0] is low
+
+
+def test_headings_look_at_the_goal() -> None:
+    here = torch.tensor([[1.0, 1.0]] * 4)
+    there = torch.tensor([[2.0, 2.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
+    expected = [math.pi / 4, math.pi, -math.pi / 2, 0.0]
+    assert heading_to(here, there)[:, 2].tolist() == pytest.approx(expected)
+    assert torch.equal(heading_to(here, there)[:, :2], here)
+
+
+def test_no_truth_is_in_it() -> None:
+    assert {field.name for field in fields(Problem)} == {
+        "task", "observation", "mixture", "risk_map", "free", "start", "goal_m", "time_budget_s",
+    }  # fmt: skip
+    assert not any("class_id" in name or "truth" in name for name in tensors(varied()))
+
+
+def test_ground_is_looked_up_by_row_and_column_of_each_episodes_own_map() -> None:
+    problem = varied()
+    x = torch.rand(BATCH, 50) * 10
+    y = torch.rand(BATCH, 50) * 6
+    state = torch.stack((x, y, torch.zeros_like(x)), dim=-1)
+    found, free = problem.traversability_at(state), problem.free_at(state)
+    for member in range(BATCH):
+        for point in range(50):
+            cell = int(y[member, point] / 0.5), int(x[member, point] / 0.5)
+            assert found[member, point] == problem.risk_map[member][cell].clamp(min=0.3)
+            assert bool(free[member, point]) == bool(problem.free[member][cell])
+    assert torch.equal(problem.traversability_at(state[:, 7]), found[:, 7])
+
+
+def test_off_the_map_nothing_moves_and_nothing_is_free() -> None:
+    problem = factories.problem(torch.ones(1, 16, 16))
+    state = torch.tensor(
+        [[[-0.1, 1.0], [8.0, 1.0], [1.0, 8.1], [1.0, -5.0], [math.nan, 1.0], [math.inf, 1.0]]]
+    )
+    assert problem.traversability_at(state).tolist() == [[0.0] * 6]
+    assert not problem.free_at(state).any()
+    assert (problem.terminal_cost(state[:, :4], problem.goal_m[:, None]) > 9999).all()
+
+
+def test_select_keeps_episodes_with_everything_that_is_theirs() -> None:
+    problem = varied()
+    chosen = problem.select(torch.tensor([2, 0]))
+    assert len(chosen) == 2
+    assert chosen.task is problem.task
+    for name, value in tensors(chosen).items():
+        assert torch.equal(value, tensors(problem)[name][[2, 0]]), name
+
+
+def test_a_clone_shares_no_tensor() -> None:
+    problem = varied()
+    before = {name: value.clone() for name, value in tensors(problem).items()}
+    clone = problem.clone()
+    assert all(torch.equal(value, before[name]) for name, value in tensors(clone).items())
+    for value in tensors(clone).values():
+        value.zero_()
+    for bound in clone.action_bounds:
+        bound.zero_()
+    for name, value in tensors(problem).items():
+        assert torch.equal(value, before[name]), name
+    assert problem.action_bounds[1].tolist() == [1, 1]
+
+
+def test_to_a_device_moves_every_tensor() -> None:
+    moved = varied().to("meta")
+    assert {value.device.type for value in tensors(moved).values()} == {"meta"}
+    assert {bound.device.type for bound in moved.action_bounds} == {"meta"}
+
+
+@pytest.mark.parametrize("name", ["risk_map", "free", "goal_m"])
+def test_a_batch_that_is_none_is_refused(name: str) -> None:
+    problem = varied()
+    with pytest.raises(ConfigError, match=f"`{name}` of shape"):
+        replace(problem, **{name: getattr(problem, name)[:2]})
+
+
+def test_doubles_stay_doubles() -> None:
+    ground = torch.rand(1, 16, 16, dtype=torch.float64)
+    problem = factories.problem(ground, robot=Unicycle())
+    problem = replace(problem, start=problem.start.double(), goal_m=problem.goal_m.double())
+    cost = problem.stage_cost(
+        problem.start, problem.start[:, :2], problem.ground_at(problem.start), problem.goal_m
+    )
+    assert cost.dtype == problem.action_bounds[0].dtype == problem.padded_ground.dtype == torch.float64

@@ -1,0 +1,83 @@
+from functools import partial
+
+import pytest
+import torch
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning import risk
+from tests.test_mixture import random_mixture
+
+
+def test_measures_by_name_are_those_of_the_mixture() -> None:
+    mixture = random_mixture()
+    for text, expected in (
+        ("cvar", mixture.cvar(0.9)),
+        ("cvar:0.5", mixture.cvar(0.5)),
+        ("var", mixture.var(0.9)),
+        ("var:0.95", mixture.var(0.95)),
+        ("mean", mixture.mean()),
+        ("single-class", mixture.most_likely().cvar(0.9)),
+        ("single-class:0.2", mixture.most_likely().cvar(0.2)),
+        ({"part": "cvar", "options": {"level": 0.3}}, mixture.cvar(0.3)),
+    ):
+        assert torch.equal(risk.apply(registry.make("risk", text), mixture), expected), text
+
+
+@pytest.mark.parametrize("text", ["cvr", "cvar:x", "mean:0.5", ""])
+def test_measures_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError):
+        registry.make("risk", text)
+
+
+@pytest.mark.parametrize("level", [1.0, -0.1])
+@pytest.mark.parametrize("name", ["cvar", "var", "single-class"])
+def test_levels_out_of_range_are_refused(name: str, level: float) -> None:
+    with pytest.raises(ConfigError, match="level"):
+        risk.apply(registry.make("risk", f"{name}:{level}"), random_mixture())
+
+
+def test_a_higher_level_is_more_cautious() -> None:
+    mixture = random_mixture()
+    for measure in (risk.var, risk.cvar, risk.single_class):
+        low, high = (risk.apply(partial(measure, level=level), mixture) for level in (0.3, 0.95))
+        assert (high <= low + 1e-9).all()
+        assert (high < low).any()
+
+
+def test_a_users_measure_is_applied_and_its_map_takes_the_mixtures_dtype() -> None:
+    mixture = random_mixture()
+    single = TraversabilityMixture(mixture.weights.float(), mixture.means.float(), mixture.stds.float())
+    worst = risk.apply(lambda given: given.cvar(0.99).double(), single)
+    assert worst.dtype == torch.float32
+    assert torch.equal(worst, single.cvar(0.99))
+
+
+@pytest.mark.parametrize(
+    ("measure", "expected"),
+    [
+        (lambda mixture: mixture, "shape [2, 1, 6], got TraversabilityMixture"),
+        (lambda mixture: mixture.means, "shape [2, 1, 6], got [2, 4, 1, 6]"),
+        (lambda mixture: mixture.mean()[0], "got [1, 6]"),
+        (lambda mixture: mixture.mean().mT, "got [2, 6, 1]"),
+        (lambda mixture: None, "got NoneType"),
+        (lambda mixture: mixture.mean() > 0.3, "floating-point numbers, got torch.bool"),
+        (lambda mixture: mixture.mean() + 1, "in [0, 1], got values outside"),
+        (lambda mixture: mixture.mean() - 1, "in [0, 1], got values outside"),
+        (lambda mixture: mixture.mean() * torch.nan, "or not a number"),
+    ],
+)
+def test_what_is_no_map_of_traversability_is_refused(measure, expected: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ConfigError) as caught:
+        risk.apply(measure, random_mixture())
+    assert expected in str(caught.value)
+
+
+@pytest.mark.parametrize("name", registry.names("risk"))
+def test_a_measure_changes_nothing_that_it_is_given(name: str) -> None:
+    mixture = random_mixture()
+    before = [value.clone() for value in (mixture.weights, mixture.means, mixture.stds)]
+    risk.apply(registry.make("risk", name), mixture)
+    after = (mixture.weights, mixture.means, mixture.stds)
+    assert all(torch.equal(*pair) for pair in zip(before, after, strict=True))
