@@ -161,7 +161,7 @@ def _unusable(error: OSError, known: Known) -> str:
     if not error.filename:
         return f"could not use a file: {reason}"
     path = Path(str(error.filename))
-    if error.errno not in (errno.EACCES,):
+    if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"could not use {path}: {reason}"
     there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
     remedy = "Choose another place with --out, or change" if "out" in known.kinds else "Change"

@@ -3,7 +3,7 @@
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from benchnav.errors import BenchnavError
@@ -45,13 +45,14 @@ def sole_writer(path: Path, what: str) -> Iterator[None]:
     The lock is a file beside it, so `path` may be moved, replaced or removed while it is held.
 
     Args:
-        path: what is held; its folder is made.
+        path: what is held; its folder is made, and removed at the end where nothing came into it.
         what: what is written there, for the message.
 
     Raises:
         BenchnavError: another process, or another part of this one, holds it.
     """
     path = path.resolve()
+    made = [folder for folder in path.parents if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.with_name(f".{path.name}.lock")
     descriptor = _take(lock, what)
@@ -61,6 +62,9 @@ def sole_writer(path: Path, what: str) -> Iterator[None]:
         # Removed while it is still held: whoever opened it meanwhile sees that its name is gone.
         lock.unlink(missing_ok=True)
         os.close(descriptor)
+        with suppress(OSError):  # one is not empty, or was removed by others
+            for folder in made:
+                folder.rmdir()
 
 
 def _take(lock: Path, what: str) -> int:

@@ -62,7 +62,7 @@ def test_a_folder_is_held_before_it_exists_and_nothing_stays_behind(tmp_path: Pa
             sole_writer(folder, "the run"),
         ):
             pass
-    assert list(folder.parent.iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
     with sole_writer(folder, "the run"):
         pass
 
@@ -145,3 +145,12 @@ def test_racing_processes_never_hold_it_at_once(tmp_path: Path) -> None:
     assert [racer.wait(timeout=120) for racer in racers] == [0, 0]
     assert number.read_text() == "400"
     assert [item.name for item in tmp_path.iterdir()] == ["number"]
+
+
+def test_folders_that_were_made_for_nothing_are_removed(tmp_path: Path) -> None:
+    with sole_writer(tmp_path / "a" / "b" / "run", "x"):
+        assert (tmp_path / "a" / "b").is_dir()
+    assert list(tmp_path.iterdir()) == []
+    with sole_writer(tmp_path / "a" / "b" / "run", "x"):
+        (tmp_path / "a" / "b" / "run").mkdir()
+    assert (tmp_path / "a" / "b" / "run").is_dir()

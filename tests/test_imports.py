@@ -1,4 +1,4 @@
-"""Imports go one way: root -> datagen -> planning and models -> eval; only entry points import a cli."""
+"""Imports go one way: root → datagen → planning and models → eval, and so do the drawers within them."""
 
 import ast
 from pathlib import Path
@@ -6,42 +6,131 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "benchnav"
-ALLOWED = {
-    "": set(),
-    "datagen": {"datagen"},
-    "planning": {"planning"},
-    "models": {"models", "datagen"},
-    "eval": {"eval", "datagen", "models", "planning"},
+
+# The values that the drawers of `planning` share, and the shells that Gymnasium is given.
+VALUES = ("free_space", "objective", "problem", "risk", "robots")
+PLANNING = tuple(f"planning.{name}" for name in VALUES)
+
+# What the modules of a drawer may import besides the root's; a name stands for all that is under it.
+MAY_IMPORT: dict[str, tuple[str, ...]] = {
+    "": (),
+    "datagen": ("datagen",),
+    "models": ("models", "datagen"),
+    "planning": PLANNING,
+    "planning/world": (*PLANNING, "planning.world"),
+    "planning/planners": (*PLANNING, "planning.planners"),
+    "planning/env.py": (*PLANNING, "planning.world", "planning.env_batch"),
+    "planning/env_batch.py": (*PLANNING, "planning.world", "datagen.store"),
+    "eval": ("eval", "models", "planning", "datagen"),
+    "eval/run": ("eval.run", "eval.suite", "eval.trial", "models", "planning", "datagen"),
+    "eval/stats": ("eval.stats", "planning"),
+    "eval/report": ("eval.report", "eval.stats", "eval.run.folder", "eval.suite", "eval.trial", "planning"),
 }
-# planning's environment alone reads datasets.
-EXTRA = {"planning/env.py": {"datagen"}}
+
+
+def modules() -> list[Path]:
+    return [path.relative_to(PACKAGE) for path in sorted(PACKAGE.rglob("*.py"))]
+
+
+def drawer(place: Path) -> str:
+    """The nearest entry of the table: the module's own, else that of a folder it lies in."""
+    return next(
+        name
+        for candidate in (place, *place.parents)
+        if (name := "" if candidate == Path() else candidate.as_posix()) in MAY_IMPORT
+    )
+
+
+def may_import(place: Path, name: str) -> bool:
+    """Tells whether a module may import another, both of ours."""
+    inner = name.removeprefix("benchnav").removeprefix(".")
+    first = inner.split(".")[0]
+    is_root = not (PACKAGE / first).is_dir()
+    if inner.split(".")[-1] == "cli" or ".cli." in f".{inner}.":
+        return False
+    return (
+        not inner
+        or is_root
+        or any(f"{inner}.".startswith(f"{known}.") for known in MAY_IMPORT[drawer(place)])
+    )
 
 
 def imported(path: Path) -> set[str]:
+    """Modules of ours that a file imports, wherever in it; of `from a import b` the module b where it is one."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path} has a relative import"
-            found |= {f"{node.module}.{alias.name}" for alias in node.names} | {str(node.module)}
-    return {name for name in found if name.startswith("benchnav.")}
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                found.add(inner if is_module(inner) else str(node.module))
+    return {name for name in found if name.split(".")[0] == "benchnav"}
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_go_one_way(path: Path) -> None:
-    place = path.relative_to(PACKAGE)
-    home = place.parts[0] if len(place.parts) > 1 else ""
-    allowed = ALLOWED[home] | EXTRA.get(place.as_posix(), set())
-    for name in imported(path):
-        first = name.split(".")[1]
-        if (PACKAGE / first).is_dir():
-            assert first in allowed, f"{place} imports {name}"
-        assert not name.endswith(".cli"), f"{place} imports a cli"
+def is_module(name: str) -> bool:
+    place = PACKAGE.parent / name.replace(".", "/")
+    return place.is_dir() or place.with_suffix(".py").is_file()
+
+
+@pytest.mark.parametrize("place", modules(), ids=Path.as_posix)
+def test_imports_go_one_way(place: Path) -> None:
+    wrong = sorted(name for name in imported(PACKAGE / place) if not may_import(place, name))
+    assert not wrong, f"{place} imports {', '.join(wrong)}"
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "allowed"),
+    [
+        ("registry.py", "benchnav.errors", True),
+        ("registry.py", "benchnav.planning.robots", False),
+        ("datagen/store.py", "benchnav.models.config", False),
+        ("models/data.py", "benchnav.datagen.store", True),
+        ("models/fused.py", "benchnav.planning.risk", False),
+        ("planning/problem.py", "benchnav.planning.objective", True),
+        ("planning/problem.py", "benchnav.planning.planners.planner", False),
+        ("planning/problem.py", "benchnav.datagen.store", False),
+        ("planning/env_batch.py", "benchnav.datagen.store", True),
+        ("planning/env_batch.py", "benchnav.datagen.generate", False),
+        ("planning/env.py", "benchnav.planning.planners.mppi", False),
+        ("planning/world/simulation.py", "benchnav.planning.problem", True),
+        ("planning/world/simulation.py", "benchnav.planning.planners.planner", False),
+        ("planning/planners/cl_rrt/tree.py", "benchnav.planning.planners.planner", True),
+        ("planning/planners/cl_rrt/tree.py", "benchnav.planning.world.outcome", False),
+        ("planning/planners/mppi.py", "benchnav.eval.trial", False),
+        ("eval/run/rollout.py", "benchnav.planning.world.simulation", True),
+        ("eval/run/rollout.py", "benchnav.eval.report.tables", False),
+        ("eval/stats/intervals.py", "benchnav.eval.run.rows", False),
+        ("eval/stats/intervals.py", "benchnav.eval.report.tables", False),
+        ("eval/report/tables.py", "benchnav.eval.stats.intervals", True),
+        ("eval/report/tables.py", "benchnav.eval.run.folder", True),
+        ("eval/report/tables.py", "benchnav.eval.run.rollout", False),
+        ("eval/report/tables.py", "benchnav.models.predictor", False),
+        ("eval/runner.py", "benchnav.eval.report.write", True),
+        ("eval/runner.py", "benchnav.eval.cli", False),
+        ("eval/cli.py", "benchnav.models.cli", False),
+    ],
+)
+def test_the_rule_knows_its_drawers(place: str, name: str, allowed: bool) -> None:
+    assert may_import(Path(place), name) == allowed
+
+
+def test_every_folder_is_a_drawer_or_lies_in_one() -> None:
+    named = {Path(name) for name in MAY_IMPORT if name}
+    for name in named:
+        assert (PACKAGE / name).exists(), f"{name} is in the table alone"
+    for folder in {place.parent for place in modules()} - {Path()}:
+        assert named & {folder, *folder.parents}, f"{folder} has no rule"
+
+
+def test_values_of_planning_are_all_that_lies_beside_its_drawers() -> None:
+    beside = {path.stem for path in (PACKAGE / "planning").glob("*.py")} - {"__init__"}
+    assert beside == {*VALUES, "env", "env_batch"}
 
 
 def test_no_drawers_without_a_label() -> None:
-    names = {path.stem for path in PACKAGE.rglob("*.py")} | {
-        path.name for path in PACKAGE.rglob("*") if path.is_dir()
+    names = {place.stem for place in modules()} | {
+        parent.name for place in modules() for parent in place.parents
     }
     assert not names & {"utils", "util", "common", "helpers", "misc"}

@@ -1,21 +1,25 @@
 """No function changes what it is given."""
 
 from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
 
-from benchnav import gridgraph, rng
+from benchnav import gridgraph, registry, rng
 from benchnav.datagen import appearance, elevation, latent
 from benchnav.datagen.block import Block
 from benchnav.datagen.generate import generate
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.schema import entry_digests
-from benchnav.planning import astar, mppi
-from benchnav.planning.dwa import DWAConfig, choose_velocity
-from benchnav.planning.risk import NAMES, RiskSetting
-from benchnav.planning.simulation import Simulation, fail, tell_stuck
+from benchnav.planning import risk
+from benchnav.planning.planners import astar, mppi
+from benchnav.planning.planners.dwa import DWAConfig, judge, velocity_window
+from benchnav.planning.problem import Problem
+from benchnav.planning.world.outcome import Outcome, tell_standstill
+from benchnav.planning.world.simulation import Simulation, end
+from benchnav.planning.world.world import World
 from tests import factories
 from tests.factories import tiny_recipe
 from tests.test_mixture import random_mixture
@@ -28,11 +32,11 @@ def same_after(call: Callable[[], object], *given: torch.Tensor | np.ndarray) ->
         np.testing.assert_array_equal(kept, np.asarray(value))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_risk_settings(name: str) -> None:
+@pytest.mark.parametrize("name", registry.names("risk"))
+def test_risk_measures(name: str) -> None:
     mixture = random_mixture()
     given = (mixture.weights, mixture.means, mixture.stds)
-    same_after(lambda: RiskSetting(name).apply(mixture), *given)
+    same_after(lambda: risk.apply(registry.make("risk", name), mixture), *given)
 
 
 def test_mixture_methods() -> None:
@@ -61,39 +65,65 @@ def test_datagen() -> None:
     same_after(lambda: Block.of(maps), *maps.values())
 
 
-def test_planning() -> None:
+def maps_of(problem: Problem) -> tuple[torch.Tensor, ...]:
+    """Every tensor of a problem."""
+    held = [
+        getattr(value, f.name)
+        for value in (problem, problem.mixture, problem.observation)
+        for f in fields(value)
+    ]
+    derived = (problem.padded_ground, problem.traversability, *problem.action_bounds)
+    return (*(value for value in held if torch.is_tensor(value)), *derived)
+
+
+def test_the_problem() -> None:
     problem = factories.problem(torch.rand(2, 16, 16))
-    maps = (problem.elevation_m, problem.traversability, problem.start, problem.goal_m)
+    state, action = torch.rand(2, 5, 3), torch.rand(2, 5, 2)
+    ground, target = problem.ground_at(state), problem.goal_m[:, None]
+    given = (state, action, ground, target, *maps_of(problem))
+    same_after(lambda: problem.stage_cost(state, action, ground, target), *given)
+    same_after(lambda: problem.terminal_cost(state, target), *given)
+    same_after(lambda: problem.select(torch.tensor([1])), *given)
+
+
+def test_parts_of_planners() -> None:
+    """Planners themselves are held to this by their contract."""
+    problem = factories.problem(torch.rand(2, 16, 16))
+    maps = maps_of(problem)
     same_after(lambda: astar.search(problem), *maps)
     costs, goals = astar.edge_costs(problem), np.zeros((2, 16, 16), dtype=bool)
     same_after(lambda: gridgraph.cost_to_go(costs, goals, (16, 16)), costs, goals)
-    mean, noise = torch.rand(2, 12, 2), torch.randn(12, 2, 5)
-    same_after(lambda: mppi.rollout_cost(problem, problem.start, mean, noise), mean, noise, *maps)
-    velocity = torch.zeros(2, 2)
-    same_after(
-        lambda: choose_velocity(problem, problem.start, velocity, problem.goal_m, DWAConfig()),
-        velocity,
-        *maps,
-    )
-    action, outcome = torch.full((2, 2), 5.0), torch.tensor([2, 2])
+    mean, noise, target = torch.rand(2, 12, 2), torch.randn(12, 2, 5), problem.goal_m
+    same_after(lambda: mppi.rollout_cost(problem, problem.start, mean, noise, target), mean, noise, *maps)
+    velocity, config = torch.zeros(2, 2), DWAConfig()
+    same_after(lambda: velocity_window(problem, velocity, config), velocity, *maps)
+    window = velocity_window(problem, velocity, config)
+    same_after(lambda: judge(problem, problem.start, window, target, config), window, *maps)
+
+
+def test_the_world() -> None:
+    problem = factories.problem(torch.rand(2, 16, 16))
+    action, outcome = torch.full((2, 2), 5.0), torch.full((2,), int(Outcome.TIMEOUT))
     terrain = factories.terrain(torch.rand(2, 16, 16))
-    simulation = Simulation(terrain, problem.dynamics, problem.goal_m, 0, [0, 1])
-    now = simulation.init(problem.start)
     truth = (terrain.traversability_mean, terrain.traversability_std, terrain.traversability)
-    same_after(lambda: simulation.step(now, action), now.state, now.outcome, now.step, action, *maps, *truth)
-    same_after(lambda: fail(now, torch.tensor([True, False])), now.outcome)
-    track = torch.zeros(2, 200, 2)
-    same_after(lambda: tell_stuck(outcome, track, 0.1), outcome, track)
+    simulation = Simulation(terrain, problem.task, World(), problem.goal_m, 0, [0, 1])
+    now = simulation.init(problem.start)
+    given = (now.state, now.outcome, now.step, action, *maps_of(problem), *truth)
+    same_after(lambda: simulation.step(now, action), *given)
+    same_after(lambda: simulation.unhindered(now, action), *given)
+    same_after(lambda: end(now, torch.tensor([True, False]), Outcome.PLANNER_ERROR), *given)
+    track, driven = torch.zeros(2, 200, 2), torch.zeros(2, 199)
+    same_after(lambda: tell_standstill(outcome, track, driven, 0.1), outcome, track, driven)
 
 
 def test_the_global_generators_are_left_alone() -> None:
     torch.manual_seed(0)
     np.random.seed(0)  # noqa: NPY002 - to see that nobody uses it
     before = torch.get_rng_state(), np.random.get_state()[1]  # noqa: NPY002
-    problem = factories.problem(torch.full((1, 16, 16), 0.8))
-    planner = mppi.MPPI(mppi.MPPIConfig(samples=32, horizon=5))
-    planner.plan(problem.start, planner.init(problem, torch.Generator().manual_seed(1)))
     generate(tiny_recipe(), "train", np.arange(2))
     random_mixture().sample(3, torch.Generator())
+    ground = torch.full((2, 16, 16), 0.8)
+    problem = factories.problem(ground)
+    Simulation(factories.terrain(ground), problem.task, World(), problem.goal_m, 0, [0, 1])
     assert torch.equal(before[0], torch.get_rng_state())
     np.testing.assert_array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002

@@ -151,7 +151,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         CheckpointError: it is missing, damaged, or of a newer format.
     """
     folder = Path(folder)
-    config = _read_config(folder)
+    config = read_config(folder)
     try:
         parts = {
             name: Part(
@@ -171,6 +171,37 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         return Checkpoint(class_names=tuple(config["class_names"]), parts=parts, model=config["model"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Reads what a checkpoint says of itself, without its tensors.
+
+    Raises:
+        CheckpointError: it is missing, damaged, or of a newer format.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise CheckpointError(
+            f"Expected a checkpoint folder with {CONFIG}, got {folder} without one. "
+            f"Make one with `benchnav-train all --out {folder}`."
+        )
+    try:
+        config = json.loads(path.read_text())
+        kind, version = config["format"], tuple(int(part) for part in config["format_version"].split("."))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise _damaged(path, f"{type(error).__name__} {error}") from error
+    if kind != FORMAT:
+        raise CheckpointError(
+            f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav checkpoint."
+        )
+    if version > FORMAT_VERSION or version[0] < FORMAT_VERSION[0]:
+        remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
+        raise CheckpointError(
+            f"Expected format version {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
+            f"{config['format_version']}. "
+            + (remedy if version > FORMAT_VERSION else "Train the model again with this version.")
+        )
+    return config
 
 
 def _write(folder: Path, checkpoint: Checkpoint) -> None:
@@ -211,32 +242,6 @@ def _stored(value: Tensor, half: bool) -> Tensor:
     # Kernels alone: running variances and biases are few, and may leave float16's range.
     value = value.detach().cpu().contiguous()
     return value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
-
-
-def _read_config(folder: Path) -> dict[str, Any]:
-    path = folder / CONFIG
-    if not path.is_file():
-        raise CheckpointError(
-            f"Expected a checkpoint folder with {CONFIG}, got {folder} without one. "
-            f"Make one with `benchnav-train all --out {folder}`."
-        )
-    try:
-        config = json.loads(path.read_text())
-        kind, version = config["format"], tuple(int(part) for part in config["format_version"].split("."))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise _damaged(path, f"{type(error).__name__} {error}") from error
-    if kind != FORMAT:
-        raise CheckpointError(
-            f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav checkpoint."
-        )
-    if version > FORMAT_VERSION or version[0] < FORMAT_VERSION[0]:
-        remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
-        raise CheckpointError(
-            f"Expected format version {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
-            f"{config['format_version']}. "
-            + (remedy if version > FORMAT_VERSION else "Train the model again with this version.")
-        )
-    return config
 
 
 def _read_tensors(path: Path, digest: str) -> dict[str, Tensor]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from benchnav.models.target import Target
 
 _HELD_OUT = 0.1  # of slip logs
+_FEW_ROWS = 10  # of a class in slip logs
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
 Config = TypeVar("Config", ClassifierConfig, MDNConfig)
 
@@ -290,6 +291,15 @@ def _train_gp_on_logs(
     target = open_target(
         Path(out), Checkpoint(class_names=names), ["gp"], f"file:{logs.digest}", options, overwrite
     )
+    counts = dict(zip(names, table.count.tolist(), strict=True))
+    if few := [
+        f"{name} {count}" for name, count in counts.items() if 0 < count < min(_FEW_ROWS, config.max_points)
+    ]:
+        print(
+            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes "
+            f"({', '.join(few)}); what is predicted of them is little more than the prior",
+            file=sys.stderr,
+        )
     metrics = {}
     if int(table.count.max()) >= 1 / _HELD_OUT:
         kept, held = hold_out(table, _HELD_OUT, seed)
@@ -298,7 +308,7 @@ def _train_gp_on_logs(
             f"gp: NLL of {int(held.count.sum())} rows held out {metrics['held_out_nll']:.4f}; now with all rows"
         )
     model = fit_gps(config, table, options)
-    seen = ", ".join(f"{name} {count}" for name, count in zip(names, table.count.tolist(), strict=True))
+    seen = ", ".join(f"{name} {count}" for name, count in counts.items())
     _say(f"gp: rows learned from: {seen}")
     part = Part(
         config={**asdict(config), "steepest_deg": model.steepest_deg},

@@ -72,7 +72,7 @@ def test_a_planner_that_fails_ends_with_status_1(
     dataset_path: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:  # type: ignore[no-untyped-def]
     out, faulty = tmp_path / "run", "{part: tests.eval.parts:Faulty, label: bad, options: {fault: raise}}"
-    arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
+    arguments = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL[2:-2])
     assert evaluate(monkeypatch, *arguments, "--planners", f"[straight,{faulty}]") == 1
     captured = capsys.readouterr()
     assert "1 in planner_error" in captured.err

@@ -133,3 +133,47 @@ def test_an_interrupted_training_goes_on_from_its_gps(
     assert (tmp_path / "c" / "gp.safetensors").read_bytes() == kept
     assert set(load_checkpoint(tmp_path / "c").parts) == {"classifier", "gp"}
     assert "--overwrite" in refuses(monkeypatch, capfd, "all", *where)
+
+
+def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    many = "".join(f"rock,{slope},{0.9 - 0.01 * slope:.2f}\n" for slope in range(12))
+    header = "class,slope_deg,traversability\n"
+    for name, rows in (("few", "mud,3,0.4\nsand,2,0.5\n"), ("enough", "")):
+        Path(f"{name}.csv").write_text(header + many + rows)
+        assert call(monkeypatch, "gp", "--data", f"{name}.csv", "--out", name, *QUICK_GP) == 0
+        told = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
+        assert len(told) == (name == "few")
+        if told:
+            assert "few.csv has fewer than 10 rows of some classes (mud 1, sand 1)" in told[0]
+
+
+def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(
+        "import torch\n\nfrom benchnav.mixture import TraversabilityMixture\n\n\n"
+        "class Mine:\n    def __init__(self, mean: float = 0.5) -> None:\n        self.mean = mean\n\n"
+        "    def predict(self, observation):\n        ones = torch.ones_like(observation.slope_deg)[:, None]\n"
+        "        return TraversabilityMixture(ones, self.mean * ones, 0.2 * ones)\n"
+    )
+    reports = []
+    for source in ("./mine.py:Mine:0.1", "./mine.py:Mine:0.7"):
+        assert call(monkeypatch, "evaluate", source, "--data", dataset.path, "--json", "report.json") == 0
+        reports.append(json.loads(Path("report.json").read_text()))
+    assert [report["model"] for report in reports] == ["./mine.py:Mine:0.1", "./mine.py:Mine:0.7"]
+    assert reports[0]["splits"] != reports[1]["splits"]
+
+    def locked(*arguments: object, **_: object) -> object:
+        raise PermissionError(13, "Permission denied", "/tmp/a-name-of-ours")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", locked)
+    message = refuses(monkeypatch, capfd, "evaluate", "oracle", "--data", dataset.path, "--out", "locked/new")
+    assert f"could not use {tmp_path}/locked/new/quality.json: Permission denied" in message
+    assert f"Choose another place with --out, or change the permissions of {tmp_path}." in message

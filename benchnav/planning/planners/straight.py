@@ -17,6 +17,8 @@ from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot, action_l
 _TURN_GAIN = 4.0
 # A robot that looks farther away than this turns before it drives, so that it leaves narrow places straight.
 _AWAY_RAD = 0.2
+# Greatest speed for a metre that is left, 1/s, so that a target is not overshot.
+_APPROACH = 2.0
 # Least share of the top speed of a robot that steers: it cannot turn while it stands.
 _CREEP = 0.3
 
@@ -41,7 +43,8 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     # A robot of limited acceleration has to be able to end its turn in time.
     gain = _TURN_GAIN if limits is None else min(_TURN_GAIN, 2 * limits[1] / high[1])
     least = 0.0 if TURN_RATE in robot.action_names else _CREEP
-    speed = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
+    aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
+    speed = torch.minimum(aligned, _APPROACH * torch.linalg.vector_norm(offset, dim=1))
     actions = zip((speed, gain * missing), low, high, strict=True)
     return torch.stack([action.clamp(least, most) for action, least, most in actions], dim=1)
 

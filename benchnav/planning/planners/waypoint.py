@@ -95,31 +95,29 @@ def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -
         lookahead_m: how far along the path to look.
 
     Returns:
-        The way-point (x, y), the path's next point where no line is worth it; and where to drive to follow
-        the path itself: its next point, or the centre of the robot's own cell where the line to that point
-        cuts across dearer ground. Each of shape [B, 2].
+        (x, y), shape [B, 2], the path's next point where no line is worth it; and whether at least the line
+        to that next point is worth it, bool, shape [B].
     """
     grid = ground.grid
     robot, ahead = points_m[:, :1], points_m[:, 1:]
     row, column = grid.cell_of(robot[..., 0], robot[..., 1])
-    own = torch.stack(grid.centre_of(row, column), dim=-1).to(robot)
+    # Half-way to the next cell's centre lies the edge or the corner that the two cells share.
+    gate = 0.5 * (torch.stack(grid.centre_of(row, column), dim=-1).to(robot) + ahead[:, :1])
     count = ahead.shape[1]
-    # Straight lines to each point, the path's legs, and the two legs by way of the own cell's centre.
-    begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, own), dim=1)
-    end = torch.cat((ahead, ahead[:, 1:], own, ahead[:, :1]), dim=1)
+    # Straight lines to each point, the path's legs, and the first leg by way of the gate.
+    begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, gate), dim=1)
+    end = torch.cat((ahead, ahead[:, 1:], gate, ahead[:, :1]), dim=1)
     # Only what is within the look-ahead counts, and that spans no more columns or rows than this.
     crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
     costs = line_costs(ground, begin, end, crossings)
     lines, legs, detour = costs[:, :count], costs[:, count:-2], costs[:, -2:].sum(dim=1, keepdim=True)
+    # The line to a neighbour across a corner may cut a cell that the path does not touch.
     path = torch.cat((torch.minimum(lines[:, :1], detour), legs), dim=1).cumsum(dim=1)
-    worth = lines <= _SHORT_CUT * path
-    steps = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2)
+    near = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2).cumsum(dim=1) <= lookahead_m
     rank = torch.arange(count, device=ahead.device)
-    farthest = torch.where(worth & (steps.cumsum(dim=1) <= lookahead_m), rank, 0).amax(dim=1)
-    # At its centre already, as well as steering can tell, a robot has nothing to gain from it.
-    astray = torch.linalg.vector_norm(own - robot, dim=2) > grid.resolution_m / 4
-    onward = torch.where((astray & ~worth[:, :1])[..., None], own, ahead[:, :1])
-    return ahead.gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0], onward[:, 0]
+    worth = lines <= _SHORT_CUT * path
+    farthest = torch.where(worth & near, rank, 0).amax(dim=1)
+    return ahead.gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0], worth[:, 0]
 
 
 def _grid_cuts(start_m: Tensor, offset_m: Tensor, resolution_m: float, crossings: int) -> Tensor:

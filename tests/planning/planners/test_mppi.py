@@ -6,7 +6,7 @@ import torch
 
 from benchnav.errors import ConfigError
 from benchnav.planning.planners import mppi
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -130,10 +130,11 @@ def test_it_drives_at_the_target_that_it_is_given() -> None:
     state = planner.init(problem, generator())
     aside = torch.tensor([[4.0, 7.0]])
     turns = [
-        planner.plan_toward(first(problem), state, target)[0][0, 1] for target in (problem.goal_m, aside)
+        planner.plan_toward(first(problem), state, target)[1].mean[0, :, 1].mean()
+        for target in (problem.goal_m, aside)
     ]
-    assert turns[1] - turns[0] > 0.2
-    assert torch.equal(planner.plan(first(problem), state)[0][0, 1], turns[0])
+    assert turns[1] - turns[0] > 0.03
+    assert torch.equal(planner.plan(first(problem), state)[1].mean[0, :, 1].mean(), turns[0])
     assert planner.took(state, aside) is state
 
 
@@ -211,10 +212,12 @@ def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(
         mppi, "draw_noise", lambda state, samples: state.mean.new_empty(*state.mean.shape[1:], samples)
     )
-    monkeypatch.setattr(torch._dynamo.config, "disable", True)
+    monkeypatch.setattr(mppi, "Fused", lambda function, samples: function)
     with fake_cuda(problem_on(robot)) as problem:
+        mean, scale = problem.start.new_zeros(2, 20, 2), problem.start.new_ones(2)
+        state = MPPIState(problem, mean, scale, seed=0, step=0)
         planner = MPPI(replace(SMALL, control_cost=0.1))
-        action, state, plan = planner.plan(first(problem, draw=True), planner.init(problem, generator()))
+        action, state, plan = planner.plan(first(problem, draw=True), state)
         assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)
         cost = mppi.rollout_cost(
             problem, problem.start, state.mean, mppi.draw_noise(state, 9), problem.goal_m

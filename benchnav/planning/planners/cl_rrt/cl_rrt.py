@@ -51,7 +51,7 @@ _STALL_M = 0.25  # progress less than this in `stall_s` is none
 
 @dataclass(frozen=True, kw_only=True)
 class CLRRTConfig:
-    """Settings of CL-RRT; the defaults are the paper's where it gives them.
+    """Settings of CL-RRT. The paper gives none of these numbers; the defaults are ours.
 
     Args:
         expansions: edges tried in a plan.

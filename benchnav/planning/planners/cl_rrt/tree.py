@@ -106,7 +106,7 @@ class Route:
     """What was planned for each episode.
 
     Args:
-        status: `PlanStatus`: OK where the path leads to the goal over free ground, else PARTIAL; shape [B].
+        status: `PlanStatus`: OK where the path leads to the goal and enters free ground alone, else PARTIAL.
         depth: edges of the path, 0 where there is none, int64, shape [B].
         rows: references of the edges, as `Reference` keeps them, shape [B, D, N, 4].
         end_m: arc length at which each reference is left for the next, shape [B, D].

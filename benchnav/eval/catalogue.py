@@ -1,0 +1,166 @@
+"""What can be named in a suite: the parts of each kind with their purpose and options, and checkpoints."""
+
+import inspect
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from benchnav import registry
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.options import dataclass_in, list_options, plain
+from benchnav.registry import Option
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+TITLES = {
+    "planner": "planners",
+    "model": "models",
+    "risk": "risk measures",
+    "robot": "robots",
+    "objective": "objectives",
+}
+HELP = (
+    "More by package.module:Name and path/to/file.py:Name. NAME:VALUE sets the first option, "
+    "{part: NAME, label: LABEL, options: {...}} any."
+)
+
+_WIDEST_OPTION = 56  # that is not broken, at 100 columns
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One thing that can be named.
+
+    Args:
+        name: as it is written in a suite.
+        purpose: one line.
+        options: its options, each `name: type = default`.
+    """
+
+    name: str
+    purpose: str
+    options: tuple[str, ...] = ()
+
+
+def print_catalogue(*kinds: str) -> None:
+    """Prints what can be named in a suite: as tables in a terminal, as plain lines elsewhere.
+
+    Args:
+        kinds: some of the registry's; all of them when none is named.
+
+    Raises:
+        ConfigError: there is no such kind.
+    """
+    chosen = [kind for kind in kinds if kind] or list(registry.KINDS)
+    for kind in chosen:
+        registry.names(kind)  # refuses an unknown one before anything is printed
+    if not sys.stdout.isatty():
+        print("\n".join(line for kind in chosen for line in plain_lines(kind)))
+        return
+    from rich.console import Console
+
+    console = Console()
+    for kind in chosen:
+        console.print(make_table(kind))
+    console.print(HELP, markup=False, highlight=False)
+
+
+def list_entries(kind: str) -> list[Entry]:
+    """Lists the parts of a kind that are known by name; for models also the checkpoints found."""
+    found = [_describe(kind, name) for name in registry.names(kind)]
+    return found + list(_checkpoints()) if kind == "model" else found
+
+
+def plain_lines(kind: str) -> list[str]:
+    """The catalogue of a kind as lines that other programs can read: `KIND NAME: PURPOSE`, then options."""
+    lines = []
+    for entry in list_entries(kind):
+        lines.append(f"{kind} {entry.name}: {entry.purpose}")
+        lines += [f"    {option}" for option in entry.options]
+    return lines
+
+
+def make_table(kind: str) -> "Table":
+    """The catalogue of a kind as a table for a terminal."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    entries = list_entries(kind)
+    widest = max((len(option) for entry in entries for option in entry.options), default=0)
+    table = Table(
+        title=Text(TITLES[kind]),
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
+    table.add_column("name", no_wrap=True, style="bold")
+    table.add_column("purpose", min_width=20)
+    table.add_column("options", overflow="fold", no_wrap=widest <= _WIDEST_OPTION)
+    for entry in entries:
+        table.add_row(Text(entry.name), Text(entry.purpose), Text("\n".join(entry.options)))
+    return table
+
+
+def _describe(kind: str, name: str) -> Entry:
+    """Describes a part; one that cannot be imported is told as such, and hides no other."""
+    try:
+        target = registry.find(kind, name).target
+        if hasattr(target, "from_checkpoint"):
+            return Entry(name=name, purpose=f"{_purpose(target)} A family: name a checkpoint of it.")
+        options = tuple(_option_lines(registry.options_of(kind, target)))
+        return Entry(name=name, purpose=_purpose(target), options=options)
+    except BenchnavError as error:
+        return Entry(name=name, purpose=f"cannot be used: {error}")
+
+
+def _purpose(target: Any) -> str:
+    """The first line of a docstring; one that Python made of a dataclass says nothing."""
+    line = (inspect.getdoc(target) or "").partition("\n")[0]
+    return "" if line.startswith(f"{getattr(target, '__name__', '')}(") else line
+
+
+def _option_lines(options: dict[str, Option], prefix: str = "") -> Iterator[str]:
+    for name, option in options.items():
+        config = dataclass_in(option.kind)
+        if config and option.default is not None:
+            yield from _option_lines(_with_values(list_options(config), option.default), f"{prefix}{name}.")
+            continue
+        kind = "" if option.kind is Any else f": {registry.type_name(option.kind)}"
+        yield f"{prefix}{name}{kind}{_default(option.default)}"
+
+
+def _with_values(options: dict[str, Option], value: Any) -> dict[str, Option]:
+    """Options of a dataclass with one value's own fields for defaults."""
+    return {
+        name: Option(kind=option.kind, default=getattr(value, name, option.default))
+        for name, option in options.items()
+    }
+
+
+def _default(value: Any) -> str:
+    if value is registry.NO_DEFAULT:
+        return " (has to be given)"
+    try:
+        return f" = {json.dumps(plain(value), ensure_ascii=False)}"
+    except ConfigError:
+        return f" = {type(value).__name__}"
+
+
+def _checkpoints() -> Iterator[Entry]:
+    from benchnav.models.checkpoint import read_config
+    from benchnav.models.predictor import list_checkpoints
+
+    for folder in list_checkpoints():
+        try:
+            config = read_config(folder)
+            classes = len(config.get("class_names") or ())
+            told = f", {classes} classes" if classes else ""
+            purpose = f"Checkpoint of the family {config.get('model')} in {folder}{told}."
+        except BenchnavError as error:
+            purpose = f"cannot be used: {error}"
+        yield Entry(name=folder.name, purpose=purpose)
