@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -163,6 +164,10 @@ def test_a_registered_model_is_found_by_name(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(registry, "_REGISTERED", {})
     registry.register("model", "mine", Spy)
     assert isinstance(load_model("mine"), Spy)
+    registry.register(
+        "model", "oracle-like", lambda mean=0.5: SimpleNamespace(mean=mean, predict=Spy().predict)
+    )
+    assert load_model("oracle-like:0.25").mean == 0.25  # type: ignore[union-attr]
 
 
 @pytest.mark.usefixtures("_own_file")

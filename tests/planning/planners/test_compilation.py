@@ -1,0 +1,185 @@
+import logging
+import sys
+from typing import Any
+
+import pytest
+import torch
+import torch._dynamo.config
+import torch._inductor.config
+
+from benchnav.planning.planners import compilation
+from benchnav.planning.planners.compilation import Fused, worth_compiling
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from tests import factories
+from tests.planning.planners.driving import first, generator
+
+CPU = torch.device("cpu")
+MANY = 5000
+
+
+def scaled(x: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+    assert compiling() or eager.append(x.shape) is None
+    return (x * factor + 1).sin()
+
+
+eager: list[torch.Size] = []
+"""Shapes for which `scaled` ran as Python."""
+compiling = torch.compiler.is_compiling
+
+
+@pytest.fixture(autouse=True)
+def _fresh() -> None:
+    eager.clear()
+
+
+def inputs(columns: int) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.linspace(0, 1, 3 * columns).reshape(3, columns), torch.tensor(2.0)
+
+
+def test_what_is_worth_compiling_depends_on_samples_and_device_alone() -> None:
+    assert worth_compiling(5000, CPU)
+    assert worth_compiling(2000, CPU)
+    assert not worth_compiling(1999, CPU)
+    assert worth_compiling(10, torch.device("cuda"))
+
+
+def test_more_shapes_than_pytorch_allows_stay_compiled() -> None:
+    limit = torch._dynamo.config.recompile_limit
+    fused = Fused(scaled, MANY)
+    assert fused.compiled is None
+    for columns in range(1, limit + 3):
+        x, factor = inputs(columns)
+        torch.testing.assert_close(fused(x, factor), (x * 2 + 1).sin())
+        assert fused.compiled is True
+    assert eager == []
+
+
+def test_few_samples_run_eagerly() -> None:
+    fused = Fused(scaled, 100)
+    fused(*inputs(40))
+    assert fused.compiled is False
+    assert len(eager) == 1
+
+
+def test_pytorchs_own_switch_turns_it_off() -> None:
+    fused = Fused(scaled, MANY)
+    with torch._dynamo.config.patch(disable=True):
+        fused(*inputs(41))
+    assert fused.compiled is False
+    assert len(eager) == 1
+
+
+def uncompilable(x: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+    if x.sum().item() > 1e9:
+        return x
+    return x * factor
+
+
+def test_what_cannot_be_compiled_runs_eagerly_and_leaves_all_else_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    hopeless, fine = Fused(uncompilable, MANY), Fused(scaled, MANY)
+    x, factor = inputs(42)
+    for _ in range(2):
+        torch.testing.assert_close(hopeless(x, factor), 2 * x)
+    assert hopeless.compiled is False
+    said = capsys.readouterr().err
+    assert said.count("benchnav: running uncompiled, several times slower: ") == 1
+    fine(x, factor)
+    assert fine.compiled is True
+    assert eager == []
+    another = Fused(uncompilable, MANY)
+    another(x, factor)
+    assert another.compiled is False
+
+
+def test_without_a_compiler_it_runs_eagerly(capsys: pytest.CaptureFixture[str]) -> None:
+    fused = Fused(scaled, MANY)
+    x, factor = inputs(43)
+    with torch._inductor.config.patch(
+        {"cpp.cxx": ("no-such-compiler",), "force_disable_caches": True, "cpp_wrapper": False}
+    ):
+        torch.testing.assert_close(fused(x, factor), (x * 2 + 1).sin())
+    assert fused.compiled is False
+    assert "uncompiled" in capsys.readouterr().err
+
+
+def test_a_mistake_in_the_function_is_raised_as_it_is() -> None:
+    def mistaken(x: torch.Tensor) -> torch.Tensor:
+        raise ValueError("not today")
+
+    with pytest.raises(ValueError, match="not today"):
+        Fused(mistaken, MANY)(torch.zeros(3))
+
+
+def settings() -> dict[str, Any]:
+    dynamo = torch._dynamo.config
+    return {
+        "limits": (dynamo.recompile_limit, dynamo.accumulated_recompile_limit),
+        "flags": (dynamo.fail_on_recompile_limit_hit, dynamo.suppress_errors),
+        "notices": logging.getLogger("torch.utils.cpp_extension").level,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def test_no_setting_of_pytorch_is_left_changed() -> None:
+    before = settings()
+    during: list[dict[str, Any]] = []
+
+    def look(x: torch.Tensor) -> torch.Tensor:
+        during.append(settings())
+        return x
+
+    fused = Fused(scaled, MANY)
+    fused(*inputs(44))
+    Fused(uncompilable, MANY)(*inputs(44))
+    assert settings() == before
+    fused._fused = look  # type: ignore[assignment]
+    fused(torch.zeros(1))
+    assert during[0]["limits"] == (sys.maxsize, sys.maxsize)
+    assert during[0]["flags"] == (True, False)
+    assert settings() == before
+
+
+# --- In MPPI.
+
+SMALL = MPPIConfig(samples=64, horizon=4)
+
+
+class Doubtful:
+    """An objective that looks at a number, which nothing compiled can do."""
+
+    def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+        return traversability * float(state.sum())
+
+    def terminal(self, state, traversability, target):  # type: ignore[no-untyped-def]
+        return traversability
+
+
+def test_compiled_and_eager_planners_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = 0.35 + 0.6 * torch.rand(2, 16, 20, generator=generator())
+    problem = factories.problem(maps)
+    uncompilable_problem = factories.problem(maps, objective=Doubtful())
+    actions = []
+    for worth in (1_000_000, 1):
+        monkeypatch.setattr(compilation, "_WORTH_ROLLOUTS", worth)
+        planner = MPPI(SMALL)
+        assert planner.compiled is None
+        action, state, _ = planner.plan(first(problem), planner.init(problem, generator()))
+        actions.append(torch.cat((action, state.mean.flatten(1)), dim=1))
+        assert planner.compiled is (worth == 1)
+    torch.testing.assert_close(actions[0], actions[1], atol=1e-4, rtol=1e-4)
+    doubtful, other = MPPI(SMALL), MPPI(SMALL)
+    doubtful.plan(first(problem), doubtful.init(uncompilable_problem, generator()))
+    assert doubtful.compiled is False
+    action, state, _ = other.plan(first(problem), other.init(problem, generator()))
+    assert other.compiled is True
+    assert torch.equal(action, actions[1][:, :2])
+
+
+def test_a_unit_of_three_episodes_and_one_of_twenty_agree_on_compiling() -> None:
+    planner = MPPI(MPPIConfig(samples=1000, horizon=2))
+    for batch in (3, 20, 200):
+        problem = factories.problem(torch.full((batch, 16, 16), 0.8))
+        planner.plan(first(problem), planner.init(problem, generator()))
+        assert planner.compiled is False
