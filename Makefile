@@ -6,11 +6,12 @@ STAMP := $(VENV)/.installed
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
-.PHONY: help demo test bench lint clean
+.PHONY: help demo test test-slow bench lint clean
 
 help:
 	@echo "make demo   set up, run a small suite of the shipped model on the shipped maps, write report and playback"
 	@echo "make test   set up, run the tests"
+	@echo "make test-slow  those that take minutes: whole suites with the shipped model"
 	@echo "make bench  speed, side by side with peers"
 	@echo "make lint   ruff and mypy"
 
@@ -28,6 +29,9 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -n $(JOBS) -m slow
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/datasets.py

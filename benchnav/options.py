@@ -107,6 +107,19 @@ def typed(owner: str, name: str, option: Option, value: Any) -> Any:
         ) from error
 
 
+def from_text(owner: str, name: str, option: Option, text: str) -> Any:
+    """Reads an option's value from text; arguments as of `typed`. Without a type it is read as YAML.
+
+    Raises:
+        ConfigError: the value is of another type.
+    """
+    if option.kind is not Any:
+        return typed(owner, name, option, text)
+    from jsonargparse import get_loader
+
+    return get_loader("yaml")(text)
+
+
 def refuse_unknown(
     owner: str, given: Mapping[str, Any], known: Mapping[str, Option], prefix: str = ""
 ) -> None:

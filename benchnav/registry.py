@@ -31,6 +31,7 @@ from benchnav.options import (
     Option,
     call,
     config_class,
+    from_text,
     hint,
     list_options,
     one_line,
@@ -56,7 +57,6 @@ __all__ = [
     "Option",
     "Part",
     "complete",
-    "digest_of",
     "find",
     "hint",
     "make",
@@ -160,7 +160,7 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         name, option = _first_option(kind, source, text)
         if name in options:
             raise ConfigError(f"Expected option {name!r} of {kind} {text!r} once, got {options[name]!r} too.")
-        options = {name: typed(f"{kind} {source!r}", name, option, value), **options}
+        options = {name: from_text(f"{kind} {source!r}", name, option, value), **options}
     place = source.rpartition(":")[0]
     label = fields.get("label") or (text[len(place) + 1 :] if place else text)
     return Part(part=source, label=str(label), options=options)

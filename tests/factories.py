@@ -33,13 +33,9 @@ def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
     )
 
 
-def task(
-    robot: Robot | None = None, objective: Objective | None = None, rules: Rules | None = None
-) -> Task:
+def task(robot: Robot | None = None, objective: Objective | None = None, rules: Rules | None = None) -> Task:
     """The paper's task, with some of its parts replaced."""
-    return Task(
-        robot=robot or Unicycle(), objective=objective or GoalDistance(), rules=rules or Rules()
-    )
+    return Task(robot=robot or Unicycle(), objective=objective or GoalDistance(), rules=rules or Rules())
 
 
 def certain(traversability: torch.Tensor) -> TraversabilityMixture:

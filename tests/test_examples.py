@@ -38,8 +38,9 @@ def test_a_model_of_ones_own_beats_a_constant_and_the_oracle_beats_both(tmp_path
 def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:
     """Runs `benchnav-eval run` with two jobs, as a user does, and gives the rows."""
     command = [
-        Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle", "--instances", "2",
-        "--scenarios", "[std]", "--recorded", "0", "--jobs", "2", "--out", "run", "--time_budget_s", "60",
+        Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle",
+        "--instances", "2", "--scenarios", "[std]", "--recorded", "0", "--jobs", "2", "--out", "run",
+        "--time_budget_s", "60",
     ]  # fmt: skip
     done = subprocess.run(
         [*map(str, command), *flags], cwd=folder, capture_output=True, text=True, timeout=300

@@ -277,6 +277,16 @@ def test_a_part_is_made_with_its_options(file: str) -> None:
     assert make("robot", f"{file}:robot") == "robot"
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("0.5", 0.5), ("1e-3", 0.001), ("3", 3), ("true", True), ("far", "far")]
+)
+def test_a_value_for_an_option_without_a_type_is_what_it_looks_like(text: str, value: object) -> None:
+    register("risk", "untyped", lambda mixture, share=0.25: share)
+    found = make("risk", f"untyped:{text}")(None)
+    assert found == value
+    assert type(found) is type(value)
+
+
 def test_what_a_part_is_made_for_is_given_where_it_is_asked_for(file: str) -> None:
     made = make("objective", f"{file}:NeedsRobot:0.2", robot="the robot")
     assert (made.robot, made.margin_m) == ("the robot", 0.2)

@@ -54,8 +54,7 @@ def list_command(kinds: list[str]) -> None:
     """
     from benchnav.eval.catalogue import print_catalogue
 
-    for kind in kinds or ("",):
-        print_catalogue(kind)
+    print_catalogue(*kinds)
 
 
 def report(folder: str) -> None:

@@ -58,10 +58,24 @@ def drive_straight(instance: int) -> tuple[float, float, float]:
     direction, place, met = (goal - start) / np.linalg.norm(goal - start), start, []
     while np.linalg.norm(goal - place) >= 1:
         column, row = (place // 0.5).astype(int)
-        mean, std = (float(t[0, row, column]) for t in (terrain.traversability_mean, terrain.traversability_std))
+        mean, std = (
+            float(t[0, row, column]) for t in (terrain.traversability_mean, terrain.traversability_std)
+        )
         met.append(float(np.clip(mean + std * luck[len(met)], 0, 1)))
         place = place + 0.1 * met[-1] * direction
     return 0.1 * len(met), 0.1 * sum(met), float(np.mean(met))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["std", "hg", "hs"])
+def test_astar_dwa_never_stalls_under_any_risk_setting(scenario: str, tmp_path: Path) -> None:
+    suite = Suite(planners=("astar_dwa",), scenarios=(scenario,), recorded=0)
+    for _ in run_suite(suite, tmp_path / "run", jobs=2):
+        pass
+    rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
+    assert len(rows) == 4 * 20
+    assert not rows["outcome"].isin(["stalled", "planner_failure", "planner_error"]).any()
+    assert rows.groupby("risk")["success"].sum().min() >= 19
 
 
 def test_the_shipped_maps_are_sound_and_of_the_recipe() -> None:

@@ -9,7 +9,8 @@ from benchnav.errors import ConfigError
 from benchnav.eval.run.unit import Extent
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
-from benchnav.models.predictor import class_mismatch
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.predictor import class_mismatch, find_checkpoint
 from benchnav.planning.planners.planner import check_steers
 
 Say = Callable[[str], None]
@@ -51,7 +52,7 @@ def check_suite(
     if jobs > 1:
         _check_everywhere(trials)
     for trial in _distinct(trials, ("model",)):
-        model = trial.make_model()
+        model = _class_table(trial)
         for data in {other.data for other in trials if other.model == trial.model and not other.blind}:
             _tell(say, class_mismatch(model, datasets[data], f"model {trial.model.label}"))
     for line in dict.fromkeys(line for trial in trials for line in _doubts(trial, datasets[trial.data])):
@@ -64,6 +65,14 @@ def check_suite(
         )
         wanted[trial.id] = (trial, extent)
     return wanted, datasets
+
+
+def _class_table(trial: Trial) -> Any:
+    """What knows the class table of a trial's model, which is thereby tried: its checkpoint where it has one."""
+    model = trial.make_model()
+    if ":" in trial.model.part or trial.model.part in registry.names("model"):
+        return model
+    return load_checkpoint(find_checkpoint(trial.model.part))
 
 
 def _check_split(trial: Trial, known: list[str], dataset: TerrainDataset, instances: int) -> None:

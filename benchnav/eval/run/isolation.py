@@ -80,9 +80,9 @@ class IsolatedPlanner:
                 f"The planner's process ended in `{what}` with status {self._child.exitcode}."
             ) from error
         if kind == "raised":
-            error = ChildError(value.strip().splitlines()[-1])
-            error.add_note(value)
-            raise error
+            raised = ChildError(value.strip().splitlines()[-1])
+            raised.add_note(value)
+            raise raised
         return value
 
 

@@ -17,6 +17,7 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.eval.run.unit import Extent
 from benchnav.eval.trial import PART_KINDS, Trial
 from benchnav.models.predictor import model_identity
+from benchnav.sources import digest_of
 
 PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch", "rerun-sdk")
 
@@ -27,8 +28,9 @@ def describe_code() -> dict[str, Any]:
     """What rows depend on beside their trial: sources, versions, arithmetic of the processor."""
     package = Path(benchnav.__file__).parent
     files = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".yaml"))
+    named = ((path.relative_to(package).as_posix().encode(), path.read_bytes()) for path in files)
     return {
-        "sources": registry.digest_of(path.read_bytes() for path in files),
+        "sources": digest_of(item for pair in named for item in pair),
         "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         "processor": torch.backends.cpu.get_cpu_capability(),
     }
@@ -103,7 +105,7 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
 
 def _map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:
     digests = dataset.entry_digests(split, range(count))
-    return [registry.digest_of([entry.tobytes()])[:16] for entry in digests]
+    return [digest_of([entry.tobytes()])[:16] for entry in digests]
 
 
 def command_lines(earlier: Iterable[str]) -> list[str]:

@@ -22,7 +22,7 @@ class AStarDWAConfig(GuideConfig):
 
 
 class AStarDWA(Guided[DWAState]):
-    """A* + DWA as a planner.
+    """A* gives way-points to the dynamic window approach.
 
     Args:
         config: settings.

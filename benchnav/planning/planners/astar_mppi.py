@@ -22,7 +22,7 @@ class AStarMPPIConfig(GuideConfig):
 
 
 class AStarMPPI(Guided[MPPIState]):
-    """A* + MPPI as a planner.
+    """A* gives way-points to model predictive path integral control.
 
     Args:
         config: settings.

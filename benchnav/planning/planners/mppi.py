@@ -84,7 +84,7 @@ class MPPIState:
 
 
 class MPPI:
-    """MPPI as a planner to the goal, and as a local planner to way-points.
+    """Model predictive path integral control: sampled action sequences, weighed by their cost.
 
     Args:
         config: settings.

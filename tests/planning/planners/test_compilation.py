@@ -1,5 +1,6 @@
 import logging
 import sys
+from functools import partial
 from typing import Any
 
 import pytest
@@ -43,7 +44,9 @@ def test_what_is_worth_compiling_depends_on_samples_and_device_alone() -> None:
     assert worth_compiling(10, torch.device("cuda"))
 
 
-def test_more_shapes_than_pytorch_allows_stay_compiled() -> None:
+def test_more_shapes_than_pytorch_allows_stay_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The limit is the tracer's, so that no C++ need be compiled.
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     limit = torch._dynamo.config.recompile_limit
     fused = Fused(scaled, MANY)
     assert fused.compiled is None
@@ -150,7 +153,7 @@ class Doubtful:
     """An objective that looks at a number, which nothing compiled can do."""
 
     def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
-        return traversability * float(state.sum())
+        return traversability if state.sum() > 0 else 2 * traversability
 
     def terminal(self, state, traversability, target):  # type: ignore[no-untyped-def]
         return traversability

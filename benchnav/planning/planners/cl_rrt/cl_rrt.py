@@ -128,7 +128,7 @@ class CLRRTState:
 
 
 class CLRRT:
-    """CL-RRT as a planner.
+    """A tree of closed-loop simulations, and the controller on its quickest branch.
 
     Args:
         config: settings.
@@ -143,7 +143,10 @@ class CLRRT:
 
     def remarks(self, robot: Robot) -> tuple[str, ...]:
         """Notes for tables; see `Planner`."""
-        asked_m, used_m = self.config.follower.lookahead_m, PathFollower(self.config.follower, robot).lookahead_m
+        asked_m, used_m = (
+            self.config.follower.lookahead_m,
+            PathFollower(self.config.follower, robot).lookahead_m,
+        )
         if used_m <= asked_m:
             return ()
         return (f"looks {used_m:g} m ahead, as far as the robot drives while its turn rate builds up",)
