@@ -1,6 +1,7 @@
 """Every example runs as a user runs it, and does what it says."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -85,9 +86,7 @@ def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_pa
 @pytest.mark.parametrize("name", ["own_planner.py", "own_risk.py", "own_robot.py"])
 def test_the_command_in_an_examples_docstring_names_what_is_there(name: str) -> None:
     text = (EXAMPLES / name).read_text()
-    for word in (
-        text.split('"""')[1].replace("'", " ").replace(",", " ").replace("[", " ").replace("]", " ").split()
-    ):
-        if ".py:" in word:
-            file, _, part = word.strip("`").partition(":")
-            assert f" {part}" in (EXAMPLES.parent / file).read_text()
+    named = re.findall(r"(examples/\w+\.py):(\w+)", text.split('"""')[1])
+    assert named
+    for file, part in named:
+        assert re.search(rf"^(class|def) {part}\b", (EXAMPLES.parent / file).read_text(), re.MULTILINE)

@@ -1,5 +1,6 @@
 """The registry: each form of a name, options and their types, what is said of mistakes, and digests."""
 
+import contextlib
 import importlib
 import os
 import subprocess
@@ -504,13 +505,17 @@ def test_workers_find_parts_of_files_and_modules(
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(package))
     texts = ["./mine.py:Planner:3", "plugged.parts:Planner:3", "plugged:3"]
-    made = Parallel(n_jobs=2)(delayed(_reach)(text, os.getpid()) for text in texts)
+    # Workers may be older than this test: they are told where names of files and packages begin.
+    here = Path.cwd()
+    made = Parallel(n_jobs=2)(delayed(_reach)(text, os.getpid(), here, package) for text in texts)
     assert made == [3.0, 3.0, 3.0]
 
 
-def _reach(text: str, parent: int) -> float:
+def _reach(text: str, parent: int, here: Path, package: Path) -> float:
     assert os.getpid() != parent
-    return float(make("planner", text).config.reach_m)
+    sys.path.insert(0, str(package))
+    with contextlib.chdir(here):
+        return float(make("planner", text).config.reach_m)
 
 
 def test_the_registry_is_light_to_import() -> None:

@@ -1,6 +1,7 @@
 """The command `benchnav-eval`: run suites, list parts, report on runs, replay episodes."""
 
 import os
+import shlex
 import sys
 from pathlib import Path
 
@@ -75,6 +76,10 @@ def replay(
     risk: str = "",
     scenario: str = "",
     model: str = "",
+    robot: str = "",
+    objective: str = "",
+    world: str = "",
+    data: str = "",
     seed: int = -1,
     realisation: int = 0,
     instance: int = 0,
@@ -88,6 +93,10 @@ def replay(
         risk: Risk setting.
         scenario: Scenario.
         model: Model.
+        robot: Robot.
+        objective: Objective.
+        world: World.
+        data: Dataset.
         seed: Root seed; the run's first when not given.
         realisation: Draw of the world's luck.
         instance: Instance of the scenario.
@@ -97,7 +106,10 @@ def replay(
 
     from benchnav.eval.recorder import record_episode
 
-    labels = {"planner": planner, "risk": risk, "scenario": scenario, "model": model}
+    labels = {
+        **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
+        **{"robot": robot, "objective": objective, "world": world, "data": data},
+    }
     asked = {name: label for name, label in labels.items() if label}
     path = record_episode(Path(folder), asked, seed if seed >= 0 else None, realisation, instance)
     print(f"recording: {path}")
@@ -123,13 +135,14 @@ def _print(folder: Path) -> None:
 
 def _print_replay(folder: Path) -> None:
     from benchnav.eval.run.folder import open_run
+    from benchnav.eval.trial import NOT_USED
 
-    trials = [trial for trial, _ in open_run(folder).trials.values()]
-    labels = trials[-1].labels
-    asked = f"--planner {labels['planner']} --scenario {labels['scenario']}"
-    if not trials[-1].blind:
-        asked += f" --risk {labels['risk']}"
-    print(f"replay:  {_program('benchnav-eval')} replay {folder} {asked}")
+    every = [trial.labels for trial, _ in open_run(folder).trials.values()]
+    words = ["replay", str(folder)]
+    for name, label in every[-1].items():
+        if label != NOT_USED and (name in ("planner", "scenario") or len({one[name] for one in every}) > 1):
+            words += [f"--{name}", label]
+    print(f"replay:  {_program('benchnav-eval')} {shlex.join(words)}")
 
 
 def _failed(folder: Path) -> int:

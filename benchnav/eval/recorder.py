@@ -57,16 +57,16 @@ class Recorder:
         return Recording(
             about=about,
             grid=problem.grid,
-            rgb=problem.observation.rgb[member].numpy(),
-            elevation_m=problem.elevation_m[member].numpy(),
-            predicted=problem.risk_map[member].numpy(),
-            free=problem.free[member].numpy(),
-            goal_m=problem.goal_m[member].numpy(),
+            rgb=problem.observation.rgb[member].cpu().numpy(),
+            elevation_m=problem.elevation_m[member].cpu().numpy(),
+            predicted=problem.risk_map[member].cpu().numpy(),
+            free=problem.free[member].cpu().numpy(),
+            goal_m=problem.goal_m[member].cpu().numpy(),
             dt_s=problem.dt_s,
             action_names=problem.robot.action_names,
-            states=episodes.states[member, : steps + 1].numpy(),
-            actions=episodes.actions[member, :steps].numpy(),
-            traversability=episodes.traversability[member, :steps].numpy(),
+            states=episodes.states[member, : steps + 1].cpu().numpy(),
+            actions=episodes.actions[member, :steps].cpu().numpy(),
+            traversability=episodes.traversability[member, :steps].cpu().numpy(),
             plans=self._plans[member],
         )
 
@@ -126,7 +126,7 @@ def _find(folder: Path, labels: Mapping[str, str], seed: int | None, realisation
     asked += [f"realisation {realisation}", f"instance {instance}"] + (
         [] if seed is None else [f"seed {seed}"]
     )
-    columns = ("planner", "risk", "scenario", "model")
+    columns = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
     there = {name: list(dict.fromkeys(t.labels[name] for t, _ in run.trials.values())) for name in columns}
     raise ConfigError(
         f"Expected an episode of the run, got {', '.join(asked)}. "

@@ -19,8 +19,9 @@ import joblib
 from benchnav.errors import ConfigError
 from benchnav.eval.recorder import Recorder
 from benchnav.eval.run import provenance
+from benchnav.eval.run.changes import changed_options
 from benchnav.eval.run.check import check_suite
-from benchnav.eval.run.episode import build, one_thread, read_block, simulate
+from benchnav.eval.run.episode import PredictionError, build, one_thread, read_block, simulate
 from benchnav.eval.run.folder import (
     FORMAT,
     FORMAT_VERSION,
@@ -30,11 +31,10 @@ from benchnav.eval.run.folder import (
     open_run,
     write_unit,
 )
-from benchnav.eval.run.rollout import one_line
 from benchnav.eval.run.rows import episode_rows, error_rows, step_columns
 from benchnav.eval.run.unit import Extent, Unit, in_table_order, units
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import Trial
+from benchnav.eval.trial import Trial, check_labels
 from benchnav.files import sole_writer, write_text
 
 Trials = dict[str, tuple[Trial, Extent]]
@@ -63,12 +63,12 @@ def run_suite(
         DatasetError: the dataset lacks what the suite asks for.
     """
     with sole_writer(folder, str(folder)):
-        wanted, datasets = check_suite(suite, jobs, say)
+        wanted = check_suite(suite, jobs > 1 or planner_limit_s > 0, say)
         if overwrite:
             _drop(folder)
-        run_id, trials = _begin(suite, folder, wanted, datasets, say)
+        run_id, trials = _begin(suite, folder, wanted, planner_limit_s, say)
         every = units(trials, suite.recorded)
-        missing = [unit for unit in every if about_unit(folder, unit) is None]
+        missing = [unit for unit in every if about_unit(folder, unit, run_id) is None]
         done = len(every) - len(missing)
         if done:
             say(f"{done} of {len(every)} units were there already")
@@ -76,7 +76,8 @@ def run_suite(
         for _ in _run_all(missing, folder, run_id, jobs, planner_limit_s):
             done += 1
             yield done, len(every)
-        merge_tables(folder, in_table_order(every, trials))
+        _check_unchanged(folder)
+        merge_tables(folder, in_table_order(every, trials), run_id)
 
 
 def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0) -> None:
@@ -92,9 +93,9 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
     with one_thread():
         try:
             problem, simulation = build(unit, run_id)
-        except Exception as error:
-            about |= {"traceback": traceback.format_exc(), "errors": [one_line(error)]}
-            rows = error_rows(unit, unit.trial.world.time_budget_s, one_line(error))
+        except PredictionError as error:
+            about |= {"traceback": traceback.format_exc(), "errors": [str(error)]}
+            rows = error_rows(unit, unit.trial.world.time_budget_s, str(error))
             write_unit(folder, unit, rows, [], about)
             return
         recorder = Recorder(unit, problem)
@@ -113,10 +114,13 @@ def _run_all(
     # Workers may be older than this call, so that they are told where names of files begin.
     here, target = Path.cwd(), folder.resolve()
     calls = (joblib.delayed(_run_at)(here, unit, target, run_id, planner_limit_s) for unit in missing)
-    with warnings.catch_warnings():
-        # A worker whose memory has grown is replaced; that is no concern of a user's.
-        warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-        yield from joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
+    finished = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
+    for _ in missing:
+        with warnings.catch_warnings():
+            # A worker whose memory has grown is replaced; that is no concern of a user's.
+            warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
+            next(finished)
+        yield
 
 
 def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: float) -> None:
@@ -125,7 +129,7 @@ def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: 
 
 
 def _drop(folder: Path) -> None:
-    if folder.exists():
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         open_run(folder)  # Only what is a run folder may be dropped.
         dropped = folder.with_name(f".{folder.name}.{os.getpid()}.dropped")
         os.replace(folder, dropped)
@@ -133,7 +137,7 @@ def _drop(folder: Path) -> None:
 
 
 def _begin(
-    suite: Suite, folder: Path, wanted: Trials, datasets: Any, say: Callable[[str], None]
+    suite: Suite, folder: Path, wanted: Trials, planner_limit_s: float, say: Callable[[str], None]
 ) -> tuple[str, Trials]:
     """Writes `run.json`, or extends the one that is there; gives the run's id and all its trials."""
     if not (folder / RUN).exists():
@@ -141,9 +145,9 @@ def _begin(
             raise ConfigError(
                 f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
             )
-        run_id = secrets.token_hex(8)
-        _write_about(folder, run_id, suite, wanted, datasets, [])
-        return run_id, wanted
+        about = _about(secrets.token_hex(8), suite, wanted, planner_limit_s, [])
+        write_text(folder / RUN, json.dumps(about, indent=1))
+        return about["run_id"], wanted
     earlier = open_run(folder)
     if earlier.version < FORMAT_VERSION:
         raise ConfigError(
@@ -151,7 +155,8 @@ def _begin(
             f"{earlier.version}, which can be reported and not gone on with. Choose another `out`."
         )
     trials = _joined(earlier.trials, wanted)
-    now = _about(earlier.about["run_id"], suite, trials, datasets, earlier.about["commands"])
+    check_labels(trial for trial, _ in trials.values())
+    now = _about(earlier.about["run_id"], suite, trials, planner_limit_s, earlier.about["commands"])
     changed = provenance.differences(earlier.about, now)
     if changed:
         raise ConfigError(
@@ -161,7 +166,7 @@ def _begin(
     if trials != earlier.trials:
         new = len(trials) - len(earlier.trials)
         say(f"{folder} is extended: {new} new trials" if new else f"{folder} is extended by more episodes")
-        _write_about(folder, now["run_id"], suite, trials, datasets, earlier.about["commands"])
+        write_text(folder / RUN, json.dumps(now, indent=1))
     return now["run_id"], trials
 
 
@@ -174,14 +179,22 @@ def _joined(earlier: Trials, wanted: Trials) -> Trials:
     return joined
 
 
-def _write_about(
-    folder: Path, run_id: str, suite: Suite, trials: Trials, datasets: Any, commands: list[str]
-) -> None:
-    about = _about(run_id, suite, trials, datasets, commands)
-    write_text(folder / RUN, json.dumps(about, indent=1))
+def _check_unchanged(folder: Path) -> None:
+    """Refuses to make one table of rows of which some may be of other code than others."""
+    run = open_run(folder)
+    about = run.about
+    now = {**about, **provenance.describe(run.trials)}
+    changed = provenance.differences(about, json.loads(json.dumps(now)))
+    if changed:
+        raise ConfigError(
+            f"While {folder} was running these changed: {'; '.join(changed)}. Its rows may be of either. "
+            "Run it again with --overwrite."
+        )
 
 
-def _about(run_id: str, suite: Suite, trials: Trials, datasets: Any, commands: list[str]) -> dict[str, Any]:
+def _about(
+    run_id: str, suite: Suite, trials: Trials, planner_limit_s: float, commands: list[str]
+) -> dict[str, Any]:
     entries = {
         trial_id: {"value": trial.value, "labels": trial.labels, **_notes(trial), **extent.to_dict()}
         for trial_id, (trial, extent) in trials.items()
@@ -192,9 +205,8 @@ def _about(run_id: str, suite: Suite, trials: Trials, datasets: Any, commands: l
         "run_id": run_id,
         "suite": suite.to_dict(),
         "trials": entries,
-        "datasets": provenance.describe_maps(trials, datasets),
-        "parts": provenance.describe_parts(trials),
-        "code": provenance.describe_code(),
+        "planner_limit_s": planner_limit_s,
+        **provenance.describe(trials),
         "machine": provenance.describe_machine(),
         "commands": provenance.command_lines(commands),
     }
@@ -208,4 +220,5 @@ def _notes(trial: Trial) -> dict[str, Any]:
     return {
         "follows": str(getattr(planner, "follows", "J")),
         "remarks": list(remarks(trial.make_task().robot)) if remarks else [],
+        "changed": changed_options(trial.planner),
     }

@@ -8,7 +8,7 @@ is run, and belong to the suite.
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -144,23 +144,35 @@ def trials_of(suite: Suite, scenarios_of: Any) -> list[Trial]:
     Raises:
         ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
     """
+    _check_options_used(suite)
     found: dict[str, Trial] = {}
-    labels: dict[tuple[str, str], Any] = {}
     for product in suite.trials or ({},):
         here: set[str] = set()
         for trial in _product(suite, product, scenarios_of):
-            for name, label in trial.labels.items():
-                value = _labelled(trial, name)
-                if labels.setdefault((name, label), value) != value and label != NOT_USED:
-                    raise ConfigError(
-                        f"Expected a label for each {name}, got two settings that are both called {label!r}. "
-                        f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
-                    )
             if trial.id in here and not trial.blind:
                 raise ConfigError(f"Expected settings that differ, got twice what {_words(trial)} is.")
             here.add(trial.id)
-            found.setdefault(trial.id, trial)
+            if found.setdefault(trial.id, trial).labels != trial.labels:
+                raise ConfigError(f"Expected one label for one setting, got two for what {_words(trial)} is.")
+    check_labels(found.values())
     return list(found.values())
+
+
+def check_labels(trials: Iterable[Trial]) -> None:
+    """Refuses two settings under one label, which no reader of a table could tell apart.
+
+    Raises:
+        ConfigError: there are such.
+    """
+    known: dict[tuple[str, str], Any] = {}
+    for trial in trials:
+        for name, label in trial.labels.items():
+            value = _labelled(trial, name)
+            if known.setdefault((name, label), value) != value and label != NOT_USED:
+                raise ConfigError(
+                    f"Expected a label for each {name}, got two settings that are both called {label!r}. "
+                    f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
+                )
 
 
 def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Iterator[Trial]:
@@ -185,7 +197,6 @@ def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Ite
         "objective": chosen("objectives", suite.objectives),
     }
     ready = {kind: [_part(kind, part, suite) for part in listed] for kind, listed in parts.items()}
-    _check_options_used(suite, ready["planner"])
     worlds = [
         _world(suite, world, task)
         for world in chosen("world", (suite.world,))
@@ -221,26 +232,26 @@ def read_model(given: Any) -> Part:
     """
     from benchnav.models.predictor import find_checkpoint, load_model
 
-    asked = {"part": given} if isinstance(given, str) else dict(given)
-    source = str(asked.get("part", ""))
-    if source in registry.names("model") or ":" in source:
-        part = registry.read_part("model", given)
+    part = registry.read_part("model", given)
+    if part.part in registry.names("model") or ":" in part.part:
         if hasattr(registry.find("model", part.part).target, "from_checkpoint"):
-            load_model(source)  # says what to name in place of a family
+            load_model(part)  # says what to name in place of a family
         return registry.complete("model", part)
-    find_checkpoint(source)
-    if asked.get("options"):
-        raise ConfigError(f"Expected no options for the checkpoint {source!r}, got {asked['options']}.")
-    label = str(asked.get("label", Path(source).name))
-    return Part(part=source, label=label)
+    find_checkpoint(part.part)
+    if part.options:
+        raise ConfigError(f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
+    return replace(part, label=Path(part.part).name) if part.label == part.part else part
 
 
-def _check_options_used(suite: Suite, planners: Sequence[Part]) -> None:
-    if suite.trials:
-        return  # a product may leave a planner out
+def _check_options_used(suite: Suite) -> None:
+    """Refuses options of planners that no product names, such as a mistyped one."""
+    listed: list[Any] = []
+    for product in suite.trials or ({},):
+        given = next((product[key] for key in ("planners", "planner") if key in product), suite.planners)
+        listed += given if isinstance(given, list | tuple) else [given]
+    known = list(dict.fromkeys(registry.read_part("planner", part).part for part in listed))
     for name in suite.planner_options:
-        if name not in {part.part for part in planners}:
-            known = [part.part for part in planners]
+        if name not in known:
             raise ConfigError(
                 f"Expected `planner_options` of planners of the suite, {', '.join(known)}, got {name!r}."
                 f"{registry.hint(name, known)}"
@@ -248,6 +259,9 @@ def _check_options_used(suite: Suite, planners: Sequence[Part]) -> None:
 
 
 def _world(suite: Suite, world: Any, task: Any) -> tuple[World, Rules, str]:
+    for where, value in (("world", world), ("task", task)):
+        if not isinstance(value, Mapping) and not (where == "world" and isinstance(value, str)):
+            raise ConfigError(f"Expected `{where}` as a mapping of settings, got {value!r}.")
     given = {"preset": world} if isinstance(world, str) else dict(world)
     name = given.pop("preset", "paper")
     if name not in PRESETS:

@@ -1,5 +1,6 @@
 """Planners, models and risk measures that tests name as `tests.eval.parts:Name`."""
 
+import inspect
 import time
 import uuid
 from pathlib import Path
@@ -9,6 +10,7 @@ import torch
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
 from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Unicycle
 
 
 class Spy:
@@ -73,12 +75,30 @@ class Faulty:
             action = action[:, :1]
         if self.fault == "raise":
             raise RuntimeError("no way on")
+        if self.fault == "exit":
+            raise SystemExit(0)
         if self.fault == "hang":
             time.sleep(600)
         if self.fault == "give up":
             failed = torch.full((batch,), int(PlanStatus.FAILED))
             return action, plan_state, Plan.empty(batch, status=failed)
         return action, plan_state, Plan.empty(batch)
+
+
+class Picky(Faulty):
+    """Can be made until a unit has begun, which a file tells."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__()
+        if any(line.function == "simulate" for line in inspect.stack()):
+            raise OSError(f"not here: {log}")
+
+
+class Rusty(Unicycle):
+    """A robot whose F fails where it drives fast."""
+
+    def __call__(self, state, action, traversability):  # type: ignore[no-untyped-def]
+        raise ValueError("seized")
 
 
 class Gaussian:

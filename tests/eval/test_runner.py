@@ -159,6 +159,7 @@ def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_p
         ({"models": ("oracle", "tests.eval.parts:Gaussian")}, 8, 16, 4),
         ({"seeds": (0, 5)}, 4, 16, 4),
         ({"seed": 5}, 4, 16, 4),
+        ({"seed": 5, "instances": 1}, 4, 12, 4),
         ({"realisations": 3}, 4, 24, 4),
         ({"scenarios": ("hg",)}, 6, 12, 4),
         ({"noise": "stored"}, 8, 16, 4),
@@ -178,7 +179,7 @@ def test_a_run_is_extended_by_what_is_missing(
     # What was there and what came make the rows of a run that had all at once.
     fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
     fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
-    if "scenarios" not in change and "noise" not in change:
+    if not {"scenarios", "noise", "instances"} & set(change):
         same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
 
 
@@ -191,6 +192,56 @@ def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
         sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
     assert sizes == [(20, 1), (22, 2), (23, 2), (23, 2)]
     same(rows, finish(replace(suite, instances=0), tmp_path / "fresh"))
+
+
+def test_a_run_is_extended_by_another_dataset(dataset_path: Path, tmp_path: Path) -> None:
+    finish(quick(dataset_path, scenarios=("std",), risks=("mean",)), tmp_path / "run")
+    other = factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    rows = finish(quick(other, scenarios=("std",), risks=("mean",)), tmp_path / "run")
+    assert rows.groupby("data").size().to_dict() == {str(dataset_path): 2, str(other): 2}
+    assert len(open_run(tmp_path / "run").about["datasets"]) == 2
+
+
+def test_an_extension_under_a_label_that_is_taken_is_refused(dataset_path: Path, tmp_path: Path) -> None:
+    finish(quick(dataset_path, scenarios=("std",)), tmp_path / "run")
+    late = {"part": "tests.eval.parts:Faulty", "options": {"after_s": 2.0}}
+    with pytest.raises(ConfigError, match="both called 'Faulty'"):
+        finish(quick(dataset_path, scenarios=("std",), planners=(late,)), tmp_path / "run")
+
+
+def test_code_that_changes_while_a_run_goes_on_makes_no_table(dataset_path: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    suite = quick(dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",))
+    steps = run_suite(suite, tmp_path / "run")
+    next(steps)
+    mine.write_text(mine.read_text() + "# edited\n")
+    with pytest.raises(ConfigError, match=r"While .* running these changed: .*mine\.py"):
+        list(steps)
+    assert not (tmp_path / "run" / "episodes.parquet").exists()
+
+
+def test_a_unit_of_another_run_does_not_count(dataset_path: Path, tmp_path: Path) -> None:
+    suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
+    for name in ("one", "two"):
+        finish(suite, tmp_path / name)
+    (unit,) = (path.relative_to(tmp_path / "one") for path in (tmp_path / "one").glob("units/*/*"))
+    shutil.copy(tmp_path / "one" / unit, tmp_path / "two" / unit)
+    said: list[str] = []
+    finish(suite, tmp_path / "two", say=said.append)
+    assert said == []  # nothing was there: the unit was run anew
+
+
+def test_a_run_with_another_time_limit_or_compiler_is_refused(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
+    finish(suite, tmp_path / "run")
+    with pytest.raises(ConfigError, match="planner_limit_s"):
+        finish(suite, tmp_path / "run", planner_limit_s=9.0)
+    monkeypatch.setattr(provenance, "can_compile", lambda: None)
+    with pytest.raises(ConfigError, match="compiles"):
+        finish(suite, tmp_path / "run")
 
 
 def test_a_run_of_other_code_or_data_is_refused_and_what_changed_is_named(
@@ -310,6 +361,13 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
+        ({"robots": ("tests.eval.parts:Faulty",)}, "without dt_s"),
+        ({"planners": ("benchnav.planning.robots:Unicycle",)}, "without init"),
+        ({"objectives": ("benchnav.planning.robots:Unicycle",)}, "without stage"),
+        ({"trials": ({"task": 3},)}, "mapping"),
+        ({"trials": ({"planners": []},)}, "at least one trial"),
+        ({"trials": ({"planners": "mppi"},), "planner_options": {"mpi": {"samples": 8}}}, "planner_options"),
+        ({"model": {"part": "paper-v1", "lable": "mine"}}, "lable"),
     ):
         for place in (tmp_path / "run", tmp_path / "new"):
             with pytest.raises(BenchnavError, match=expected):
@@ -326,8 +384,9 @@ def test_parts_of_this_process_alone_are_refused_for_workers(
     registry.register("planner", "mine", Faulty)
     suite = quick(dataset_path, planners=("mine",))
     assert len(finish(suite, tmp_path / "run")) == 8
-    with pytest.raises(ConfigError, match="jobs"):
-        finish(suite, tmp_path / "two", jobs=2)
+    for options in ({"jobs": 2}, {"planner_limit_s": 9.0}):
+        with pytest.raises(ConfigError, match="jobs"):
+            finish(suite, tmp_path / "two", **options)
 
 
 def test_what_a_user_should_know_is_said(dataset_path: Path, tmp_path: Path) -> None:

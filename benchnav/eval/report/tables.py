@@ -8,9 +8,8 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.stats.intervals import LABELS
+from benchnav.eval.trial import NOT_USED
 from benchnav.planning.world.outcome import FAILURES
-
-NOT_USED = "–"
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
@@ -108,7 +107,7 @@ def _notes(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> tu
     marks = []
     for trial in summary["trial"]:
         about = trials[trial]
-        texts = [f"follows {about['follows']}"] if about["follows"] not in _USERS_OWN else []
+        texts = [f"objective: {about['follows']}"] if about["follows"] not in _USERS_OWN else []
         own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]
         marks.append(",".join(_raised(number) for number in own))
     return marks, [f"{_raised(number)} {text}" for text, number in numbers.items()]

@@ -40,9 +40,19 @@ def convert_about(about: Mapping[str, Any], episodes: pd.DataFrame) -> dict[str,
     world = _world(about)
     value = {"world": {"noise": world["noise"], "time_budget_s": world["time_budget_s"]}}
     remark = "0.1 called every robot that stood still stuck, also where it did not drive"
-    trial = {"value": value, "labels": {"world": world["label"]}, "follows": "", "remarks": [remark]}
-    trial["seeds"] = [about["suite"]["seed"]]
-    return {"trials": dict.fromkeys(episodes["trial"].unique(), trial), "commands": [about["command"]]}
+    options = about["suite"]["planner_options"]
+    trials = {
+        trial: {
+            "value": value,
+            "labels": {"world": world["label"], "planner": planner},
+            "follows": "",
+            "remarks": [remark],
+            "changed": [f"{name} = {setting}" for name, setting in options.get(planner, {}).items()],
+            "seeds": [about["suite"]["seed"]],
+        }
+        for trial, planner in episodes[["trial", "planner"]].drop_duplicates().itertuples(index=False)
+    }
+    return {"trials": trials, "commands": [about["command"]]}
 
 
 def _world(about: Mapping[str, Any]) -> dict[str, Any]:

@@ -114,14 +114,10 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     lines.append(f"Data: {_list(summary['data'])}. Models: {_list(summary['model'])}. Seeds: {_list(seeds)}.")
     if summary["n_episodes"].nunique() == summary["n_maps"].nunique() == 1:
         lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {summary['n_maps'][0]} maps.")
-    options = [
-        f"{planner} {name} = {value}"
-        for planner, given in about["suite"].get("planner_options", {}).items()
-        for name, value in given.items()
-    ]
-    if options:
-        lines.append(f"Planner options: {', '.join(options)}.")
-    return lines
+    options = dict.fromkeys(
+        f"{trial['labels']['planner']} {change}" for trial in trials for change in trial.get("changed", ())
+    )
+    return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
 
 
 def _world(value: Mapping[str, Any]) -> str:

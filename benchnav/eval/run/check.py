@@ -5,29 +5,42 @@ from typing import Any
 
 from benchnav import registry
 from benchnav.datagen.store import TerrainDataset, find_dataset
-from benchnav.errors import ConfigError
+from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.unit import Extent
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint
+from benchnav.options import one_line
 from benchnav.planning.planners.planner import check_steers
 
 Say = Callable[[str], None]
 
+_MEMBERS = {
+    "planner": ("init", "plan"),
+    "robot": (
+        "dt_s",
+        "action_names",
+        "action_low",
+        "action_high",
+        "top_speed_mps",
+        "initial_state",
+        "__call__",
+    ),
+    "objective": ("stage", "terminal"),
+}
 
-def check_suite(
-    suite: Suite, jobs: int, say: Say
-) -> tuple[dict[str, tuple[Trial, Extent]], dict[str, TerrainDataset]]:
+
+def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Trial, Extent]]:
     """Makes the trials of a suite and refuses what cannot be run.
 
     Args:
         suite: what is evaluated.
-        jobs: worker processes.
+        elsewhere: parts are made in other processes.
         say: is told what is worth knowing, a line at a time.
 
     Returns:
-        The trials by id, with how often each is to be run; the datasets by path or id.
+        The trials by id, with how often each is to be run.
 
     Raises:
         ConfigError: a part, scenario, instance or combination cannot be had.
@@ -41,15 +54,20 @@ def check_suite(
         return [name.removeprefix("test/") for name in datasets[data].splits if name.startswith("test/")]
 
     trials = trials_of(suite, scenarios_of)
+    if not trials:
+        raise ConfigError(
+            f"Expected a suite with at least one trial, got none; data has {scenarios_of(suite.data)}."
+        )
     for trial in trials:
         _check_split(trial, scenarios_of(trial.data), datasets[trial.data], suite.instances)
     for trial in _distinct(trials, ("planner", "robot", "objective")):
+        _check_members(trial)
         check_steers(trial.make_planner(), trial.make_task().robot, trial.planner.label)
         _check_first_plan(trial)
     for trial in trials:
         trial.world.steps(trial.make_task().robot.dt_s)
         trial.make_risk()
-    if jobs > 1:
+    if elsewhere:
         _check_everywhere(trials)
     for trial in _distinct(trials, ("model",)):
         model = _class_table(trial)
@@ -60,11 +78,9 @@ def check_suite(
     wanted = {}
     for trial in trials:
         there = datasets[trial.data].map_count(trial.split)
-        extent = Extent(
-            seeds=suite.all_seeds, realisations=suite.realisations, instances=suite.instances or there
-        )
+        extent = Extent.product(suite.all_seeds, suite.realisations, suite.instances or there)
         wanted[trial.id] = (trial, extent)
-    return wanted, datasets
+    return wanted
 
 
 def _class_table(trial: Trial) -> Any:
@@ -89,6 +105,19 @@ def _check_split(trial: Trial, known: list[str], dataset: TerrainDataset, instan
         )
 
 
+def _check_members(trial: Trial) -> None:
+    """Refuses a part that stands in the place of another kind."""
+    task = trial.make_task()
+    made = {"planner": trial.make_planner(), "robot": task.robot, "objective": task.objective}
+    for kind, names in _MEMBERS.items():
+        missing = [name for name in names if not hasattr(made[kind], name)]
+        if missing:
+            raise ConfigError(
+                f"Expected {kind} {getattr(trial, kind).part!r} with {', '.join(names)}, got "
+                f"{type(made[kind]).__name__} without {', '.join(missing)}."
+            )
+
+
 def _check_first_plan(trial: Trial) -> None:
     """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
     if not registry.find("planner", trial.planner.part).shipped:
@@ -104,8 +133,16 @@ def _check_first_plan(trial: Trial) -> None:
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
     places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
-    problem = pose_problem(trial.make_task(), seen, mixture, ground, *places, 1.0)
-    trial.make_planner().init(problem, torch.Generator())
+    try:
+        problem = pose_problem(trial.make_task(), seen, mixture, ground, *places, 1.0)
+        trial.make_planner().init(problem, torch.Generator())
+    except BenchnavError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f"Planner {trial.planner.label!r} cannot be prepared for robot {trial.robot.label!r} and objective "
+            f"{trial.objective.label!r}: {one_line(error)}"
+        ) from error
 
 
 def _check_everywhere(trials: list[Trial]) -> None:
@@ -115,8 +152,9 @@ def _check_everywhere(trials: list[Trial]) -> None:
             known = kind != "model" or source in registry.names("model") or ":" in source
             if known and not registry.find(kind, source).everywhere:
                 raise ConfigError(
-                    f"Expected {kind} {source!r} to be found by other processes, since `jobs` > 1, but it is "
-                    "registered in this one alone. Name it as path/to/file.py:Name."
+                    f"Expected {kind} {source!r} to be found by other processes, which `jobs` > 1 and "
+                    "`planner_limit_s` need, but it is registered in this one alone. Name it as "
+                    "path/to/file.py:Name."
                 )
 
 

@@ -5,7 +5,7 @@ of its block that a process runs one after another.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,13 +16,15 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.errors import BenchnavError
 from benchnav.eval.run.isolation import IsolatedPlanner
-from benchnav.eval.run.rollout import Episodes, Watcher, run_episodes
+from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
 from benchnav.eval.run.unit import Unit
 from benchnav.eval.trial import Trial
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import predict
 from benchnav.planning import risk
+from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.world.simulation import Simulation
 from benchnav.terrain import Terrain
@@ -50,6 +52,10 @@ def read_block(unit: Unit, run_id: str) -> Block:
     return _block(run_id, unit.trial.data, unit.trial.split, unit.instances)
 
 
+class PredictionError(BenchnavError):
+    """A model or a risk measure raised; the cause says what."""
+
+
 def build(unit: Unit, run_id: str) -> tuple[Problem, Simulation]:
     """Makes the problem and the simulation of a unit.
 
@@ -58,16 +64,21 @@ def build(unit: Unit, run_id: str) -> tuple[Problem, Simulation]:
         run_id: predictions are kept for one run alone.
 
     Raises:
-        Exception: whatever the model or the risk measure raises.
+        PredictionError: the model or the risk measure failed.
+        BenchnavError: the data cannot be read, or are not enough for the world.
     """
     trial = unit.trial
     block, task = read_block(unit, run_id), trial.make_task()
-    mixture = _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances)
+    try:
+        mixture = _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances)
+        risk_map = risk.apply(trial.make_risk(), mixture)
+    except (Exception, SystemExit) as error:
+        raise PredictionError(fault(error)) from error
     problem = pose_problem(
         task,
         block.terrain.observe(),
         mixture,
-        risk.apply(trial.make_risk(), mixture),
+        risk_map,
         block.start_m,
         block.goal_m,
         trial.world.time_budget_s,
@@ -101,12 +112,31 @@ def simulate(
 ) -> tuple[Episodes, bool]:
     """Runs a unit's episodes; gives what happened, and whether the planner ran compiled."""
     trial = unit.trial
-    isolated = IsolatedPlanner(trial, planner_limit_s) if planner_limit_s else None
-    with isolated or nullcontext():
-        planner = isolated or trial.make_planner()
+    planner: Any
+    with ExitStack() as stack:
+        try:
+            if planner_limit_s:
+                planner = stack.enter_context(IsolatedPlanner(trial, planner_limit_s))
+            else:
+                planner = trial.make_planner()
+        except (Exception, SystemExit) as error:
+            planner = _Unmade(error)
         generator = planner_generator(unit)
         episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every)
     return episodes, bool(getattr(planner, "compiled", False))
+
+
+class _Unmade:
+    """Stands for a planner that could not be made: it fails in each unit as one that raises."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+    def init(self, problem: Problem, generator: torch.Generator) -> None:
+        raise self.error
+
+    def plan(self, step: Step, plan_state: None) -> tuple[Tensor, None, Plan]:
+        raise self.error
 
 
 @contextmanager

@@ -116,19 +116,28 @@ def write_unit(
         pq.write_table(table, partial)
 
 
-def about_unit(folder: Path, unit: Unit) -> dict[str, Any] | None:
-    """What is known of a unit; None where it is not finished for the instances it now has."""
+def about_unit(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
+    """What is known of a unit; None where this run has not finished it for the instances it now has."""
     try:
         metadata = pq.read_schema(folder / unit.path).metadata or {}
     except (OSError, ValueError):
         return None
     about = json.loads(metadata.get(_METADATA, b"{}"))
-    return about if about.get("instances") == list(unit.instances) else None
+    own = about.get("run_id") == run_id and about.get("instances") == list(unit.instances)
+    return about if own else None
 
 
-def merge_tables(folder: Path, finished: Iterable[Unit]) -> None:
-    """Writes `episodes.parquet` and `steps.parquet` of all units, a unit at a time, and `errors.txt`."""
+def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
+    """Writes `episodes.parquet` and `steps.parquet` of all units, a unit at a time, and `errors.txt`.
+
+    Raises:
+        ConfigError: a unit is missing, or of another run.
+    """
     finished = list(finished)
+    abouts = [about_unit(folder, unit, run_id) for unit in finished]
+    for unit, about in zip(finished, abouts, strict=True):
+        if about is None:
+            raise ConfigError(f"{folder / unit.path} is not of this run. Run the same command again.")
     schemas = [pq.read_schema(folder / unit.path) for unit in finished]
     names = dict.fromkeys(name for schema in schemas for name in schema.names)
     layers = [name.removeprefix(_STEP_COLUMN) for name in names if name.startswith(_STEP_COLUMN)]
@@ -136,7 +145,9 @@ def merge_tables(folder: Path, finished: Iterable[Unit]) -> None:
     layers = [name for name in layers if name != "traversability"] + ["traversability"]
     _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
     _merge(folder / STEPS, (_step_table(folder, unit, layers) for unit in finished))
-    traces = [text for unit in finished if (text := _trace(folder, unit))]
+    traces = [
+        text for unit, about in zip(finished, abouts, strict=True) if about and (text := _trace(unit, about))
+    ]
     if traces:
         write_text(folder / ERRORS, "\n".join(traces))
     else:
@@ -177,8 +188,7 @@ def _step_table(folder: Path, unit: Unit, layers: Sequence[str]) -> pa.Table:
     return pa.table(columns)
 
 
-def _trace(folder: Path, unit: Unit) -> str:
-    about = about_unit(folder, unit) or {}
+def _trace(unit: Unit, about: dict[str, Any]) -> str:
     if not about.get("traceback") and not about.get("errors"):
         return ""
     labels = ", ".join(f"{name} {label}" for name, label in unit.trial.labels.items())

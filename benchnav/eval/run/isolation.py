@@ -16,7 +16,7 @@ from benchnav.eval.trial import Trial
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
 
-# Starting a process and importing PyTorch is not the planner's time.
+# Starting a process, importing PyTorch and compiling are not the planner's time.
 _START_S = 120.0
 
 
@@ -29,7 +29,7 @@ class IsolatedPlanner:
 
     Args:
         trial: whose planner.
-        limit_s: time limit of each call.
+        limit_s: time limit of each call; `init` and the first `plan` have two minutes more, to compile.
     """
 
     def __init__(self, trial: Trial, limit_s: float) -> None:
@@ -41,7 +41,11 @@ class IsolatedPlanner:
         self._child = context.Process(target=_serve, args=(there, trial), daemon=True)
         self._child.start()
         there.close()
-        self._answer("start", _START_S)
+        try:
+            self._answer("start", _START_S)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __enter__(self) -> "IsolatedPlanner":
         """Ends the child at the end."""
@@ -56,13 +60,15 @@ class IsolatedPlanner:
     def init(self, problem: Problem, generator: torch.Generator) -> int:
         """See `Planner`. The plan state stays in the child; here it is the number of calls."""
         self._send(("init", problem, generator.initial_seed(), generator.get_state()))
-        self._answer("init", self.limit_s)
+        self._answer("init", self.limit_s + _START_S)
         return 0
 
     def plan(self, step: Step, plan_state: int) -> tuple[torch.Tensor, int, Plan]:
         """See `Planner`."""
         self._send(("plan", step))
-        action, plan, self.compiled = self._answer("plan", self.limit_s)
+        # The first call may compile.
+        limit_s = self.limit_s if plan_state else self.limit_s + _START_S
+        action, plan, self.compiled = self._answer("plan", limit_s)
         return action, plan_state + 1, plan
 
     def _send(self, message: Any) -> None:
@@ -99,7 +105,7 @@ def _serve(connection: Connection, trial: Trial) -> None:
         trial.make_task()
         planner = trial.make_planner()
         connection.send_bytes(pickle.dumps(("started", None)))
-    except Exception:
+    except (Exception, SystemExit):
         connection.send_bytes(pickle.dumps(("raised", traceback.format_exc())))
         return
     while True:
@@ -119,6 +125,6 @@ def _serve(connection: Connection, trial: Trial) -> None:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, getattr(planner, "compiled", None)
             text = pickle.dumps(("answer", answer))
-        except Exception:
+        except (Exception, SystemExit):
             text = pickle.dumps(("raised", traceback.format_exc()))
         connection.send_bytes(text)

@@ -13,13 +13,14 @@ import torch
 
 import benchnav
 from benchnav import registry
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.eval.run.unit import Extent
 from benchnav.eval.trial import PART_KINDS, Trial
 from benchnav.models.predictor import model_identity
+from benchnav.planning.planners.compilation import can_compile
 from benchnav.sources import digest_of
 
-PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch", "rerun-sdk")
+PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
 
 Trials = Mapping[str, tuple[Trial, Extent]]
 
@@ -33,6 +34,7 @@ def describe_code() -> dict[str, Any]:
         "sources": digest_of(item for pair in named for item in pair),
         "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
         "processor": torch.backends.cpu.get_cpu_capability(),
+        "compiles": can_compile(),
     }
 
 
@@ -46,12 +48,22 @@ def describe_command() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def describe_maps(trials: Trials, datasets: Mapping[str, TerrainDataset]) -> dict[str, Any]:
+def describe(trials: Trials) -> dict[str, Any]:
+    """All that rows depend on beside the trials themselves."""
+    return {
+        "datasets": describe_maps(trials),
+        "parts": describe_parts(trials),
+        "code": describe_code(),
+    }
+
+
+def describe_maps(trials: Trials) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map."""
     used: dict[str, dict[str, int]] = {}
     for trial, extent in trials.values():
         splits = used.setdefault(trial.data, {})
         splits[trial.split] = max(extent.instances, splits.get(trial.split, 0))
+    datasets = {data: TerrainDataset(find_dataset(data)) for data in used}
     return {
         data: {
             "id": datasets[data].id,
@@ -89,8 +101,11 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         for name, before in earlier["code"]["versions"].items()
         if before != now["code"]["versions"].get(name)
     ]
-    if earlier["code"]["processor"] != now["code"]["processor"]:
-        changed.append(f"processor ({earlier['code']['processor']} to {now['code']['processor']})")
+    for name in ("processor", "compiles"):
+        if earlier["code"][name] != now["code"][name]:
+            changed.append(f"{name} ({earlier['code'][name]} to {now['code'][name]})")
+    if earlier["planner_limit_s"] != now["planner_limit_s"]:
+        changed.append(f"planner_limit_s ({earlier['planner_limit_s']:g} to {now['planner_limit_s']:g})")
     changed += [
         name for name, identity in earlier["parts"].items() if now["parts"].get(name, identity) != identity
     ]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import BenchnavError
+from benchnav.options import one_line
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import act, begin
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
@@ -138,18 +139,35 @@ def run_episodes(
             log.blame(now.running & answer.faulty, answer.reason)
             now = end(now, answer.faulty, Outcome.PLANNER_ERROR)
             now = end(now, answer.plan.status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
-            free = simulation.unhindered(now, answer.action)
             before = now.state
-            now, felt = simulation.step(now, answer.action)
+            now, felt, free = _move(simulation, now, answer.action)
             log.add(before, now, answer.action, felt, free)
-    except Exception as error:
+    except RobotError:
+        raise
+    except (Exception, SystemExit) as error:
         trace = traceback.format_exc()
-        log.blame(now.running, one_line(error))
+        log.blame(now.running, fault(error))
         now = end(now, now.running, Outcome.PLANNER_ERROR)
     return log.episodes(now, len(problem.robot.action_low), planning_s, trace)
 
 
-def one_line(error: BaseException) -> str:
+class RobotError(BenchnavError):
+    """A robot's F raised in the simulation; no planner is to blame, and no row would mean anything."""
+
+
+def _move(
+    simulation: Simulation, now: SimulationState, action: Tensor
+) -> tuple[SimulationState, Tensor, Tensor]:
+    """The next states, the λ met, and where the action would have led on ground of λ = 1."""
+    try:
+        free = simulation.unhindered(now, action)
+        return *simulation.step(now, action), free
+    except Exception as error:
+        robot = type(simulation.robot).__name__
+        raise RobotError(f"Robot {robot} failed in the simulation: {fault(error)}") from error
+
+
+def fault(error: BaseException) -> str:
     """An error as one line; our own errors speak for themselves."""
     text = " ".join(str(error).split())
-    return text if isinstance(error, BenchnavError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, BenchnavError) else one_line(error)

@@ -76,9 +76,6 @@ def episode_rows(
 
 def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
     """Rows of episodes that could not begin, since their model or risk measure failed."""
-    nothing = dict.fromkeys(
-        ("traversability", "reference_time_s", "time_ratio", "path_length_m", "stuck_share"), np.nan
-    )
     rows = [
         {
             "trial": unit.trial.id,
@@ -90,8 +87,12 @@ def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
             "success": False,
             "total_time_s": time_budget_s,
             "end_time_s": 0.0,
-            **nothing,
+            "traversability": np.nan,
+            "reference_time_s": np.nan,
+            "time_ratio": np.nan,
             "score": 0.0,
+            "path_length_m": np.nan,
+            "stuck_share": np.nan,
             "roughness_radps2": np.nan,
             "planning_ms": np.nan,
             "compiled": False,
@@ -99,10 +100,7 @@ def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
         }
         for instance in unit.instances
     ]
-    columns = ["trial", *unit.trial.labels, "seed", "realisation", "instance", "outcome", "success"]
-    columns += ["total_time_s", "end_time_s", "traversability", "reference_time_s", "time_ratio", "score"]
-    columns += ["path_length_m", "stuck_share", "roughness_radps2", "planning_ms", "compiled", "error"]
-    return pd.DataFrame(rows)[columns]
+    return pd.DataFrame(rows)
 
 
 def step_columns(problem: Problem, episodes: Episodes) -> list[dict[str, np.ndarray]]:

@@ -1,7 +1,7 @@
 """Units of work: a trial's block of instances under one seed and realisation, run as one batch."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +15,42 @@ class Extent:
     """How often a trial is run.
 
     Args:
-        seeds: root seeds.
-        realisations: draws of the world's luck for each seed.
-        instances: the first so many of the split.
+        draws: (seed, realisation, instances): under each seed and draw of the world's luck the first so
+            many instances of the split.
     """
 
-    seeds: tuple[int, ...]
-    realisations: int
-    instances: int
+    draws: tuple[tuple[int, int, int], ...]
+
+    @classmethod
+    def product(cls, seeds: Iterable[int], realisations: int, instances: int) -> "Extent":
+        """The same instances under every seed and realisation."""
+        return cls(draws=tuple((seed, r, instances) for seed in seeds for r in range(realisations)))
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Root seeds."""
+        return tuple(dict.fromkeys(seed for seed, _, _ in self.draws))
+
+    @property
+    def instances(self) -> int:
+        """The most instances that any draw has."""
+        return max(instances for _, _, instances in self.draws)
 
     def union(self, other: "Extent") -> "Extent":
-        """The least extent that holds both."""
-        return Extent(
-            seeds=tuple(dict.fromkeys((*self.seeds, *other.seeds))),
-            realisations=max(self.realisations, other.realisations),
-            instances=max(self.instances, other.instances),
-        )
+        """What is in either, and no more."""
+        most: dict[tuple[int, int], int] = {}
+        for seed, realisation, instances in (*self.draws, *other.draws):
+            most[seed, realisation] = max(instances, most.get((seed, realisation), 0))
+        return Extent(draws=tuple((*key, instances) for key, instances in most.items()))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return asdict(self) | {"seeds": list(self.seeds)}
+        return {"seeds": list(self.seeds), "draws": [list(draw) for draw in self.draws]}
 
     @classmethod
     def from_dict(cls, about: Mapping[str, Any]) -> "Extent":
         """Reads what `to_dict` gave; other keys are left alone."""
-        return cls(
-            seeds=tuple(about["seeds"]), realisations=about["realisations"], instances=about["instances"]
-        )
+        return cls(draws=tuple((seed, realisation, count) for seed, realisation, count in about["draws"]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,11 +122,10 @@ def in_table_order(made: Iterable[Unit], trials: Mapping[str, Any]) -> list[Unit
 
 
 def _blocks(trial: Trial, extent: Extent) -> Iterator[Unit]:
-    for seed in extent.seeds:
-        for realisation in range(extent.realisations):
-            for start in range(0, extent.instances, BLOCK_INSTANCES):
-                block = tuple(range(start, min(start + BLOCK_INSTANCES, extent.instances)))
-                yield Unit(trial=trial, seed=seed, realisation=realisation, instances=block)
+    for seed, realisation, instances in extent.draws:
+        for start in range(0, instances, BLOCK_INSTANCES):
+            block = tuple(range(start, min(start + BLOCK_INSTANCES, instances)))
+            yield Unit(trial=trial, seed=seed, realisation=realisation, instances=block)
 
 
 def _first_of_each_planner(every: Iterable[Unit]) -> Iterator[Unit]:

@@ -10,6 +10,8 @@ bits and much in speed.
 """
 
 import logging
+import os
+import shutil
 import sys
 from collections.abc import Callable
 from typing import Generic, ParamSpec, TypeVar
@@ -23,6 +25,12 @@ R = TypeVar("R")
 _WORTH_ROLLOUTS = 40_000
 # Episodes that are taken to run in parallel, however many do.
 _EPISODES = 20
+
+
+def can_compile() -> bool:
+    """Tells whether anything is compiled here: PyTorch's switch is not off, and there is a C++ compiler."""
+    compilers = (os.environ.get("CXX", ""), "g++", "clang++")
+    return not torch._dynamo.config.disable and any(shutil.which(name) for name in compilers if name)
 
 
 def worth_compiling(samples: int, device: torch.device) -> bool:

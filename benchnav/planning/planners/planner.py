@@ -91,7 +91,10 @@ class Planner(Protocol[State]):
     - `steers`: tuples of action names; a robot of other actions is refused before anything runs. Without
       it any robot is accepted.
     - `follows`: whose objective it follows, for tables, where it is not the user's J alone.
-    - `blind`: true where it looks at nothing predicted, so that one run stands for every model and risk.
+    - `blind`: on the class, true where it looks at nothing predicted, so that one run stands for every
+      model and risk setting.
+    - `remarks(robot)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
+    - `compiled`: whether it runs compiled; None before its first plan.
     """
 
     def init(self, problem: Problem, generator: torch.Generator) -> State:

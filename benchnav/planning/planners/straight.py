@@ -53,7 +53,7 @@ class Straight:
     """The blind baseline: full speed straight at the goal, whatever the ground is."""
 
     steers = STEERS
-    follows = "nothing: drives straight at the goal"
+    follows = "none, drives straight at the goal"
     blind = True
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:

@@ -84,7 +84,8 @@ class Simulation:
             Where they stand next, and the λ that each robot met, shape [B].
         """
         traversability = self._realisation.at(now.state, now.step)
-        moved = self.robot(now.state, action.clamp(self._low, self._high), traversability)
+        # A robot of a user's may write into what it is given.
+        moved = self.robot(now.state.clone(), action.clamp(self._low, self._high), traversability)
         state = torch.where(now.running[:, None], moved, now.state)
         step = now.step + now.running
         arrived = distance(state, self._goal_m) < self._goal_radius_m
@@ -97,7 +98,7 @@ class Simulation:
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
         """Where an action would take the robots on ground of λ = 1, shape [B, S]; what was commanded."""
         action = action.clamp(self._low, self._high)
-        return self.robot(now.state, action, torch.ones_like(now.state[:, 0]))
+        return self.robot(now.state.clone(), action, torch.ones_like(now.state[:, 0]))
 
     def exchange(self, members: Tensor, others: "Simulation") -> "Simulation":
         """Gives some episodes the maps, goals and luck of another simulation; the rest keep theirs.

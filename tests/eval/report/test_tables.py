@@ -31,7 +31,7 @@ def test_golden_table() -> None:
         "| std | mppi | cvar | 100 | 34–100 | 25.0 ± 7.1 | 25.0 ± 7.1 | 70.0 ± 0.0 | – |\n"
         "| std | cl_rrt¹,² | mean | 50 | 9–91 | 70.0 ± 42.4 | 40.0 | 70.0 ± 28.3 | 1 stuck |\n"
         "| std | straight | – | 0 | 0–66 | 100.0 ± 0.0 | – | 80.0 (n = 1) | 1 out of bounds, 1 planner failure |\n"
-        "\n¹ follows its own time\n"
+        "\n¹ objective: its own time\n"
         "\n² limits 0.5 m/s²\n"
     )
 
@@ -84,7 +84,7 @@ def test_notes_are_numbered_once_and_marked_at_every_trial_they_hold_for() -> No
     shared = {"follows": "path length", "remarks": []}
     table = table_of(episodes, a=shared, b=shared | {"remarks": ["slow"]})
     assert [row[1] for row in table.rows] == ["mppi", "mppi", "a¹", "a¹", "b¹,²", "b¹,²"]
-    assert table.notes == ("¹ follows path length", "² slow")
+    assert table.notes == ("¹ objective: path length", "² slow")
 
 
 @pytest.mark.parametrize("follows", ["", "J"])

@@ -33,8 +33,7 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         name: about
         | {
             "value": {"data": "paper-v1", "split": "test/std", **parts, **made.PAPER},
-            "realisations": 1,
-            "instances": 2,
+            "draws": [[0, 0, 2], [7, 0, 2]],
         }
         for name, about in known.items()
     }
@@ -60,7 +59,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "- World paper: noise resampled, T = 100 s, free where the risk map is above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each trial: 4 episodes on 2 maps.",
-        "¹ follows its own time",
+        "¹ objective: its own time",
         "    benchnav-eval run --seeds '[0,7]'",
     ):
         assert line in text.splitlines()
@@ -73,9 +72,14 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
 
 
 def test_options_of_planners_stand_in_the_header(tmp_path: Path) -> None:
-    suite = {"planner_options": {"mppi": {"samples": 64, "horizon": 20}}}
-    folder = run_folder(tmp_path / "run", episodes(), suite=suite)
-    assert "Planner options: mppi samples = 64, mppi horizon = 20." in read_report(folder).header
+    folder = run_folder(tmp_path / "run", episodes())
+    about = json.loads((folder / "run.json").read_text())
+    for trial in about["trials"].values():
+        if trial["labels"]["planner"] == "cl_rrt":
+            trial["changed"] = ["expansions = 64", "follower.speed_mps = 0.5"]
+    (folder / "run.json").write_text(json.dumps(about))
+    line = "Planner options: cl_rrt expansions = 64, cl_rrt follower.speed_mps = 0.5."
+    assert line in read_report(folder).header
 
 
 def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
@@ -119,7 +123,7 @@ def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     printed = capsys.readouterr().out
     assert printed.startswith("World paper: noise resampled, T = 100 s")
     assert "T if success [s]" in printed
-    assert "¹ follows its own time" in printed
+    assert "¹ objective: its own time" in printed
 
 
 def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:

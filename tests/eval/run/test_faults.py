@@ -5,6 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from benchnav.errors import BenchnavError
 from benchnav.eval.run.folder import ERRORS
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
@@ -90,6 +91,31 @@ def test_a_planner_that_raises_at_the_beginning_leaves_rows_without_measures(
     assert rows[["traversability", "path_length_m", "stuck_share", "roughness_radps2"]].isna().all(axis=None)
     assert rows["end_time_s"].tolist() == [0, 0]
     assert rows["total_time_s"].tolist() == [30.0, 30.0]
+
+
+@pytest.mark.parametrize("limit_s", [0.0, 60.0])
+def test_a_planner_that_exits_is_a_fault_like_any_other(
+    limit_s: float, dataset_path: Path, tmp_path: Path
+) -> None:
+    rows = run(dataset_path, tmp_path / "run", "exit", limit_s=limit_s)
+    assert rows["outcome"].tolist() == ["planner_error"] * 2
+    assert all("SystemExit" in error for error in rows["error"])
+
+
+def test_a_robot_that_fails_in_the_simulation_ends_the_run_and_blames_no_planner(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(BenchnavError, match="Robot Rusty failed in the simulation: ValueError: seized"):
+        run(dataset_path, tmp_path / "run", "none", robots=("tests.eval.parts:Rusty",))
+
+
+def test_a_planner_that_is_made_here_and_not_in_a_unit_ends_its_own_units(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picky = {"part": "tests.eval.parts:Picky", "options": {"log": str(tmp_path / "seen")}}
+    rows = run(dataset_path, tmp_path / "run", "none", planners=(picky, "straight"))
+    assert set(rows[rows["planner"] == "Picky"]["outcome"]) == {"planner_error"}
+    assert rows[rows["planner"] == "straight"]["success"].all()
 
 
 def test_a_planner_that_gives_up_is_no_fault(dataset_path: Path, tmp_path: Path) -> None:
