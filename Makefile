@@ -25,7 +25,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $(STAMP)
 
 demo: $(STAMP)
-	$(BIN)/benchnav-eval run --config benchnav/eval/suites/demo.yaml --out runs/demo --jobs $(JOBS)
+	$(BIN)/benchnav-eval run --config demo --out runs/demo --jobs $(JOBS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS)

@@ -126,6 +126,8 @@ def settings() -> dict[str, Any]:
 
 
 def test_no_setting_of_pytorch_is_left_changed() -> None:
+    notices = logging.getLogger("torch.utils.cpp_extension")
+    notices.setLevel(logging.DEBUG)
     before = settings()
     during: list[dict[str, Any]] = []
 
@@ -141,7 +143,9 @@ def test_no_setting_of_pytorch_is_left_changed() -> None:
     fused(torch.zeros(1))
     assert during[0]["limits"] == (sys.maxsize, sys.maxsize)
     assert during[0]["flags"] == (True, False)
+    assert during[0]["notices"] == logging.ERROR
     assert settings() == before
+    notices.setLevel(logging.NOTSET)
 
 
 # --- In MPPI.

@@ -41,6 +41,22 @@ def test_it_turns_to_the_nearer_side_and_slows() -> None:
     assert steered(3.0, 1 + math.cos(-3.0), 2 + math.sin(-3.0))[1] > 0
 
 
+def test_it_slows_at_the_target() -> None:
+    assert steered(0.0, 1.1, 2.0)[0] == pytest.approx(0.2)
+    assert steered(0.0, 1.6, 2.0)[0] == 1.0
+
+
+@pytest.mark.parametrize("limit", [0.4, 1.0])
+def test_a_robot_of_limited_acceleration_does_not_turn_too_far(limit: float) -> None:
+    robot = DifferentialDrive(turn_acceleration_radps2=limit)
+    state = robot.initial_state(torch.tensor([[0.0, 0.0, 0.0]]))
+    target = torch.tensor([[-30.0, 40.0]])
+    for _ in range(100):
+        state = robot(state, steer_toward(state, target, robot), torch.ones(1))
+        assert state[0, 2] < math.atan2(40 - state[0, 1], -30 - state[0, 0]) + 0.1
+    assert (state[0, :2] - target[0]).norm() < 48
+
+
 def test_a_robot_that_steers_drives_while_it_turns() -> None:
     speed, steering = steered(0.0, -5.0, 2.5, BICYCLE)
     assert speed == pytest.approx(0.3)

@@ -253,8 +253,8 @@ class CLRRT:
 
     def _search(self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor) -> Route:
         """Grows trees from root states [M, S] of some episodes and takes the best path of each."""
-        config = self.config
-        loop = self._closed_loop(now.problem.select(members), failures)
+        config, everyone = self.config, len(members) == len(now.problem)
+        loop = self._closed_loop(now.problem if everyone else now.problem.select(members), failures)
         tracking = map_tensors(lambda values: values[members], now.tracking)
         key = rng.stream_key(now.seed, "cl_rrt", now.step)
         draws = rng.uniform(key, np.zeros(1, dtype=np.int64), (config.rounds, config.expansions_per_round, 3))

@@ -138,14 +138,22 @@ def test_closed_wall_is_tried_in_vain_and_then_crossed() -> None:
 
 
 @pytest.mark.parametrize("most_failures", [1, 3])
-def test_plans_in_vain_before_a_wall_is_crossed(most_failures: int) -> None:
+def test_plans_in_vain_before_a_wall_is_crossed_and_tries_at_a_free_way_afterwards(
+    most_failures: int,
+) -> None:
     blocked = torch.full((1, *GRID.shape), 0.1)
     blocked[:, 15:17, 5:7] = 0.8  # too small for a partial path
     problem = make_problem(blocked)
-    config = replace(SMALL, most_failures=most_failures, turning_radius_m=0.2)
-    _, _, plans = drive(problem, 10, config)
-    without = [bool(plan.path.isnan().all()) for plan in plans]
+    config = replace(SMALL, expansions=100, most_failures=most_failures, turning_radius_m=0.2)
+    planner, plan_state = begin(problem, config)
+    without, failures = [], []
+    for _ in range(10):
+        _, plan_state, plan = planner.plan(at(problem.start), plan_state)
+        without.append(bool(plan.path.isnan().all()))
+        failures.append(int(plan_state.failures))
     assert without == most_failures * [True] + (10 - most_failures) * [False]
+    tries = list(range(1, most_failures + 1))
+    assert failures == (tries + [0] + tries + 10 * [most_failures])[:10]
 
 
 def test_of_two_episodes_one_may_cross_and_the_other_not() -> None:

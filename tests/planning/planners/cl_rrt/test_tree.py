@@ -183,6 +183,17 @@ def test_partial_route_leads_nearest_to_the_goal_and_is_left_before_its_end() ->
     assert best_route(loop, extended(loop, planted(loop), [0], [(3.4, 8.0)]), 4).depth.tolist() == [0]
 
 
+def test_partial_route_rather_leads_to_free_ground_than_nearer_to_the_goal() -> None:
+    maps = open_map()
+    maps[:, 12:20, 4:16] = 0.1  # about the start, to x = 8 m
+    loop = make_loop(maps)
+    tree = extended(loop, planted(loop), [0, 0], [(7.0, 8.0), (4.0, 11.0)])
+    assert tree.at.free.tolist() == [[False, False, True]]
+    assert tree.to_goal_m[0, 1] < tree.to_goal_m[0, 2]
+    end = known(best_route(loop, tree, 4).path[0])[-1]
+    torch.testing.assert_close(end, tree.at.state[0, 2, :2])
+
+
 def test_best_route_is_a_question_that_changes_nothing() -> None:
     loop = make_loop(walled_map())
     tree = extended(loop, planted(loop), [0, 0], [(5.0, 8.0), (4.5, 8.0)])
