@@ -73,6 +73,7 @@ def test_every_setting_reaches_its_place() -> None:
     assert (trial.rules.slowest, trial.rules.goal_radius_m) == (0.05, 2.0)
     assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 30.0)
     assert trial.make_task().robot.dt_s == 0.2
+    assert trial.make_task().rules == trial.rules
     assert trial.make_planner().after_s == 3.0
     assert (
         trial.world_label
