@@ -73,5 +73,9 @@ def permutation(key: int, indices: np.ndarray, n: int) -> np.ndarray:
 
 
 def generator(key: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """Makes a PyTorch generator for the stream `key` on `device`, for bulk draws of planners."""
+    """Makes a PyTorch generator for the stream `key` on `device`, for bulk draws of planners.
+
+    PyTorch's generator on the CPU keeps the low 32 bits of a seed: hash a key for every draw, as
+    `stream_key` does, rather than count on from one.
+    """
     return torch.Generator(device=device).manual_seed(key % 2**63)
