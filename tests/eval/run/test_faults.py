@@ -77,6 +77,7 @@ def test_episodes_that_had_ended_keep_their_outcome(
     rows = run(dataset_path, tmp_path / "run", "raise", planners=(faulty,))
     assert sorted(rows["outcome"]) == ["planner_error", "success"]
     kept = rows[rows["success"]].iloc[0]
+    assert kept["error"] == ""
     pd.testing.assert_series_equal(kept[MEASURES], sound.loc[kept.name, MEASURES])
     trace = (tmp_path / "run" / ERRORS).read_text()
     assert "Traceback" in trace
