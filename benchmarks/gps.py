@@ -87,9 +87,8 @@ def distributions(table: SlopeTable, terrain: Terrain) -> tuple[TraversabilityMi
     """Predicted and true distribution of λ in each cell, its class known."""
     own = terrain.class_id.unsqueeze(1)
     mean, std = (values.gather(1, own).double() for values in table.lookup(terrain.slope_deg))
-    truth = (v.unsqueeze(1).double() for v in (terrain.traversability_mean, terrain.traversability_std))
-    one = torch.ones_like(mean)
-    return TraversabilityMixture(one, mean, std), TraversabilityMixture(one, *truth)
+    truth = (v.double() for v in (terrain.truth.weights, terrain.truth.means, terrain.truth.stds))
+    return TraversabilityMixture(torch.ones_like(mean), mean, std), TraversabilityMixture(*truth)
 
 
 def errors(table: SlopeTable, dataset: TerrainDataset) -> tuple[list[float], list[float]]:

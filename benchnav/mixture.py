@@ -15,13 +15,22 @@ The last form is flat in v at the VaR (it is a maximum over v), so the error of 
 squared. The root is bisected a fixed number of times: no step waits for the worst cell, or for the
 device, and the error is bounded whatever the parameters. Arithmetic is in float64 whatever their dtype.
 
+The expected time over the ground, in units of its time at λ = 1, is for a least speed ε
+
+    E[1 / max(λ, ε)] = 1 + ∫_ε^1 F(x) / x² dx = Σ_k w_k (1 + ∫_ε^1 Φ((x − m_k) / s_k) / x² dx),
+
+where each integrand is 0 well below m_k and 1 / x² well above, and is integrated in between by
+Gauss-Legendre quadrature over log x.
+
 Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional
 value-at-risk". Letters in shapes: K components, H×W cells, *B any leading dimensions.
 """
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +38,8 @@ from benchnav.errors import ConfigError
 
 _SMALLEST_STD = 1e-9
 _BISECTIONS = 30  # leave an error of at most 2⁻³¹ < 1e-9
+_REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
+_QUADRATURE_NODES = 24
 
 
 @dataclass(frozen=True)
@@ -39,14 +50,17 @@ class TraversabilityMixture:
         weights: probability of each component, summing to 1 over K, shape [*B, K, H, W].
         means: component means before clipping, shape [*B, K, H, W].
         stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
+        group: the terrain class that each component belongs to, K of them; None where components are
+            no classes.
 
     Raises:
-        ConfigError: the shapes differ or have fewer than three dimensions.
+        ConfigError: the shapes differ or have fewer than three dimensions, or `group` has another length.
     """
 
     weights: Tensor
     means: Tensor
     stds: Tensor
+    group: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         """Checks the shapes."""
@@ -54,6 +68,11 @@ class TraversabilityMixture:
             raise ConfigError(
                 "Expected `weights`, `means` and `stds` of one shape [*B, K, H, W], got "
                 f"{list(self.weights.shape)}, {list(self.means.shape)} and {list(self.stds.shape)}."
+            )
+        if self.group is not None and len(self.group) != self.weights.shape[-3]:
+            raise ConfigError(
+                f"Expected `group` to name the class of each of {self.weights.shape[-3]} components, "
+                f"got {len(self.group)}."
             )
 
     def cdf(self, value: Tensor | float) -> Tensor:
@@ -98,6 +117,66 @@ class TraversabilityMixture:
         shortfall = self._integrated_cdf(value) - self._integrated_cdf(torch.zeros_like(value))
         return (value - shortfall / tail).clamp(min=0).minimum(value).to(self.weights.dtype)
 
+    def chance(self, value: float) -> Tensor:
+        """P(λ ≥ value), shape [*B, H, W].
+
+        Args:
+            value: traversability in [0, 1].
+        """
+        if value <= 0:
+            return torch.ones_like(self.weights.select(-3, 0))
+        below = self._uncensored_cdf(torch.tensor(value, dtype=torch.float64, device=self.weights.device))
+        return (1 - below).clamp(0, 1).to(self.weights.dtype)
+
+    def harmonic_mean(self, floor: float) -> Tensor:
+        """1 / E[1 / max(λ, floor)]: the speed, as a share, that gives the expected time over the ground.
+
+        Args:
+            floor: ε in (0, 1], least speed.
+
+        Returns:
+            In [floor, 1], at most the mean of max(λ, floor); shape [*B, H, W].
+        """
+        if not 0 < floor <= 1:
+            raise ConfigError(f"Expected a least speed in (0, 1], got {floor}.")
+        weights, means, stds = self._parameters()
+        # Beyond [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x² is known.
+        low = (means - _REACH * stds).clamp(floor, 1)
+        high = (means + _REACH * stds).clamp(floor, 1)
+        start, span = low.log(), high.log() - low.log()
+        time = 1 + (1 / high - 1)
+        for node, share in _legendre():
+            log_x = start + span * node
+            time = time + share * span * _probability((log_x.exp() - means) / stds) * torch.exp(-log_x)
+        return (1 / (weights * time).sum(-3)).clamp(floor, 1).to(self.weights.dtype)
+
+    def from_normal(self, normal: Tensor) -> Tensor:
+        """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1).
+
+        A field of correlated standard normals gives a field of λ with each cell's own distribution
+        (a Gaussian copula).
+
+        Args:
+            normal: z, shape [*B, H, W].
+
+        Returns:
+            λ in [0, 1], shape [*B, H, W].
+        """
+        if self.weights.shape[-3] == 1:
+            return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
+        return self._value_at_risk(_probability(normal.double())).to(self.weights.dtype)
+
+    def select(self, members: Tensor) -> "TraversabilityMixture":
+        """Keeps some maps of the first dimension, by index, shape [M]."""
+        return TraversabilityMixture(
+            self.weights[members], self.means[members], self.stds[members], self.group
+        )
+
+    def to(self, device: torch.device | str) -> "TraversabilityMixture":
+        """The mixture on a device."""
+        parameters = (values.to(device) for values in (self.weights, self.means, self.stds))
+        return TraversabilityMixture(*parameters, self.group)
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1); log probability mass at 0 and at 1; −∞ elsewhere.
 
@@ -139,10 +218,31 @@ class TraversabilityMixture:
         return (mean + std * noise).clamp(0, 1)
 
     def most_likely(self) -> "TraversabilityMixture":
-        """Keeps the heaviest component of each cell alone: the paper's single-class option, K = 1."""
-        best = self.weights.argmax(dim=-3, keepdim=True)
-        means, stds = (torch.gather(t, -3, best) for t in (self.means, self.stds))
-        return TraversabilityMixture(torch.ones_like(means), means, stds)
+        """Keeps the heaviest class of each cell alone, all its components: the paper's single-class option.
+
+        Raises:
+            ConfigError: the components are not told to belong to classes.
+        """
+        if self.group is None:
+            raise ConfigError(
+                "Expected components that belong to terrain classes for the single-class option, got a "
+                "mixture without `group`. Take another risk measure, or give the mixture its `group`."
+            )
+        classes = sorted(set(self.group))
+        members = [[k for k, own in enumerate(self.group) if own == c] for c in classes]
+        most = max(len(own) for own in members)
+        # Of the classes with fewer components some are taken again, at no weight.
+        table = torch.tensor([own + own[:1] * (most - len(own)) for own in members])
+        counted = torch.tensor([[1.0] * len(own) + [0.0] * (most - len(own)) for own in members])
+        table, counted = table.to(self.weights.device), counted.to(self.weights)
+        of_class = (self.weights.movedim(-3, -1)[..., table] * counted).sum(-1)
+        best = of_class.argmax(dim=-1)
+        index = table[best].movedim(-1, -3)
+        weights, means, stds = (torch.gather(t, -3, index) for t in (self.weights, self.means, self.stds))
+        weights = weights * counted[best].movedim(-1, -3)
+        if most == 1:
+            weights = torch.ones_like(weights)
+        return TraversabilityMixture(weights / weights.sum(-3, keepdim=True), means, stds, (0,) * most)
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
@@ -159,11 +259,11 @@ class TraversabilityMixture:
         return (weights * stds * torch.addcmul(_density(z), z, _probability(z))).sum(-3)
 
     @torch.no_grad()
-    def _value_at_risk(self, tail: float) -> Tensor:
-        """clip(F⁻¹(tail), 0, 1) in float64, exact at 0 and 1."""
+    def _value_at_risk(self, tail: float | Tensor) -> Tensor:
+        """clip(F⁻¹(tail), 0, 1) in float64, exact at 0 and 1; of one tail, or of one a cell [*B, H, W]."""
         weights, means, stds = self._parameters()
         low, width = torch.zeros_like(means.select(-3, 0)), 1.0
-        if tail >= 1:
+        if not isinstance(tail, Tensor) and tail >= 1:
             return low + width
         # F(x) = ½ Σ_k w_k erfc(shift_k − x scale_k): few passes over memory, and exact far down in the tail.
         scale = math.sqrt(0.5) / stds
@@ -194,3 +294,10 @@ def _check_level(level: float) -> float:
     if not 0 <= level < 1:
         raise ConfigError(f"Expected `level` in [0, 1), got {level}. CVaR at level 0 is the mean.")
     return float(level)
+
+
+@cache
+def _legendre() -> tuple[tuple[float, float], ...]:
+    """Nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
+    return tuple((float(0.5 + 0.5 * x), float(0.5 * w)) for x, w in zip(nodes, weights, strict=True))

@@ -58,6 +58,8 @@ def uniform(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.nd
     drawn = (bits >> np.uint64(11)).astype(np.float64)
     drawn += 0.5
     drawn *= 2.0**-53
+    # The largest of the words rounds up to 1, of which the inverse normal is infinite.
+    np.minimum(drawn, 1 - 2.0**-53, out=drawn)
     return drawn.reshape(len(bits), *shape)
 
 

@@ -6,11 +6,13 @@ space. Traversability is in [0, 1] and higher is better. Letters in shapes: B ma
 """
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
 
 
 @dataclass(frozen=True)
@@ -130,21 +132,22 @@ class Terrain:
         class_id: index into the dataset's class table, shape [B, H, W].
         elevation_m: shape [B, H, W].
         slope_deg: shape [B, H, W].
-        traversability_mean: latent traversability f_c(ψ), in [0, 1], shape [B, H, W]. Because λ is
-            clipped, E[λ] differs from it near 0 and 1.
-        traversability_std: σ_c of the latent traversability, shape [B, H, W].
-        traversability: the realised λ = clip(f_c(ψ) + ε, 0, 1), shape [B, H, W].
+        truth: the true distribution of λ in each cell, parameters of shape [B, K, H, W]: of the cell's
+            own class at its slope, and of its soft spots where the class has them.
+        traversability: one realised λ, shape [B, H, W].
         grid: size and resolution.
+        look_alikes: what colours can tell at best: the truth of all classes that look like the cell's own,
+            weighted alike; None where no two classes look alike, so that it is the truth.
     """
 
     rgb: Tensor
     class_id: Tensor
     elevation_m: Tensor
     slope_deg: Tensor
-    traversability_mean: Tensor
-    traversability_std: Tensor
+    truth: TraversabilityMixture
     traversability: Tensor
     grid: Grid
+    look_alikes: TraversabilityMixture | None = None
 
     def __post_init__(self) -> None:
         """Checks that the layers fit the grid and one another."""
@@ -154,8 +157,7 @@ class Terrain:
             class_id=self.class_id,
             elevation_m=self.elevation_m,
             slope_deg=self.slope_deg,
-            traversability_mean=self.traversability_mean,
-            traversability_std=self.traversability_std,
+            truth=self.truth.weights.select(-3, 0),
             traversability=self.traversability,
         )
 
@@ -165,8 +167,20 @@ class Terrain:
 
     def select(self, members: Tensor) -> "Terrain":
         """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
-        layers = {f.name: getattr(self, f.name)[members] for f in fields(self) if f.name != "grid"}
-        return Terrain(**layers, grid=self.grid)
+        kept: dict[str, Any] = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, TraversabilityMixture):
+                kept[f.name] = value.select(members)
+            else:
+                kept[f.name] = value[members] if isinstance(value, Tensor) else value
+        return Terrain(**kept)
+
+    def to(self, device: torch.device | str) -> "Terrain":
+        """The maps on a device."""
+        moved = {f.name: getattr(self, f.name) for f in fields(self)}
+        movable = (Tensor, TraversabilityMixture)
+        return Terrain(**{n: v.to(device) if isinstance(v, movable) else v for n, v in moved.items()})
 
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""

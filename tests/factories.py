@@ -17,6 +17,12 @@ from benchnav.terrain import Grid, Observation, Terrain
 GRID = Grid(16, 16, 0.5)
 
 
+def normal(mean: torch.Tensor, std: torch.Tensor) -> TraversabilityMixture:
+    """One Gaussian a cell, clipped to [0, 1], from maps [B, H, W]."""
+    means = mean.unsqueeze(1)
+    return TraversabilityMixture(torch.ones_like(means), means, std.unsqueeze(1), (0,))
+
+
 def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
     """Flat terrain of one class with the given latent traversability, shape [B, H, W]."""
     batch, height, width = mean.shape
@@ -26,8 +32,7 @@ def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
         class_id=flat.long(),
         elevation_m=flat,
         slope_deg=flat,
-        traversability_mean=mean,
-        traversability_std=torch.full_like(mean, std),
+        truth=normal(mean, torch.full_like(mean, std)),
         traversability=mean.clamp(0, 1),
         grid=Grid(height, width, 0.5),
     )

@@ -105,7 +105,7 @@ def test_the_world() -> None:
     problem = factories.problem(torch.rand(2, 16, 16))
     action, outcome = torch.full((2, 2), 5.0), torch.full((2,), int(Outcome.TIMEOUT))
     terrain = factories.terrain(torch.rand(2, 16, 16))
-    truth = (terrain.traversability_mean, terrain.traversability_std, terrain.traversability)
+    truth = (terrain.truth.weights, terrain.truth.means, terrain.truth.stds, terrain.traversability)
     simulation = Simulation(terrain, problem.task, World(), problem.goal_m, 0, [0, 1])
     now = simulation.init(problem.start)
     given = (now.state, now.outcome, now.step, action, *maps_of(problem), *truth)

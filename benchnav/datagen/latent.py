@@ -2,6 +2,9 @@
 
 f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1), ψ in degrees; observed λ = clip(f_c(ψ) + ε_c, 0, 1)
 with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
+
+Beyond the paper, a class may have soft spots, a second mode of λ that neither colour nor slope shows, and
+classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 """
 
 from dataclasses import dataclass
@@ -10,6 +13,32 @@ import numpy as np
 from scipy.special import ndtr
 
 from benchnav.errors import ConfigError
+
+
+Parameters = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SoftSpots:
+    """Ground of a class that is soft for no reason one could see: buried loose sand, a wet patch.
+
+    Args:
+        weight: share of the class's ground, in (0, 1).
+        mean: λ there before clipping, at any slope.
+        std: its standard deviation, > 0.
+    """
+
+    weight: float
+    mean: float
+    std: float
+
+    def __post_init__(self) -> None:
+        """Refuses values that make no distribution."""
+        if not (0 < self.weight < 1 and 0 <= self.mean <= 1 and 0 < self.std <= 1):
+            raise ConfigError(
+                "Expected soft spots of `weight` in (0, 1), `mean` in [0, 1] and `std` in (0, 1], "
+                f"got {self.weight}, {self.mean} and {self.std}."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +52,7 @@ class TerrainClass:
         exponent: b_c, in [1.4, 2.0] in the shipped table.
         offset: o_c, loss on flat ground, in [0, 0.1] in the shipped table.
         noise: σ_c, in [0.1, 0.2] in the shipped table.
+        soft: its soft spots, if it has any.
     """
 
     name: str
@@ -31,6 +61,7 @@ class TerrainClass:
     exponent: float
     offset: float
     noise: float
+    soft: SoftSpots | None = None
 
     def __post_init__(self) -> None:
         """Refuses values that make no LT function or no colour."""
@@ -58,6 +89,65 @@ def latent_mean(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[Terr
 def latent_std(class_id: np.ndarray, classes: tuple[TerrainClass, ...]) -> np.ndarray:
     """σ_c of each cell, shape of `class_id`."""
     return np.take(np.array([c.noise for c in classes]), class_id)
+
+
+def truth(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+    """The true distribution of λ in each cell, as a Gaussian mixture before clipping.
+
+    Args:
+        class_id: shape [B, H, W].
+        slope_deg: shape [B, H, W].
+        classes: the class table.
+
+    Returns:
+        Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2 where the table has
+        soft spots; a class without them has them at weight 0.
+    """
+    firm = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
+    if not any(c.soft for c in classes):
+        return np.ones((len(firm[0]), 1, *firm[0].shape[1:])), firm[0][:, None], firm[1][:, None]
+    none = SoftSpots(weight=0.5, mean=0.0, std=1.0)
+    spots = [c.soft or none for c in classes]
+    weight = np.take([c.soft.weight if c.soft else 0.0 for c in classes], class_id)
+    soft = np.take([s.mean for s in spots], class_id), np.take([s.std for s in spots], class_id)
+    weights, means, stds = ((1 - weight, weight), (firm[0], soft[0]), (firm[1], soft[1]))
+    return np.stack(weights, 1), np.stack(means, 1), np.stack(stds, 1)
+
+
+def twins(classes: tuple[TerrainClass, ...]) -> list[tuple[int, ...]]:
+    """Classes that share a colour, by class: of each class those that look like it, itself among them."""
+    return [tuple(i for i, c in enumerate(classes) if c.colour == own.colour) for own in classes]
+
+
+def look_alikes(
+    class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]
+) -> Parameters | None:
+    """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
+
+    They are shown together, and which of them takes which ground is drawn anew in each map, so that each
+    weighs the same.
+
+    Returns:
+        As `truth`, with a component for each of the most classes that look alike; None where no two do.
+    """
+    alike = twins(classes)
+    most = max(len(own) for own in alike)
+    if most == 1:
+        return None
+    pieces = []
+    for place in range(most):
+        other = np.take([own[place % len(own)] for own in alike], class_id)
+        share = np.take([1 / len(own) if place < len(own) else 0.0 for own in alike], class_id)
+        weights, means, stds = truth(other, slope_deg, classes)
+        pieces.append((weights * share[:, None], means, stds))
+    weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    return weights, means, stds
+
+
+def expected_of(parameters: Parameters) -> np.ndarray:
+    """E[λ] of the clipped mixture, shape [B, H, W], from parameters of shape [B, K, H, W]."""
+    weights, means, stds = parameters
+    return (weights * expected_traversability(means, stds)).sum(1)
 
 
 def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:

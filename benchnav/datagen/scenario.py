@@ -127,6 +127,7 @@ class Recipe:
         start_m: (x, y) where navigation starts.
         goal_m: (x, y) where it ends.
         stuck_threshold: λ_stuck; a cell is truly free when E[λ] exceeds it.
+        synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2.
         environments: number of environments; each shows its own choice of classes.
         occupancy: share of the cells that each class of an environment covers, summing to 1.
         class_periods_m: lattice spacings of the class noise, one an octave.
@@ -149,6 +150,7 @@ class Recipe:
     scenarios: dict[str, Scenario]
     splits: dict[str, Split]
     stuck_threshold: float = 0.3
+    synthesis: int = 1
 
     def __post_init__(self) -> None:
         """Refuses recipes that contradict themselves."""
@@ -241,7 +243,13 @@ class Recipe:
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the recipe as plain data for JSON, fully resolved."""
-        return _plain(asdict(self))
+        plain = _plain(asdict(self))
+        if self.synthesis == 1:
+            # As version 0.1 wrote it, so that its files and readers stay as they are.
+            plain.pop("synthesis")
+            for item in plain["classes"]:
+                item.pop("soft")
+        return plain
 
 
 def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:

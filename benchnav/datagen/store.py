@@ -17,6 +17,7 @@ from benchnav.datagen import latent, schema
 from benchnav.datagen.generate import Maps
 from benchnav.datagen.scenario import Recipe, recipe_from_dict
 from benchnav.errors import DatasetError
+from benchnav.mixture import TraversabilityMixture
 from benchnav.terrain import Grid, Terrain
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
@@ -128,18 +129,19 @@ class TerrainDataset:
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> Terrain:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
         maps = self.read(split, indices, schema.MAP_FIELDS)
-        classes = self.recipe.classes
-        mean = latent.latent_mean(maps["class_id"], maps["slope_deg"].astype(np.float64), classes)
-        std = latent.latent_std(maps["class_id"], classes)
+        classes, slope = self.recipe.classes, maps["slope_deg"].astype(np.float64)
+        truth = latent.truth(maps["class_id"], slope, classes)
+        seen = latent.look_alikes(maps["class_id"], slope, classes) if self.recipe.synthesis > 1 else None
+        per_class = truth[0].shape[1]
         return Terrain(
             rgb=torch.from_numpy(maps["rgb"]),
             class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
             elevation_m=torch.from_numpy(maps["elevation_m"]),
             slope_deg=torch.from_numpy(maps["slope_deg"]),
-            traversability_mean=torch.from_numpy(mean.astype(np.float32)),
-            traversability_std=torch.from_numpy(std.astype(np.float32)),
+            truth=mixture_of(truth, per_class),
             traversability=torch.from_numpy(maps["traversability"]),
             grid=self.grid,
+            look_alikes=None if seen is None else mixture_of(seen, per_class),
         )
 
     def map_count(self, split: str) -> int:
@@ -198,6 +200,13 @@ class TerrainDataset:
             f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {self.path}, "
             f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
         )
+
+
+def mixture_of(parameters: latent.Parameters, per_class: int) -> TraversabilityMixture:
+    """A mixture in float32, each class with `per_class` of its components, from those of `latent.truth`."""
+    weights, means, stds = (torch.from_numpy(values.astype(np.float32)) for values in parameters)
+    group = tuple(k // per_class for k in range(weights.shape[1]))
+    return TraversabilityMixture(weights, means, stds, group)
 
 
 def dataset_folders() -> list[Path]:

@@ -235,9 +235,9 @@ def measure_latent(table: SlopeTable, terrain: Terrain) -> dict[str, float]:
     own = terrain.class_id.unsqueeze(1)
     mean, std = (values.gather(1, own) for values in table.lookup(terrain.slope_deg))
     mixture = _choose(TraversabilityMixture(torch.ones_like(mean), mean, std), known)
-    noise_error = (table.noise_std[terrain.class_id] / terrain.traversability_std - 1).abs()
+    noise_error = (table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0] - 1).abs()
     return {
-        "latent_rmse": float((mean.squeeze(1) - terrain.traversability_mean).square().mean().sqrt()),
+        "latent_rmse": float((mean.squeeze(1) - terrain.truth.means[:, 0]).square().mean().sqrt()),
         "noise_error": float(noise_error.max()),
         "nll": float(-mixture.log_prob(terrain.traversability[known].unsqueeze(0)).mean()),
     }
@@ -310,7 +310,8 @@ class _ClassTally:
 def _choose(mixture: TraversabilityMixture, cells: Tensor) -> TraversabilityMixture:
     """The chosen ones (bool, shape [B, H, W]) of a mixture's cells, as a map of one row: [K, 1, N]."""
     parameters = (mixture.weights, mixture.means, mixture.stds)
-    return TraversabilityMixture(*(values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters))
+    chosen = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
+    return TraversabilityMixture(*chosen, mixture.group)
 
 
 def _score_cells(
@@ -322,8 +323,7 @@ def _score_cells(
     """
     known = ~terrain.traversability.isnan()
     mixture, observed = _choose(mixture, known), terrain.traversability[known].unsqueeze(0)
-    mean, std = (v[known].view(1, 1, -1) for v in (terrain.traversability_mean, terrain.traversability_std))
-    truth = TraversabilityMixture(torch.ones_like(mean), mean, std).mean()
+    truth = _choose(terrain.truth, known).mean()
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
     sums = [

@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from benchnav.datagen.generate import generate
-from benchnav.datagen.latent import latent_mean, latent_std
+from benchnav.datagen.latent import truth
 from benchnav.datagen.scenario import Split, load_recipe
+from benchnav.datagen.store import mixture_of
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import AnyModel, predict
@@ -171,18 +172,17 @@ def _make_terrain(recipe: str, height: int, width: int, device: torch.device) ->
         splits={"contract": Split(scenario=name, maps=_MAPS)},
     )
     maps = generate(made, "contract", np.arange(_MAPS))
-    mean = latent_mean(maps["class_id"], maps["slope_deg"].astype(np.float64), made.classes)
+    true = truth(maps["class_id"], maps["slope_deg"].astype(np.float64), made.classes)
     layers = {
         "rgb": maps["rgb"],
         "class_id": maps["class_id"].astype(np.int64),
         "elevation_m": maps["elevation_m"],
         "slope_deg": maps["slope_deg"],
-        "traversability_mean": mean.astype(np.float32),
-        "traversability_std": latent_std(maps["class_id"], made.classes).astype(np.float32),
         "traversability": maps["traversability"],
     }
-    on_device = {name: torch.from_numpy(layer).to(device) for name, layer in layers.items()}
-    return Terrain(**on_device, grid=made.grid)
+    tensors = {name: torch.from_numpy(layer) for name, layer in layers.items()}
+    mixture = mixture_of(true, per_class=true[0].shape[1])
+    return Terrain(**tensors, truth=mixture, grid=made.grid).to(device)
 
 
 def _generators() -> dict[str, bytes]:

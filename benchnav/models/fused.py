@@ -53,7 +53,8 @@ class FusedModel:
         for classifier in self.classifiers[1:]:
             weights += self._probabilities(classifier, observation)
         means, stds = self.table.lookup(observation.slope_deg.float())
-        return TraversabilityMixture(weights / len(self.classifiers), means, stds)
+        classes = tuple(range(len(self.class_names)))
+        return TraversabilityMixture(weights / len(self.classifiers), means, stds, classes)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
         """Class probabilities of each member.

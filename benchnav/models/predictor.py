@@ -9,6 +9,7 @@ shapes: M members, B maps, H×W cells, C classes, K components.
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -78,9 +79,9 @@ class Oracle:
     """Knows the true distribution; crossed with a planner it shows what is left without model error."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
-        """Gives the true N(f_c(ψ), σ_c) of every cell, K = 1."""
-        mean, std = terrain.traversability_mean.unsqueeze(1), terrain.traversability_std.unsqueeze(1)
-        return TraversabilityMixture(torch.ones_like(mean), mean.clone(), std.clone())
+        """Gives the true distribution of every cell."""
+        truth = terrain.truth
+        return replace(truth, weights=truth.weights.clone(), means=truth.means.clone(), stds=truth.stds.clone())
 
 
 AnyModel = Model | Oracle

@@ -25,7 +25,7 @@ def test_what_is_read_is_what_was_generated(dataset_path: Path) -> None:
             np.testing.assert_array_equal(made[name], read[name])
     terrain = dataset.terrain("train", [3, 5])
     assert terrain.class_id.dtype == torch.int64
-    assert terrain.traversability_std.dtype == torch.float32
+    assert terrain.truth.stds.dtype == torch.float32
     np.testing.assert_array_equal(terrain.rgb, dataset.read("train", [3, 5], ["rgb"])["rgb"])
 
 

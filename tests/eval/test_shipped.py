@@ -59,7 +59,7 @@ def drive_straight(instance: int) -> tuple[float, float, float]:
     while np.linalg.norm(goal - place) >= 1:
         column, row = (place // 0.5).astype(int)
         mean, std = (
-            float(t[0, row, column]) for t in (terrain.traversability_mean, terrain.traversability_std)
+            float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds)
         )
         met.append(float(np.clip(mean + std * luck[len(met)], 0, 1)))
         place = place + 0.1 * met[-1] * direction

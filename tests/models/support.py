@@ -8,6 +8,7 @@ import torch
 from benchnav.datagen.create import create
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
+from benchnav.mixture import TraversabilityMixture
 from benchnav.models.pixels import PixelTable
 from benchnav.models.slope_table import SlopeTable, table_slopes
 from benchnav.terrain import Grid, Terrain
@@ -36,8 +37,9 @@ def make_terrain(batch: int = 2, size: int = 16, classes: int = 3, seed: int = 0
         class_id=torch.randint(0, classes, shape, generator=generator),
         elevation_m=torch.rand(shape, generator=generator),
         slope_deg=30 * torch.rand(shape, generator=generator),
-        traversability_mean=mean,
-        traversability_std=std,
+        truth=TraversabilityMixture(
+            torch.ones_like(mean).unsqueeze(1), mean.unsqueeze(1), std.unsqueeze(1), (0,)
+        ),
         traversability=(mean + std * torch.randn(shape, generator=generator)).clamp(0, 1),
         grid=Grid(size, size, 0.5),
     )

@@ -14,6 +14,7 @@ from benchnav.models.predictor import Oracle
 from benchnav.models.scores import crps
 from benchnav.models.uncertainty import mutual_information, predictive_entropy
 from benchnav.terrain import Grid, Observation
+from tests.factories import normal
 
 from .stub import ColourModel
 from .support import linear_table, make_terrain
@@ -54,7 +55,7 @@ def test_a_model_off_by_a_constant_is_off_by_it_in_truth() -> None:
 
     drawn = make_terrain(batch=3)
     level = torch.full_like(drawn.traversability, 0.5)
-    terrain = replace(drawn, traversability_mean=level, traversability_std=0.02 * level, traversability=level)
+    terrain = replace(drawn, truth=normal(level, 0.02 * level), traversability=level)
     figures = measure(Shifted(), [terrain], generator()).traversability
     assert figures.rmse_expected == pytest.approx(0.1, abs=1e-5)
     assert figures.rmse_observed == pytest.approx(0.1, abs=1e-5)
@@ -150,14 +151,13 @@ def test_latent_metrics_read_each_cell_with_its_own_class() -> None:
     terrain, table = make_terrain(batch=4), linear_table()
     mean, std = table.lookup(terrain.slope_deg)
     own = terrain.class_id[:, None]
-    perfect = make_terrain(batch=4)
-    perfect.traversability_mean[:] = mean.gather(1, own)[:, 0]
-    perfect.traversability_std[:] = std.gather(1, own)[:, 0]
+    mean, std = mean.gather(1, own)[:, 0], std.gather(1, own)[:, 0]
+    perfect = replace(terrain, truth=normal(mean, std))
     exact = measure_latent(table, perfect)
     assert exact["latent_rmse"] == pytest.approx(0, abs=1e-6)
     assert exact["noise_error"] == pytest.approx(0, abs=1e-6)
-    perfect.traversability_mean[:] += 0.1
-    assert measure_latent(table, perfect)["latent_rmse"] == pytest.approx(0.1, rel=1e-4)
+    shifted = replace(terrain, truth=normal(mean + 0.1, std))
+    assert measure_latent(table, shifted)["latent_rmse"] == pytest.approx(0.1, rel=1e-4)
 
 
 def test_splits_are_measured_one_at_a_time(dataset: TerrainDataset) -> None:
@@ -194,10 +194,10 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
         **{  # the same cells, cut to a map of their own
             name: getattr(terrain, name)[..., 5:]
             for name in (
-                "rgb", "class_id", "elevation_m", "slope_deg",
-                "traversability", "traversability_mean", "traversability_std",
+                "rgb", "class_id", "elevation_m", "slope_deg", "traversability",
             )
         },
+        truth=normal(terrain.truth.means[:, 0, :, 5:], terrain.truth.stds[:, 0, :, 5:]),
         grid=Grid(16, 11, 0.5),
     )  # fmt: skip
     model = FusedModel([torch.nn.Identity()], linear_table(), ("a", "b", "c"))

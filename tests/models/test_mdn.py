@@ -30,6 +30,7 @@ from benchnav.models.mdn import (
 )
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
 from benchnav.terrain import Grid, Observation, Terrain
+from tests.factories import normal
 
 from .support import make_terrain
 
@@ -279,8 +280,7 @@ def draw_two_grounds(generator: torch.Generator) -> tuple[Terrain, list[Tensor]]
         class_id=bright.long(),
         elevation_m=torch.zeros(shape),
         slope_deg=torch.where(steep, 20.0, 0.0),
-        traversability_mean=mean,
-        traversability_std=std,
+        truth=normal(mean, std),
         traversability=(mean + std * torch.randn(shape, generator=generator)).clamp(0, 1),
         grid=Grid(32, 32, 0.5),
     )

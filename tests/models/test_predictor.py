@@ -113,8 +113,8 @@ def test_a_model_is_given_an_observation_and_the_oracle_alone_the_terrain(
     monkeypatch.setattr(Oracle, "predict_terrain", remember)
     mixture = predict(load_model("oracle"), terrain)
     assert given == [terrain]
-    assert torch.equal(mixture.means[:, 0], terrain.traversability_mean)
-    assert torch.equal(mixture.stds[:, 0], terrain.traversability_std)
+    assert torch.equal(mixture.means, terrain.truth.means)
+    assert torch.equal(mixture.stds, terrain.truth.stds)
     assert torch.equal(mixture.weights, torch.ones_like(mixture.weights))
 
 

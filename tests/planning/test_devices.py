@@ -43,9 +43,7 @@ def make_problem(**parts: Any) -> Problem:
 
 
 def terrain_on_gpu() -> Terrain:
-    made = factories.terrain(torch.empty(BATCH, 12, 20))
-    layers = {name: value.to("cuda") for name, value in vars(made).items() if torch.is_tensor(value)}
-    return Terrain(**layers, grid=made.grid)
+    return factories.terrain(torch.empty(BATCH, 12, 20)).to("cuda")
 
 
 def gpu(*shape: int) -> Tensor:

@@ -42,8 +42,8 @@ class Realisation:
             self._mean = terrain.grid.pad(terrain.traversability, outside=0.0)
             self._std = torch.zeros_like(self._mean)
         else:
-            self._mean = terrain.grid.pad(terrain.traversability_mean, outside=0.0)
-            self._std = terrain.grid.pad(terrain.traversability_std, outside=0.0)
+            self._mean = terrain.grid.pad(terrain.truth.means[:, 0], outside=0.0)
+            self._std = terrain.grid.pad(terrain.truth.stds[:, 0], outside=0.0)
         # A stream each, so that another time budget leaves the luck of the first steps as it is.
         first = np.zeros(1, dtype=np.int64)
         luck = [rng.normal(rng.stream_key(key, int(i)), first, (steps,)) for i in instances]

@@ -64,9 +64,7 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
 
 @lru_cache
 def risk_maps(dataset: TerrainDataset, scenario: str, risk: str) -> torch.Tensor:
-    terrain = dataset.terrain(f"test/{scenario}")
-    mean, std = (t.unsqueeze(1) for t in (terrain.traversability_mean, terrain.traversability_std))
-    return RISKS[risk](TraversabilityMixture(torch.ones_like(mean), mean, std))
+    return RISKS[risk](dataset.terrain(f"test/{scenario}").truth)
 
 
 def luck(
@@ -80,7 +78,7 @@ def luck(
     names = (f"test/{scenario}", realisation) if realisation else (f"test/{scenario}",)
     key = rng.stream_key(rng.stream_key(seed, "simulation", *names), instance)
     drawn = rng.normal(key, np.zeros(1, np.int64), (6,))[0, :3]
-    mean, std = terrain.traversability_mean[0, row, column], terrain.traversability_std[0, row, column]
+    mean, std = (t[0, 0, row, column] for t in (terrain.truth.means, terrain.truth.stds))
     return np.clip(float(mean) + float(std) * drawn, 0, 1)
 
 
