@@ -12,6 +12,7 @@ from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Robot, Unicycle
+from benchnav.planning.world.places import Places
 from benchnav.terrain import Grid, Observation, Terrain
 
 GRID = Grid(16, 16, 0.5)
@@ -38,6 +39,12 @@ def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
     )
 
 
+def places(goal_m: torch.Tensor, start_m: torch.Tensor | None = None) -> Places:
+    """Goals [B, 2], with starts at (1.25, 1.25) unless they are given, and no reference times."""
+    start_m = torch.full_like(goal_m, 1.25) if start_m is None else start_m
+    return Places(start_m=start_m, goal_m=goal_m, reference_time_s=torch.full_like(goal_m[:, 0], torch.nan))
+
+
 def task(robot: Robot | None = None, objective: Objective | None = None, rules: Rules | None = None) -> Task:
     """The paper's task, with some of its parts replaced."""
     return Task(robot=robot or Unicycle(), objective=objective or GoalDistance(), rules=rules or Rules())
@@ -46,7 +53,7 @@ def task(robot: Robot | None = None, objective: Objective | None = None, rules: 
 def certain(traversability: torch.Tensor) -> TraversabilityMixture:
     """A prediction without doubt, from λ of shape [B, H, W]."""
     means = traversability.unsqueeze(1)
-    return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means))
+    return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means), (0,))
 
 
 def problem(

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import pytest
@@ -20,7 +21,7 @@ def random_mixture(components: int = 4, cells: int = 6, seed: int = 0) -> Traver
     weights = torch.rand(shape, generator=generator, dtype=torch.float64)
     means = 1.4 * torch.rand(shape, generator=generator, dtype=torch.float64) - 0.2
     stds = 0.02 + 0.3 * torch.rand(shape, generator=generator, dtype=torch.float64)
-    return TraversabilityMixture(weights / weights.sum(1, keepdim=True), means, stds)
+    return TraversabilityMixture(weights / weights.sum(1, keepdim=True), means, stds, tuple(range(components)))
 
 
 def single(mean: float, std: float, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
@@ -121,13 +122,16 @@ def test_risk_maps_stay_on_their_device_and_wait_for_nothing(dtype: torch.dtype)
     # A fake tensor has a device and no values: what asks for a value, or mixes devices, raises.
     with FakeTensorMode():
         weights, means, stds = (torch.empty(3, 10, 7, 5, dtype=dtype, device="cuda") for _ in range(3))
-        mixture = TraversabilityMixture(weights, means, stds)
+        mixture = TraversabilityMixture(weights, means, stds, (0, 1, 1, 2, 3, 4, 5, 6, 7, 7))
         value = torch.empty(3, 7, 5, dtype=dtype, device="cuda")
         maps = (
             mixture.mean(),
             mixture.var(0.9),
             mixture.cvar(0.9),
             mixture.most_likely().cvar(0.9),
+            mixture.harmonic_mean(0.05),
+            mixture.chance(0.1),
+            mixture.from_normal(value),
             mixture.cdf(0.5),
             mixture.cdf(value),
             mixture.log_prob(value),
@@ -198,12 +202,111 @@ def test_cdf_has_the_atoms_of_clipping() -> None:
     assert mixture.cdf(1.0).item() == 1
 
 
-def test_most_likely_keeps_the_heaviest_component() -> None:
+def test_most_likely_keeps_the_heaviest_class_where_each_has_one_component() -> None:
     mixture = random_mixture()
     kept = mixture.most_likely()
     best = mixture.weights.argmax(1)
     assert kept.means.shape == (2, 1, 1, 6)
     assert kept.means[1, 0, 0, 3] == mixture.means[1, best[1, 0, 3], 0, 3]
+
+
+def test_most_likely_keeps_the_heaviest_class_whole() -> None:
+    """Class 7 has two components that are together heavier than the heaviest one, which is of class 2."""
+    mixture = random_mixture(components=4)
+    weights = torch.tensor([0.3, 0.4, 0.25, 0.05], dtype=torch.float64).view(1, 4, 1, 1).expand(2, 4, 1, 6).clone()
+    weights[1, :, 0, 0] = torch.tensor([0.1, 0.85, 0.04, 0.01])
+    of_classes = replace(mixture, weights=weights, group=(7, 2, 7, 3))
+    kept = of_classes.most_likely()
+    alone = TraversabilityMixture(
+        weights[:, [0, 2]] / weights[:, [0, 2]].sum(1, keepdim=True), mixture.means[:, [0, 2]], mixture.stds[:, [0, 2]]
+    )
+    torch.testing.assert_close(kept.cvar(0.9)[0], alone.cvar(0.9)[0])
+    other = TraversabilityMixture(torch.ones(2, 1, 1, 6).double(), mixture.means[:, [1]], mixture.stds[:, [1]])
+    assert kept.mean()[1, 0, 0].item() == pytest.approx(other.mean()[1, 0, 0].item(), abs=1e-12)
+    assert kept.mean()[1, 0, 1].item() == pytest.approx(alone.mean()[1, 0, 1].item(), abs=1e-12)
+    torch.testing.assert_close(kept.weights.sum(1), torch.ones(2, 1, 6).double())
+    # It is one class, so that it may be asked again.
+    torch.testing.assert_close(kept.most_likely().mean(), kept.mean())
+
+
+def test_the_most_likely_class_of_components_that_are_none_is_refused() -> None:
+    with pytest.raises(ConfigError, match="without `group`"):
+        replace(random_mixture(), group=None).most_likely()
+    with pytest.raises(ConfigError, match="each of 4 components, got 3"):
+        replace(random_mixture(), group=(0, 1, 2))
+
+
+@pytest.mark.parametrize("floor", [0.02, 0.05, 0.5, 1.0])
+def test_the_harmonic_mean_is_that_of_an_adaptive_integrator(floor: float) -> None:
+    """From needles to planes, by their densities and the atoms at 0 and 1; our form integrates the CDF."""
+    from scipy.integrate import quad
+
+    for mean in (-0.3, 0.0, 0.04, 0.06, 0.5, 0.97, 1.3):
+        for std in (1e-4, 0.01, 0.05, 0.2, 1.0):
+            law = stats.norm(mean, std)
+            edges = [x for x in (mean + z * std for z in (-8, -4, -1, 0, 1, 4, 8)) if floor < x < 1]
+
+            def slow(x: float, law=law) -> float:  # type: ignore[no-untyped-def]
+                return float(law.pdf(x)) / x
+
+            inside = quad(slow, floor, 1, points=edges or None, limit=500)[0] if floor < 1 else 0.0
+            time = law.cdf(floor) / floor + inside + law.sf(1)
+            assert single(mean, std).harmonic_mean(floor).item() == pytest.approx(1 / time, abs=1e-6)
+
+
+def test_the_harmonic_mean_of_a_mixture_weighs_times_and_not_speeds() -> None:
+    mixture = random_mixture()
+    times = sum(
+        mixture.weights[:, k]
+        / TraversabilityMixture(
+            torch.ones_like(mixture.weights[:, [k]]), mixture.means[:, [k]], mixture.stds[:, [k]]
+        ).harmonic_mean(0.05)
+        for k in range(4)
+    )
+    torch.testing.assert_close(mixture.harmonic_mean(0.05), 1 / times)
+    draws = monte_carlo()
+    assert mixture.harmonic_mean(0.05)[1, 0, 3].item() == pytest.approx(
+        1 / (1 / draws[:, 1, 0, 3].clamp(min=0.05)).mean().item(), abs=1e-3
+    )
+    assert (mixture.harmonic_mean(0.05) <= mixture.mean().clamp(min=0.05) + 0.05).all()
+
+
+@pytest.mark.parametrize("floor", [0.0, -0.1, 1.1, math.nan])
+def test_a_least_speed_out_of_range_is_refused(floor: float) -> None:
+    with pytest.raises(ConfigError, match="least speed"):
+        random_mixture().harmonic_mean(floor)
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_the_chance_is_the_share_of_draws_at_the_bound_or_above(bound: float) -> None:
+    expected = (monte_carlo() >= bound).double().mean(0)
+    torch.testing.assert_close(random_mixture().chance(bound), expected, atol=3e-3, rtol=0)
+
+
+def test_normal_numbers_go_through_each_cells_quantile_function() -> None:
+    mixture = random_mixture()
+    generator = torch.Generator().manual_seed(5)
+    for z in torch.randn(20, 2, 1, 6, generator=generator, dtype=torch.float64):
+        found = mixture.from_normal(z)
+        share = torch.from_numpy(stats.norm.cdf(z.numpy()))
+        inside = (found > 0) & (found < 1)
+        torch.testing.assert_close(mixture.cdf(found)[inside], share[inside], atol=1e-7, rtol=0)
+        assert (mixture.cdf(0.0)[found == 0] >= share[found == 0]).all()
+        assert (mixture.chance(1.0)[found == 1] >= 1 - share[found == 1] - 1e-12).all()
+    alone = single(0.5, 0.3)
+    for z in (-3.0, -1.0, 0.0, 0.4, 2.5):
+        both = TraversabilityMixture(*(t.expand(2, 1, 1) for t in (alone.weights / 2, alone.means, alone.stds)))
+        at = torch.full((1, 1), z, dtype=torch.float64)
+        assert alone.from_normal(at).item() == pytest.approx(min(max(0.5 + 0.3 * z, 0), 1))
+        assert both.from_normal(at).item() == pytest.approx(alone.from_normal(at).item(), abs=1e-8)
+
+
+def test_maps_are_selected_with_their_classes() -> None:
+    mixture = random_mixture()
+    kept = mixture.select(torch.tensor([1, 1, 0]))
+    assert kept.group == mixture.group
+    for name in ("weights", "means", "stds"):
+        assert torch.equal(getattr(kept, name), getattr(mixture, name)[[1, 1, 0]])
 
 
 def test_bad_arguments_are_refused() -> None:

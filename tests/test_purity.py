@@ -106,14 +106,15 @@ def test_the_world() -> None:
     action, outcome = torch.full((2, 2), 5.0), torch.full((2,), int(Outcome.TIMEOUT))
     terrain = factories.terrain(torch.rand(2, 16, 16))
     truth = (terrain.truth.weights, terrain.truth.means, terrain.truth.stds, terrain.traversability)
-    simulation = Simulation(terrain, problem.task, World(), problem.goal_m, 0, [0, 1])
+    simulation = Simulation(terrain, problem.task, World(), factories.places(problem.goal_m), 0, [0, 1])
     now = simulation.init(problem.start)
     given = (now.state, now.outcome, now.step, action, *maps_of(problem), *truth)
     same_after(lambda: simulation.step(now, action), *given)
     same_after(lambda: simulation.unhindered(now, action), *given)
     same_after(lambda: end(now, torch.tensor([True, False]), Outcome.PLANNER_ERROR), *given)
+    steps = torch.tensor([199, 199])
     track, driven = torch.zeros(2, 200, 2), torch.zeros(2, 199)
-    same_after(lambda: tell_standstill(outcome, track, driven, 0.1), outcome, track, driven)
+    same_after(lambda: tell_standstill(outcome, steps, track, driven, 0.1), outcome, steps, track, driven)
 
 
 def test_the_global_generators_are_left_alone() -> None:
@@ -124,6 +125,6 @@ def test_the_global_generators_are_left_alone() -> None:
     random_mixture().sample(3, torch.Generator())
     ground = torch.full((2, 16, 16), 0.8)
     problem = factories.problem(ground)
-    Simulation(factories.terrain(ground), problem.task, World(), problem.goal_m, 0, [0, 1])
+    Simulation(factories.terrain(ground), problem.task, World(), factories.places(problem.goal_m), 0, [0, 1])
     assert torch.equal(before[0], torch.get_rng_state())
     np.testing.assert_array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002

@@ -21,7 +21,14 @@ from benchnav.eval.recorder import Recorder
 from benchnav.eval.run import provenance
 from benchnav.eval.run.changes import changed_options
 from benchnav.eval.run.check import check_suite
-from benchnav.eval.run.episode import PredictionError, build, one_thread, read_block, simulate
+from benchnav.eval.run.episode import (
+    PredictionError,
+    build,
+    one_thread,
+    read_block,
+    simulate,
+    time_budgets,
+)
 from benchnav.eval.run.folder import (
     FORMAT,
     FORMAT_VERSION,
@@ -95,7 +102,7 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
             problem, simulation = build(unit, run_id)
         except PredictionError as error:
             about |= {"traceback": traceback.format_exc(), "errors": [str(error)]}
-            rows = error_rows(unit, unit.trial.world.time_budget_s, str(error))
+            rows = error_rows(unit, time_budgets(unit, run_id), str(error))
             write_unit(folder, unit, rows, [], about)
             return
         recorder = Recorder(unit, problem)
@@ -103,8 +110,9 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
         episodes, compiled = simulate(unit, problem, simulation, watch, recorder.every, planner_limit_s)
         recorder.write(episodes, folder)
     about |= {"traceback": episodes.traceback, "errors": sorted({e for e in episodes.errors if e})}
-    reference = read_block(unit, run_id).reference_time_s
-    rows = episode_rows(unit, problem, episodes, reference, compiled)
+    reference = read_block(unit, run_id).places.reference_time_s.numpy()
+    redrawn = (simulation.attempts - 1).tolist()
+    rows = episode_rows(unit, problem, episodes, reference, redrawn, compiled)
     write_unit(folder, unit, rows, step_columns(problem, episodes), about)
 
 

@@ -28,7 +28,9 @@ class Suite:
         risks: Risk settings, such as `mean` or `cvar:0.9`.
         robots: Robots F.
         objectives: Objectives J.
-        world: What λ does: a preset by name, or {preset: NAME, noise: resampled | stored, time_budget_s: T}.
+        world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
+            frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
+            time_budget_ratio: T over the map's reference time}.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, slowest: 0.3,
             goal_radius_m: 1.0}.
         noise: Short for `world.noise`.

@@ -9,7 +9,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from benchnav.eval.suite import Suite
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.problem import Task
 from benchnav.planning.risk import RiskMeasure
-from benchnav.planning.world.world import PRESETS, World
+from benchnav.planning.world.settings import read_world
+from benchnav.planning.world.world import World
 from benchnav.registry import Part
 
 PART_KINDS = ("model", "risk", "planner", "robot", "objective")
@@ -77,7 +78,7 @@ class Trial:
             "split": self.split,
             **{kind: {"part": part.part, "options": dict(part.options)} for kind, part in parts.items()},
             "rules": asdict(self.rules),
-            "world": asdict(self.world),
+            "world": self.world.to_dict(),
         }
 
     @property
@@ -128,9 +129,9 @@ def trial_from(about: Mapping[str, Any]) -> Trial:
         scenario=value["split"].removeprefix("test/"),
         **parts,
         rules=rules,
-        world=World(**value["world"]),
+        world=World.from_dict(value["world"]),
         world_label=labels["world"],
-        blind=labels["risk"] == NOT_USED,
+        blind=labels["model"] == NOT_USED,
     )
 
 
@@ -149,7 +150,7 @@ def trials_of(suite: Suite, scenarios_of: Any) -> list[Trial]:
     for product in suite.trials or ({},):
         here: set[str] = set()
         for trial in _product(suite, product, scenarios_of):
-            if trial.id in here and not trial.blind:
+            if trial.id in here and trial.risk.label != NOT_USED:
                 raise ConfigError(f"Expected settings that differ, got twice what {_words(trial)} is.")
             here.add(trial.id)
             if found.setdefault(trial.id, trial).labels != trial.labels:
@@ -212,7 +213,7 @@ def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Ite
                 data=data, scenario=scenario, model=model, risk=risk, planner=planner, robot=robot,
                 objective=objective, rules=rules, world=world, world_label=label,
             )  # fmt: skip
-            yield _as_blind(trial) if _is_blind(planner) else trial
+            yield _as_run_once(trial)
 
 
 def _part(kind: str, given: Any, suite: Suite) -> Part:
@@ -259,65 +260,34 @@ def _check_options_used(suite: Suite) -> None:
 
 
 def _world(suite: Suite, world: Any, task: Any) -> tuple[World, Rules, str]:
-    for where, value in (("world", world), ("task", task)):
-        if not isinstance(value, Mapping) and not (where == "world" and isinstance(value, str)):
-            raise ConfigError(f"Expected `{where}` as a mapping of settings, got {value!r}.")
-    given = {"preset": world} if isinstance(world, str) else dict(world)
-    name = given.pop("preset", "paper")
-    if name not in PRESETS:
+    """The world and rules of a product, with the suite's short forms where it names none itself."""
+    if suite.noise == "frozen":
         raise ConfigError(
-            f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{registry.hint(name, PRESETS)}"
+            "Expected `noise` 'resampled' or 'stored', got 'frozen', which is now 'stored': the map's own λ. "
+            "For λ drawn once an episode say `world.noise` frozen, or take the world stakes."
         )
-    if suite.noise:
-        given = {"noise": suite.noise} | given
+    short: dict[str, Any] = {"noise": suite.noise} if suite.noise else {}
     if suite.time_budget_s:
-        given = {"time_budget_s": suite.time_budget_s} | given
-    preset = PRESETS[name]
-    made_world = _changed(preset.world, given, "world")
-    made_rules = _changed(preset.rules, dict(task), "task")
-    changes = _differences(preset.world, made_world) + _differences(preset.rules, made_rules)
-    return made_world, made_rules, " ".join([name, *changes])
+        short["time_budget_s"] = suite.time_budget_s
+    return read_world(world, task, short)
 
 
-def _changed(value: Any, changes: dict[str, Any], where: str) -> Any:
-    """Replaces fields of a dataclass by what is given, of dataclasses in it likewise."""
-    known = {f.name: getattr(value, f.name) for f in fields(value)}
-    made = {}
-    for name, change in changes.items():
-        if name not in known:
-            raise ConfigError(
-                f"Expected keys of `{where}` among {', '.join(known)}, got {name!r}.{registry.hint(name, known)}"
-            )
-        if isinstance(known[name], FreeSpace) and isinstance(change, Mapping):
-            made[name] = _changed(known[name], dict(change), f"{where}.{name}")
-        elif isinstance(known[name], float) and isinstance(change, int | float) and change is not True:
-            made[name] = float(change)
-        elif isinstance(known[name], str) and isinstance(change, str):
-            made[name] = change
-        else:
-            raise ConfigError(f"Expected `{where}.{name}` like {known[name]!r}, got {change!r}.")
-    return replace(value, **made)
+def _as_run_once(trial: Trial) -> Trial:
+    """One trial for every setting that would change nothing.
 
-
-def _differences(preset: Any, made: Any) -> list[str]:
-    changed = []
-    for f in fields(preset):
-        before, after = getattr(preset, f.name), getattr(made, f.name)
-        if isinstance(before, FreeSpace):
-            changed += _differences(before, after)
-        elif before != after:
-            changed.append(f"{f.name}={after:g}" if isinstance(after, float) else f"{f.name}={after}")
-    return changed
-
-
-def _is_blind(planner: Part) -> bool:
-    return bool(getattr(registry.find("planner", planner.part).target, "blind", False))
-
-
-def _as_blind(trial: Trial) -> Trial:
-    """One trial for every model and risk setting: what a blind planner is given is not looked at."""
-    model = Part(part="oracle", label=NOT_USED)
-    return replace(trial, model=model, risk=Part(part="mean", label=NOT_USED), blind=True)
+    What a blind planner is given is not looked at; and of λ that is known every measure of risk is λ itself.
+    """
+    any_risk = Part(part="mean", label=NOT_USED)
+    if getattr(registry.find("planner", trial.planner.part).target, "blind", False):
+        return replace(trial, model=Part(part="oracle", label=NOT_USED), risk=any_risk, blind=True)
+    if trial.model.part != "clairvoyant":
+        return trial
+    if trial.world.noise == "resampled":
+        raise ConfigError(
+            f"Expected a world whose λ can be known for the model 'clairvoyant', got {trial.world_label!r}, where "
+            "it is resampled at each step. Take the world stakes, or `world.noise` frozen or stored."
+        )
+    return replace(trial, risk=any_risk)
 
 
 def _labelled(trial: Trial, name: str) -> Any:

@@ -1,7 +1,7 @@
 """What a model is, and how it is found by name or by checkpoint.
 
-A model sees an `Observation` and gives a `TraversabilityMixture`; the oracle alone is given the
-Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what stands at a name is
+A model sees an `Observation` and gives a `TraversabilityMixture`; `oracle`, `ideal` and `clairvoyant`
+alone are given the Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what stands at a name is
 either called with its options and makes a model, or is a family, with `from_checkpoint`, for checkpoints
 that bear its name. The package's own models are in the same registry. Source: paper III-B. Letters in
 shapes: M members, B maps, H×W cells, C classes, K components.
@@ -9,7 +9,6 @@ shapes: M members, B maps, H×W cells, C classes, K components.
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -75,16 +74,44 @@ class ModelFamily(Protocol):
         ...
 
 
+class Privileged(Protocol):
+    """A built-in model that is given the Terrain, to tell apart what a planner's failures come from."""
+
+    def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
+        """As `Model.predict`, from the truth."""
+        ...
+
+
 class Oracle:
-    """Knows the true distribution; crossed with a planner it shows what is left without model error."""
+    """Knows the true distribution of each cell's own class; what is left is luck."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
         """Gives the true distribution of every cell."""
-        truth = terrain.truth
-        return replace(truth, weights=truth.weights.clone(), means=truth.means.clone(), stds=truth.stds.clone())
+        return terrain.truth
 
 
-AnyModel = Model | Oracle
+class Ideal:
+    """Knows all that colours can tell: of look-alikes, the mixture of their true distributions.
+
+    What a model falls short of it is the model's error; what it falls short of the oracle cannot be seen.
+    """
+
+    def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
+        """Gives the true distributions of all classes that look like the cell's own."""
+        return terrain.truth if terrain.look_alikes is None else terrain.look_alikes
+
+
+class Clairvoyant:
+    """Knows the λ that a robot will meet; what is left is planning."""
+
+    def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
+        """Gives the realised λ of every cell, without doubt, K = 1."""
+        means = terrain.traversability.unsqueeze(1)
+        return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means), (0,))
+
+
+AnyModel = Model | Privileged
+PRIVILEGED = (Oracle, Ideal, Clairvoyant)
 Source = str | Path | Mapping[str, Any] | registry.Part
 
 
@@ -109,7 +136,7 @@ def load_model(source: Source) -> AnyModel:
             "Name a checkpoint of it, by its path if it bears the same name."
         )
     model = registry.make("model", part)
-    if not isinstance(model, Oracle) and not callable(getattr(model, "predict", None)):
+    if not isinstance(model, PRIVILEGED) and not callable(getattr(model, "predict", None)):
         raise ConfigError(
             f"Expected model {part.part!r} to have `predict(observation)`, got {type(model).__name__} without it."
         )
@@ -213,7 +240,7 @@ def class_mismatch(
 
 
 def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
-    """Lets a model predict: the oracle from the Terrain, every other from its Observation alone.
+    """Lets a model predict: the privileged ones from the Terrain, every other from its Observation alone.
 
     Args:
         model: any model.
@@ -225,7 +252,7 @@ def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
     Raises:
         ConfigError: the model's answer does not fit the maps.
     """
-    if isinstance(model, Oracle):
+    if isinstance(model, PRIVILEGED):
         return model.predict_terrain(terrain)
     mixture: Any = model.predict(terrain.observe())
     shape = (len(terrain), *terrain.grid.shape)

@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from benchnav.planning.env_batch import AnyPart, EnvBatch, Observations
+from benchnav.planning.env_batch import AnyPart, AnyWorld, EnvBatch, Observations
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
@@ -31,8 +31,7 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     | `split`         | `""`          | which of its splits; empty for `train`, else its first, with a warning |
     | `robot`         | `"unicycle"`  | F: a name, `file.py:Name`, `{"part": NAME, "options": {…}}`, or a robot |
     | `objective`     | `""`          | J, likewise; empty for the shaped reward                             |
-    | `noise`         | `"resampled"` | λ anew at each step, or `"stored"`, the map's realised λ             |
-    | `time_budget_s` | `100.0`       | T                                                                    |
+    | `world`         | `"paper"`     | what λ does: `"paper"`, `"stakes"`, or changes to one of them        |
     | `goal_radius_m` | `1.0`         | a robot this near to its goal has arrived                            |
 
     ## Action space
@@ -54,26 +53,35 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     S is 3 for the unicycle and the bicycle, 5 for the differential drive, whose velocities v and ω follow.
 
     ## Reward
-    Without `objective`: metres gained toward the goal, −0.1 a second, +10 on arrival and −10 off the map.
-    With one: minus its stage cost, read at the state before the step and the λ met there. A step off the
-    map costs as much again for each step that is left, as if the robot stood there until T.
+    Without `objective`: metres gained toward the goal, −0.1 a second, +10 on arrival and −10 off the map or
+    where the ground holds the robot for good. With one: minus its stage cost, read at the state before the
+    step and the λ met there. A step that loses the robot in one of these ways costs as much again for each
+    step that is left, as if the robot stood there until T.
+
+    ## World
+    `"paper"`: λ is drawn anew at each step, low λ ends nothing, T = 100 s. `"stakes"`: λ is drawn once an
+    episode as a correlated field; 2 s on λ under 0.1 end it; T is 3 × the map's reference time at top speed.
+    Changes are given as a mapping, such as `{"preset": "stakes", "correlation_m": 2.0}`,
+    `{"noise": "stored", "time_budget_s": 60.0}` or `{"preset": "stakes", "immobile": None}`; see
+    `benchnav.planning.world.world.World`.
 
     ## Start and end
     An episode starts at the start of a map of the split, drawn at random or given by
-    `options={"instance": i}`, heading at the goal. It terminates at the goal or off the map, and is
-    truncated after `time_budget_s`.
+    `options={"instance": i}`, heading at the goal. It terminates at the goal, off the map, or
+    where the world says that the ground holds the robot for good; and is truncated after T.
 
     ## Info
 
     | key              | type  | meaning                                                    |
     |------------------|-------|------------------------------------------------------------|
     | `instance`       | int   | number of the map in its split                             |
-    | `outcome`        | str   | `running`, `success`, `timeout` or `out_of_bounds`         |
+    | `outcome`        | str   | `running`, `success`, `timeout`, `immobilised` or `out_of_bounds` |
     | `is_success`     | bool  | the goal was reached                                       |
     | `traversability` | float | λ met in the step; 1 after a reset                         |
     | `distance_m`     | float | to the goal                                                |
 
     ## Version history
+    * v0 of benchnav 0.3: `world` in place of `noise` and `time_budget_s`.
     * v0 of benchnav 0.2: `robot` in place of `dynamics`; `objective`, `goal_radius_m` and `is_success` are
       new; `split` is `train` by default, was `test/std`; `noise` "stored", was "frozen".
     * v0 of benchnav 0.1: first version.
@@ -87,12 +95,11 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
         split: str = "",
         robot: AnyPart | Robot = "unicycle",
         objective: AnyPart | Objective = "",
-        noise: str = "resampled",
-        time_budget_s: float = 100.0,
+        world: AnyWorld = "paper",
         goal_radius_m: float = 1.0,
     ) -> None:
         """Loads the maps of the split; see the class."""
-        self._batch = EnvBatch(1, data, split, robot, objective, noise, time_budget_s, goal_radius_m)
+        self._batch = EnvBatch(1, data, split, robot, objective, world, goal_radius_m)
         self.observation_space = self._batch.observation_space
         self.action_space = self._batch.action_space
 
@@ -129,8 +136,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         split: which split.
         robot: F.
         objective: J.
-        noise: what λ does.
-        time_budget_s: T.
+        world: what λ does.
         goal_radius_m: where a robot has arrived.
     """
 
@@ -143,13 +149,12 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         split: str = "",
         robot: AnyPart | Robot = "unicycle",
         objective: AnyPart | Objective = "",
-        noise: str = "resampled",
-        time_budget_s: float = 100.0,
+        world: AnyWorld = "paper",
         goal_radius_m: float = 1.0,
     ) -> None:
         """Loads the maps of the split; see the class."""
         self.num_envs = num_envs
-        self._batch = EnvBatch(num_envs, data, split, robot, objective, noise, time_budget_s, goal_radius_m)
+        self._batch = EnvBatch(num_envs, data, split, robot, objective, world, goal_radius_m)
         self.single_observation_space = self._batch.observation_space
         self.single_action_space = self._batch.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)

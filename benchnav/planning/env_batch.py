@@ -4,8 +4,8 @@ A stateful shell over the Simulation, with NumPy at the boundary; the Gymnasium 
 over this. Letters in shapes: B sub-environments, H×W cells, S state and A action dimensions.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,18 @@ from benchnav.planning.objective import GoalDistance, Objective, distance
 from benchnav.planning.problem import Task, heading_to
 from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.places import Places
+from benchnav.planning.world.settings import read_world
 from benchnav.planning.world.simulation import Simulation, SimulationState
 from benchnav.planning.world.world import World
 
 SUCCESS_REWARD = 10.0
-OUT_OF_BOUNDS_REWARD = -10.0
+LOST_REWARD = -10.0
 TIME_REWARD_PER_S = -0.1
 
 Observations = dict[str, np.ndarray]
 AnyPart = str | Mapping[str, Any] | registry.Part
+AnyWorld = str | Mapping[str, Any] | World
 
 
 class EnvBatch:
@@ -43,8 +46,7 @@ class EnvBatch:
         split: which of its splits; empty for `train`, else the first.
         robot: name or mapping of a registered robot, or one itself.
         objective: likewise of an objective; empty for the shaped reward.
-        noise: `resampled` or `stored`.
-        time_budget_s: T.
+        world: what λ does: a preset by name, a mapping of changes to one, or a world itself.
         goal_radius_m: a robot this near to its goal has arrived.
     """
 
@@ -55,21 +57,21 @@ class EnvBatch:
         split: str,
         robot: AnyPart | Robot,
         objective: AnyPart | Objective,
-        noise: str,
-        time_budget_s: float,
+        world: AnyWorld,
         goal_radius_m: float,
     ) -> None:
         """Loads the maps of the split."""
-        self._world = World(noise=noise, time_budget_s=time_budget_s)
+        self._world = world if isinstance(world, World) else read_world(world)[0]
         made: Any = _part("robot", robot)
         self._objective: Any = _part("objective", objective, robot=made) if objective else None
         rules = Rules(goal_radius_m=goal_radius_m)
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
         dataset = TerrainDataset(find_dataset(data))
         split = split or _default_split(dataset)
-        self._maps = dataset.terrain(split)
-        places = dataset.read(split, fields=["start_m", "goal_m"])
-        self._start, self._goal = (torch.from_numpy(places[name]) for name in ("start_m", "goal_m"))
+        self._maps = replace(dataset.terrain(split), look_alikes=None)  # which nobody asks for here
+        places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
+        self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
+        self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)  # to be refused at once
         self._low, self._high = (
             torch.tensor(bound, dtype=torch.float32) for bound in (made.action_low, made.action_high)
         )
@@ -103,11 +105,7 @@ class EnvBatch:
         # Only what began anew is built: the others keep their maps and luck.
         index = torch.from_numpy(members)
         self._simulation = self._simulation.exchange(index, fresh)
-        self._now = SimulationState(
-            self._now.state.index_copy(0, index, start.state),
-            self._now.outcome.index_copy(0, index, start.outcome),
-            self._now.step.index_copy(0, index, start.step),
-        )
+        self._now = _each(self._now, lambda name, value: value.index_copy(0, index, getattr(start, name)))
 
     def step(
         self, actions: np.ndarray, hold: np.ndarray | None = None
@@ -129,23 +127,19 @@ class EnvBatch:
         if given.shape != (len(self._instance), *self._low.shape):
             expected = [len(self._instance), *self._low.shape]
             raise ConfigError(f"Expected actions of shape {expected}, got {list(given.shape)}.")
-        held = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
+        waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
         action = given.clamp(self._low, self._high)
         moved, met = simulation.step(now, action)
-        self._now = replace(
-            moved,
-            state=torch.where(held[:, None], now.state, moved.state),
-            outcome=torch.where(held, now.outcome, moved.outcome),
-            step=torch.where(held, now.step, moved.step),
+        self._now = _each(
+            moved, lambda name, value: torch.where(_beside(waits, value), getattr(now, name), value)
         )
         reward = self._shaped(now) if self._objective is None else self._minus_cost(now, action, met)
         outcome = self._now.outcome
-        terminated = (outcome == Outcome.SUCCESS) | (outcome == Outcome.OUT_OF_BOUNDS)
         return (
-            torch.where(held, 0.0, reward).double().numpy(),
-            terminated.numpy(),
+            torch.where(waits, 0.0, reward).double().numpy(),
+            ((outcome == Outcome.SUCCESS) | _lost(outcome)).numpy(),
             (outcome == Outcome.TIMEOUT).numpy(),
-            torch.where(held, 1.0, met).numpy(),
+            torch.where(waits, 1.0, met).numpy(),
         )
 
     def observe(self) -> Observations:
@@ -173,16 +167,16 @@ class EnvBatch:
     def _begin(self, members: np.ndarray) -> tuple[Simulation, SimulationState]:
         """A simulation of some sub-environments alone, and its start."""
         instances = torch.from_numpy(self._instance[members])
-        goal = self._goal[instances]
+        places = self._places.select(instances)
         simulation = Simulation(
             self._maps.select(instances),
             self._task,
             self._world,
-            goal,
+            places,
             rng.stream_key(0, "environment"),
             self._luck[members].tolist(),
         )
-        pose = heading_to(self._start[instances], goal)
+        pose = heading_to(places.start_m, places.goal_m)
         return simulation, simulation.init(self._task.robot.initial_state(pose))
 
     def _shaped(self, before: SimulationState) -> Tensor:
@@ -191,14 +185,14 @@ class EnvBatch:
         reward = self._distance_m(before) - self._distance_m(now)
         reward = reward + TIME_REWARD_PER_S * self._task.robot.dt_s
         reward = reward + SUCCESS_REWARD * (now.outcome == Outcome.SUCCESS)
-        return reward + OUT_OF_BOUNDS_REWARD * (now.outcome == Outcome.OUT_OF_BOUNDS)
+        return reward + LOST_REWARD * _lost(now.outcome)
 
     def _minus_cost(self, before: SimulationState, action: Tensor, met: Tensor) -> Tensor:
         """Minus J's stage cost, shape [B]."""
         simulation, now = self._current()
         cost = self._objective.stage(before.state, action, met, self._goal_m())
-        # Else leaving the map would be the cheapest way to end a costly episode.
-        left_over = (simulation.steps - now.step) * (now.outcome == Outcome.OUT_OF_BOUNDS)
+        # Else to be lost would be the cheapest way to end a costly episode.
+        left_over = (simulation.steps - now.step) * _lost(now.outcome)
         return -cost * (1 + left_over)
 
     def _observation_space(self) -> spaces.Dict:
@@ -220,10 +214,25 @@ class EnvBatch:
         return self._simulation, self._now
 
     def _goal_m(self) -> Tensor:
-        return self._goal[self._instance]
+        return self._places.goal_m[self._instance]
 
     def _distance_m(self, now: SimulationState) -> Tensor:
         return distance(now.state, self._goal_m())
+
+
+def _each(now: SimulationState, change: Callable[[str, Tensor], Tensor]) -> SimulationState:
+    """A state of the simulation with every tensor changed, given its name."""
+    return SimulationState(**{f.name: change(f.name, getattr(now, f.name)) for f in fields(now)})
+
+
+def _beside(which: Tensor, value: Tensor) -> Tensor:
+    """Members, bool [B], with as many dimensions as `value`."""
+    return which.view(-1, *[1] * (value.ndim - 1))
+
+
+def _lost(outcome: Tensor) -> Tensor:
+    """Off the map, or held by the ground for good: no later step could mend it."""
+    return (outcome == Outcome.OUT_OF_BOUNDS) | (outcome == Outcome.IMMOBILISED)
 
 
 def _part(kind: str, given: Any, **made_for: Any) -> Any:

@@ -48,7 +48,7 @@ class Problem:
         free: S_free, the goal's disc included, bool, shape [B, H, W].
         start: initial states, shape [B, S].
         goal_m: (x, y) of the goals, shape [B, 2].
-        time_budget_s: T.
+        time_budget_s: T of each episode, shape [B].
     """
 
     task: Task
@@ -58,7 +58,7 @@ class Problem:
     free: Tensor
     start: Tensor
     goal_m: Tensor
-    time_budget_s: float
+    time_budget_s: Tensor
 
     def __post_init__(self) -> None:
         """Checks that the batch is one batch."""
@@ -67,6 +67,7 @@ class Problem:
             "risk_map": (batch, *self.grid.shape),
             "free": (batch, *self.grid.shape),
             "goal_m": (batch, 2),
+            "time_budget_s": (batch,),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -189,7 +190,7 @@ def pose_problem(
     risk_map: Tensor,
     start_m: Tensor,
     goal_m: Tensor,
-    time_budget_s: float,
+    time_budget_s: Tensor | float,
 ) -> Problem:
     """Poses the problem of driving from start to goal, heading at the goal.
 
@@ -200,7 +201,7 @@ def pose_problem(
         risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
         start_m: (x, y), shape [B, 2].
         goal_m: (x, y), shape [B, 2].
-        time_budget_s: T.
+        time_budget_s: T, of all or of each, shape [B].
     """
     rules = task.rules
     at_goal = cells_at_goal(observation.grid, goal_m, rules.goal_radius_m)
@@ -212,7 +213,7 @@ def pose_problem(
         free=rules.free_space.mask(risk_map, mixture) | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
-        time_budget_s=time_budget_s,
+        time_budget_s=torch.as_tensor(time_budget_s).to(goal_m).expand(len(goal_m)).clone(),
     )
 
 

@@ -2,8 +2,9 @@
 
 A measure is a function of a `TraversabilityMixture` with parameters of shape [B, K, H, W] that gives λ̂ in
 [0, 1] of shape [B, H, W]; its further keyword parameters are its options. A setting is written
-`name` or `name:level`: `cvar:0.9`, `var:0.95`, `mean`. Risk means the lower tail of λ; a higher level is
-more cautious. Source: paper II and III-B.
+`name` or `name:level`: `cvar:0.9`, `var:0.95`, `expected-time:0.05`, `mean`. Risk means the lower tail of λ;
+a higher level of CVaR or VaR is more cautious. Source: paper II and III-B; `expected_time` and `chance` go
+beyond it.
 """
 
 from collections.abc import Callable
@@ -41,11 +42,36 @@ def cvar(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
     return mixture.cvar(level)
 
 
-def single_class(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
-    """The CVaR of the most likely class alone.
+def expected_time(mixture: TraversabilityMixture, floor: float = 0.05) -> Tensor:
+    """1 / E[1 / max(λ, floor)], by which a path's length gives its expected time.
+
+    What a risk-neutral robot plans with where λ stays what it is at a place: it holds against the mean that
+    time is lost on slow ground, and looks at no tail. A lower floor makes ground that holds a robot dearer.
 
     Args:
         mixture: distribution a cell.
+        floor: least speed, as a share of the commanded one, in (0, 1].
+    """
+    return mixture.harmonic_mean(floor)
+
+
+def chance(mixture: TraversabilityMixture, bound: float = 0.1) -> Tensor:
+    """P(λ ≥ bound), the chance that the ground carries the robot.
+
+    Args:
+        mixture: distribution a cell.
+        bound: traversability in [0, 1].
+    """
+    if not 0 <= bound <= 1:
+        raise ConfigError(f"Expected `bound` in [0, 1], got {bound}.")
+    return mixture.chance(bound)
+
+
+def single_class(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+    """The CVaR of the most likely class alone, its soft spots with it.
+
+    Args:
+        mixture: distribution a cell, whose components belong to classes.
         level: α in [0, 1).
     """
     return mixture.most_likely().cvar(level)

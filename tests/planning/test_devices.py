@@ -23,6 +23,8 @@ from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world import realisation
+from benchnav.planning.world import simulation as simulation_module
+from benchnav.planning.world import world as world_module
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, end
 from benchnav.planning.world.world import World
@@ -121,10 +123,14 @@ def test_a_problem_is_posed_selected_and_copied_where_it_is() -> None:
 @pytest.mark.parametrize("noise", ["resampled", "stored"])
 @pytest.mark.parametrize("robot", registry.names("robot"))
 def test_the_simulation(robot: str, noise: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(realisation, "bool", lambda values: False, raising=False)
+    # What is asked of the device once, when episodes begin.
+    for module in (realisation, world_module):
+        monkeypatch.setattr(module, "bool", lambda values: False, raising=False)
+    monkeypatch.setattr(simulation_module, "int", lambda values: 20, raising=False)
     problem = make_problem(robot=registry.make("robot", robot))
     world = World(noise=noise, time_budget_s=2.0)
-    simulation = Simulation(terrain_on_gpu(), problem.task, world, problem.goal_m, 0, range(BATCH))
+    places = factories.places(problem.goal_m)
+    simulation = Simulation(terrain_on_gpu(), problem.task, world, places, 0, range(BATCH))
     now = simulation.init(problem.start)
     for _ in range(2):
         now, met = simulation.step(now, gpu(BATCH, 2))
@@ -134,7 +140,7 @@ def test_the_simulation(robot: str, noise: str, monkeypatch: pytest.MonkeyPatch)
         expect(met, BATCH)
     expect(simulation.unhindered(now, gpu(BATCH, 2)), *problem.start.shape)
     now = end(now, now.running, Outcome.PLANNER_ERROR)
-    expect(tell_standstill(now.outcome, gpu(BATCH, 21, 2), gpu(BATCH, 20), 0.1), BATCH, dtype=torch.int64)
+    expect(tell_standstill(now.outcome, now.step, gpu(BATCH, 21, 2), gpu(BATCH, 20), 0.1), BATCH, dtype=torch.int64)
 
 
 def step_of(problem: Problem) -> Step:

@@ -17,6 +17,7 @@ from benchnav.errors import BenchnavError, ConfigError
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.world.realisation import Realisation
+from benchnav.planning.world.world import World
 from tests import factories
 
 ID = "benchnav/OffRoad-v0"
@@ -47,7 +48,7 @@ def drive(env: Any, observation: dict[str, np.ndarray]) -> np.ndarray:
 
 @pytest.mark.parametrize("robot", registry.names("robot"))
 def test_the_checkers_of_gymnasium_and_stable_baselines_pass(dataset_path: Path, robot: str) -> None:
-    env = make(dataset_path, time_budget_s=2.0, robot=robot, objective="travel_time")
+    env = make(dataset_path, world={"time_budget_s": 2.0}, robot=robot, objective="travel_time")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         check_env(env)
@@ -59,13 +60,14 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(dataset_path: Path,
     [
         {},
         {"robot": "differential_drive", "objective": "goal_distance"},
-        {"noise": "stored", "goal_radius_m": 6.0},
+        {"world": {"noise": "stored", "time_budget_s": 1.0}, "goal_radius_m": 6.0},
+        {"world": {"preset": "stakes", "time_budget_s": 1.0, "immobile": None}},
     ],
 )
 def test_each_vector_member_is_the_single_environment_with_its_seed(
     dataset_path: Path, settings: dict[str, Any]
 ) -> None:
-    settings = {"split": "train", "time_budget_s": 1.0, **settings}
+    settings = {"split": "train", "world": {"time_budget_s": 1.0}, **settings}
     vector = make_vector(dataset_path, 3, **settings)
     singles = [make(dataset_path, **settings) for _ in range(3)]
     batch, _ = vector.reset(seed=7)
@@ -106,7 +108,7 @@ def test_members_that_end_apart_begin_anew_alone(dataset_path: Path, monkeypatch
         draw(self, terrain, *given)
 
     monkeypatch.setattr(Realisation, "__init__", count)
-    vector = make_vector(dataset_path, 4, split="train", time_budget_s=1.0)
+    vector = make_vector(dataset_path, 4, split="train", world={"time_budget_s": 1.0})
     vector.reset(seed=0)
     vector.unwrapped._ended = np.array([False, True, False, True])
     vector.step(np.tile(AHEAD, (4, 1)))
@@ -114,7 +116,7 @@ def test_members_that_end_apart_begin_anew_alone(dataset_path: Path, monkeypatch
 
 
 def test_reward_is_progress_less_time_and_arrival_ends(dataset_path: Path) -> None:
-    env = make(dataset_path, noise="stored")
+    env = make(dataset_path, world={"noise": "stored"})
     observation, info = env.reset(seed=0, options={"instance": 1})
     assert info["instance"] == 1
     assert info["is_success"] is False
@@ -187,7 +189,7 @@ def test_an_objective_is_taken_by_name_with_options_and_the_robot(dataset_path: 
 
 
 def test_leaving_the_map_costs_what_standing_there_until_the_end_would(dataset_path: Path) -> None:
-    env = make(dataset_path, objective="goal_distance", time_budget_s=60.0)
+    env = make(dataset_path, objective="goal_distance", world={"time_budget_s": 60.0})
     steps, reward, info, distance = leave(env)
     assert info["outcome"] == "out_of_bounds"
     assert reward == pytest.approx(-distance * (1 + 600 - steps), rel=1e-5)
@@ -196,7 +198,7 @@ def test_leaving_the_map_costs_what_standing_there_until_the_end_would(dataset_p
 def test_a_robot_is_taken_by_name_and_its_state_and_actions_are_seen(dataset_path: Path) -> None:
     part = {"part": "differential_drive", "options": {"speed_mps": [-0.5, 2.0], "dt_s": 0.2}}
     for robot in (part, DifferentialDrive(speed_mps=(-0.5, 2.0), dt_s=0.2)):
-        env = make(dataset_path, robot=robot, noise="stored")
+        env = make(dataset_path, robot=robot, world={"noise": "stored"})
         assert env.observation_space["state"].shape == (5,)
         np.testing.assert_allclose(env.action_space.low, [-0.5, -1.0])
         np.testing.assert_allclose(env.action_space.high, [2.0, 1.0])
@@ -231,7 +233,7 @@ def test_a_dataset_without_train_gives_its_first_split_and_says_so(tmp_path: Pat
 
 
 def test_time_budget_and_goal_radius_end_episodes(dataset_path: Path) -> None:
-    env = make(dataset_path, time_budget_s=0.3)
+    env = make(dataset_path, world={"time_budget_s": 0.3})
     env.reset(seed=0)
     assert [env.step(AHEAD)[3] for _ in range(3)] == [False, False, True]
     env = make(dataset_path, goal_radius_m=500.0)
@@ -241,15 +243,15 @@ def test_time_budget_and_goal_radius_end_episodes(dataset_path: Path) -> None:
 
 def test_each_episode_has_luck_of_its_own_and_stored_noise_has_none(dataset_path: Path) -> None:
     kinds = {}
-    for noise in ("resampled", "stored"):
-        env = make(dataset_path, noise=noise)
+    for noise in ("resampled", "stored", "frozen"):
+        env = make(dataset_path, world={"noise": noise})
         env.reset(seed=0)
         met = []
         for _ in range(6):
             env.reset(options={"instance": 0})
             met.append(env.step(np.zeros(2, np.float32))[4]["traversability"])
         kinds[noise] = len(set(met))
-    assert kinds["resampled"] > 2
+    assert min(kinds["resampled"], kinds["frozen"]) > 2
     assert kinds["stored"] == 1
 
 
@@ -272,13 +274,14 @@ def test_an_observation_that_is_written_into_changes_nothing(dataset_path: Path)
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({"noise": "loud"}, "noise"),
-        ({"noise": "frozen"}, "now 'stored'"),
+        ({"world": {"noise": "loud"}}, "noise"),
+        ({"world": "stake"}, "Did you mean 'stakes'"),
+        ({"world": {"nose": "stored"}}, "Did you mean 'noise'"),
         ({"robot": "unicycel"}, "Did you mean 'unicycle'"),
         ({"robot": {"part": "unicycle", "options": {"speed": 3}}}, "speed_mps"),
         ({"objective": "fuel"}, "goal_distance"),
         ({"split": "night"}, "split"),
-        ({"time_budget_s": 0.0}, "time_budget_s"),
+        ({"world": {"time_budget_s": 0.0}}, "time_budget_s"),
         ({"goal_radius_m": 0.0}, "goal_radius_m"),
     ],
 )
@@ -298,3 +301,38 @@ def test_misuse_is_named(dataset_path: Path) -> None:
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match=r"shape \[3, 2\], got \[2\]"):
         vector.step(AHEAD)
+
+
+def test_the_world_with_stakes_holds_a_robot_for_good(dataset_path: Path) -> None:
+    # On ground of λ under 1, so everywhere; a frozen world would see to it that the start is no such ground.
+    held = {"noise": "stored", "time_budget_ratio": 3.0, "immobile": {"below": 1.0, "for_s": 0.4}}
+    env = make(dataset_path, split="test/std", world=held, objective="goal_distance")
+    for seed in range(20):
+        _, info = env.reset(seed=seed)
+        steps, ended = 0, False
+        while not ended:
+            _, reward, ended, cut, info = env.step(np.zeros(2, np.float32))
+            steps += 1
+            assert not cut
+        assert info["outcome"] == "immobilised"
+        assert steps == 4
+        reference = float(env._batch._places.reference_time_s[info["instance"]])
+        left = round(3 * reference / 0.1) - steps
+        assert reward == pytest.approx(-info["distance_m"] * (1 + left), rel=1e-4)
+        shaped = make(dataset_path, split="test/std", world=held)
+        shaped.reset(seed=seed)
+        assert [shaped.step(np.zeros(2, np.float32))[1] for _ in range(4)][-1] == pytest.approx(-10.01)
+        if seed > 2:
+            return
+
+
+def test_a_world_may_be_given_as_itself(dataset_path: Path) -> None:
+    world = World(noise="stored", time_budget_s=0.2)
+    env = make(dataset_path, world=world)
+    env.reset(seed=0)
+    assert [env.step(AHEAD)[3] for _ in range(2)] == [False, True]
+
+
+def test_maps_without_a_reference_time_have_no_budget_by_it(dataset_path: Path) -> None:
+    with pytest.raises(ConfigError, match="solvable"):
+        make(dataset_path, split="train", world="stakes")

@@ -54,7 +54,7 @@ def test_a_problem_is_posed_from_what_is_predicted() -> None:
     assert problem.start[:, 2].tolist() == pytest.approx(expected)
     # The robot says what stands beside the pose.
     assert problem.start[:, 3:].tolist() == [[0.0, 0.0]] * 3
-    assert problem.time_budget_s == 42.0
+    assert problem.time_budget_s.tolist() == [42.0] * BATCH
     assert torch.equal(problem.risk_map, problem.mixture.cvar(0.5))
     assert problem.dt_s == 0.1
     assert torch.equal(problem.elevation_m, problem.observation.elevation_m)

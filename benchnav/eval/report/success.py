@@ -65,7 +65,7 @@ def _draw(
     for row in rows.to_dict("records"):
         setting = (row["planner"], row["model"], row["risk"])
         rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
-        blind = row["risk"] == NOT_USED
+        blind = row["model"] == NOT_USED
         colour = "0.45" if blind else palette(planners.index(row["planner"]) % 10)
         place = settings[setting]
         panel.plot([low, high], [place, place], color=colour, lw=1.4, solid_capstyle="butt")

@@ -122,7 +122,16 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
 
 def _world(value: Mapping[str, Any]) -> str:
     world, rules = value["world"], value.get("rules")
-    words = [f"noise {world['noise']}", f"T = {world['time_budget_s']:g} s"]
+    words = [f"λ {world['noise']}"]
+    if "correlation_m" in world:
+        words[0] += f", correlated over {world['correlation_m']:g} m"
+    if "immobile" in world:
+        held = world["immobile"]
+        words.append(f"an episode ends after {held['for_s']:g} s of λ under {held['below']:g}")
+    if "time_budget_ratio" in world:
+        words.append(f"T = {world['time_budget_ratio']:g} × the reference time at the robot's top speed")
+    else:
+        words.append(f"T = {world['time_budget_s']:g} s")
     if rules:
         free = rules["free_space"]
         words.append(f"free where the {free['by']} map is above {free['above']:g}")

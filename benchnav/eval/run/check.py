@@ -3,6 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+import torch
+
 from benchnav import registry
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
@@ -65,8 +68,8 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
         check_steers(trial.make_planner(), trial.make_task().robot, trial.planner.label)
         _check_first_plan(trial)
     for trial in trials:
-        trial.world.steps(trial.make_task().robot.dt_s)
         trial.make_risk()
+    _check_budgets(trials, datasets, suite.instances, say)
     if elsewhere:
         _check_everywhere(trials)
     for trial in _distinct(trials, ("model",)):
@@ -103,6 +106,35 @@ def _check_split(trial: Trial, known: list[str], dataset: TerrainDataset, instan
             f"Expected `instances` at most {there}, the maps of {trial.split} in {dataset.path}, "
             f"got {instances}. 0 takes all."
         )
+
+
+def _check_budgets(
+    trials: list[Trial], datasets: dict[str, TerrainDataset], instances: int, say: Say
+) -> None:
+    """Refuses time budgets that no instance can be driven in at top speed, and tells of those that some cannot."""
+    seen = set()
+    for trial in trials:
+        task = trial.make_task()
+        top_speed, radius = task.robot.top_speed_mps, task.rules.goal_radius_m
+        case = (trial.data, trial.split, trial.world, top_speed, task.robot.dt_s, radius)
+        if case in seen:
+            continue
+        seen.add(case)
+        chosen = range(instances or datasets[trial.data].map_count(trial.split))
+        read = datasets[trial.data].read(trial.split, chosen, ["start_m", "goal_m", "reference_time_s"])
+        budget = trial.world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
+        trial.world.steps(budget, task.robot.dt_s)
+        way = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - radius
+        late = way / top_speed > budget.numpy()
+        if late.all():
+            raise ConfigError(
+                f"Expected a time budget that a robot of {top_speed:g} m/s can arrive in, got {float(budget.max()):g} s "
+                f"where the nearest goal of {trial.split} is {way.min() + radius:.1f} m away."
+            )
+        if late.any():
+            say(
+                f"in {late.sum()} of {len(late)} instances of {trial.split} the goal is too far to be reached within T"
+            )
 
 
 def _check_members(trial: Trial) -> None:

@@ -6,26 +6,26 @@ of its block that a process runs one after another.
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from benchnav import rng
 from benchnav.datagen.store import TerrainDataset, find_dataset
-from benchnav.errors import BenchnavError
+from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
 from benchnav.eval.run.unit import Unit
 from benchnav.eval.trial import Trial
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.predictor import predict
+from benchnav.models.predictor import Clairvoyant, predict
 from benchnav.planning import risk
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
 from benchnav.terrain import Terrain
 
@@ -36,15 +36,11 @@ class Block:
 
     Args:
         terrain: the true maps.
-        start_m: (x, y), shape [B, 2].
-        goal_m: (x, y), shape [B, 2].
-        reference_time_s: grid reference times, shape [B].
+        places: starts, goals and grid reference times.
     """
 
     terrain: Terrain
-    start_m: Tensor
-    goal_m: Tensor
-    reference_time_s: np.ndarray
+    places: Places
 
 
 def read_block(unit: Unit, run_id: str) -> Block:
@@ -69,8 +65,10 @@ def build(unit: Unit, run_id: str) -> tuple[Problem, Simulation]:
     """
     trial = unit.trial
     block, task = read_block(unit, run_id), trial.make_task()
+    luck = luck_key(unit.seed, trial.split, unit.realisation)
+    simulation = Simulation(block.terrain, task, trial.world, block.places, luck, unit.instances)
     try:
-        mixture = _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances)
+        mixture = _predict(unit, run_id, simulation.field)
         risk_map = risk.apply(trial.make_risk(), mixture)
     except (Exception, SystemExit) as error:
         raise PredictionError(fault(error)) from error
@@ -79,13 +77,28 @@ def build(unit: Unit, run_id: str) -> tuple[Problem, Simulation]:
         block.terrain.observe(),
         mixture,
         risk_map,
-        block.start_m,
-        block.goal_m,
-        trial.world.time_budget_s,
+        block.places.start_m,
+        block.places.goal_m,
+        simulation.time_budget_s,
     )
-    luck = luck_key(unit.seed, trial.split, unit.realisation)
-    simulation = Simulation(block.terrain, task, trial.world, block.goal_m, luck, unit.instances)
     return problem, simulation
+
+
+def time_budgets(unit: Unit, run_id: str) -> Tensor:
+    """T of each episode of a unit, shape [B]."""
+    top_speed = unit.trial.make_task().robot.top_speed_mps
+    return unit.trial.world.budget_s(read_block(unit, run_id).places.reference_time_s, top_speed)
+
+
+def _predict(unit: Unit, run_id: str, field: Tensor | None) -> TraversabilityMixture:
+    """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
+    trial = unit.trial
+    model = _model(run_id, _ModelOf(trial))
+    if not isinstance(model, Clairvoyant):
+        return _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances)
+    if field is None:
+        raise ConfigError("Expected λ that stays what it is for the clairvoyant, got resampled λ.")
+    return predict(model, replace(read_block(unit, run_id).terrain, traversability=field))
 
 
 def luck_key(seed: int, split: str, realisation: int) -> int:
@@ -169,9 +182,7 @@ def _block(run_id: str, data: str, split: str, instances: tuple[int, ...]) -> Bl
     places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
     return Block(
         terrain=dataset.terrain(split, instances),
-        start_m=torch.from_numpy(places["start_m"]),
-        goal_m=torch.from_numpy(places["goal_m"]),
-        reference_time_s=places["reference_time_s"],
+        places=Places(**{name: torch.from_numpy(values) for name, values in places.items()}),
     )
 
 

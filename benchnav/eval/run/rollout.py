@@ -86,7 +86,7 @@ class _Log:
             else none[..., None].expand(-1, 0, actions),
             traversability=torch.stack(self.met, dim=1) if self.actions else none,
             turn_rate_radps=torch.stack(self.turned, dim=1) if self.actions else none,
-            outcome=tell_standstill(now.outcome, track[..., :2], driven, self.dt_s),
+            outcome=tell_standstill(now.outcome, now.step, track[..., :2], driven, self.dt_s),
             steps=now.step,
             planning_s=planning_s,
             errors=tuple(self.errors),

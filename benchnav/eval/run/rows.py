@@ -4,8 +4,11 @@ Sources: paper IV-A for success rate, total time and average traversability; Per
 "Benchmarking metric ground navigation" (BARN), for the score.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
+from torch import Tensor
 
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.unit import Unit
@@ -14,7 +17,12 @@ from benchnav.planning.world.outcome import Outcome
 
 
 def episode_rows(
-    unit: Unit, problem: Problem, episodes: Episodes, reference_time_s: np.ndarray, compiled: bool
+    unit: Unit,
+    problem: Problem,
+    episodes: Episodes,
+    reference_time_s: np.ndarray,
+    redrawn: Sequence[int],
+    compiled: bool,
 ) -> pd.DataFrame:
     """Tabulates episodes, a row each.
 
@@ -23,6 +31,8 @@ def episode_rows(
         problem: what was to be solved.
         episodes: what happened.
         reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
+        redrawn: how often the λ of each episode was drawn again, so that ground joins start and goal, B of
+            them.
         compiled: the planner ran compiled.
 
     Returns:
@@ -31,7 +41,7 @@ def episode_rows(
         `traversability`, the mean of the λ met; `reference_time_s`; `time_ratio`, over the reference time at
         the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
         `stuck_share`, share of steps with λ at most λ_stuck; `roughness_radps2`, the mean change of the
-        commanded turn rate; `planning_ms` a step and episode; `compiled`; `error`. What an episode that
+        commanded turn rate; `planning_ms` a step and episode; `redrawn`; `compiled`; `error`. What an episode that
         ended at once does not have is NaN.
     """
     top_speed = problem.robot.top_speed_mps
@@ -57,7 +67,7 @@ def episode_rows(
                 "instance": instance,
                 "outcome": outcome.name.lower(),
                 "success": success,
-                "total_time_s": end_time_s if success else problem.time_budget_s,
+                "total_time_s": end_time_s if success else float(problem.time_budget_s[b]),
                 "end_time_s": end_time_s,
                 "traversability": met.mean() if steps else np.nan,
                 "reference_time_s": float(reference_time_s[b]),
@@ -67,6 +77,7 @@ def episode_rows(
                 "stuck_share": float(stuck.double().mean()) if steps else np.nan,
                 "roughness_radps2": np.abs(np.diff(turn)).mean() / problem.dt_s if steps > 1 else np.nan,
                 "planning_ms": 1e3 * episodes.planning_s / steps_planned,
+                "redrawn": redrawn[b],
                 "compiled": compiled,
                 "error": episodes.errors[b],
             }
@@ -74,8 +85,8 @@ def episode_rows(
     return pd.DataFrame(rows)
 
 
-def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
-    """Rows of episodes that could not begin, since their model or risk measure failed."""
+def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
+    """Rows of episodes that could not begin, since their model or risk measure failed; T of shape [B]."""
     rows = [
         {
             "trial": unit.trial.id,
@@ -85,7 +96,7 @@ def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
             "instance": instance,
             "outcome": Outcome.MODEL_ERROR.name.lower(),
             "success": False,
-            "total_time_s": time_budget_s,
+            "total_time_s": budget,
             "end_time_s": 0.0,
             "traversability": np.nan,
             "reference_time_s": np.nan,
@@ -95,10 +106,11 @@ def error_rows(unit: Unit, time_budget_s: float, error: str) -> pd.DataFrame:
             "stuck_share": np.nan,
             "roughness_radps2": np.nan,
             "planning_ms": np.nan,
+            "redrawn": 0,
             "compiled": False,
             "error": error,
         }
-        for instance in unit.instances
+        for instance, budget in zip(unit.instances, time_budget_s.tolist(), strict=True)
     ]
     return pd.DataFrame(rows)
 

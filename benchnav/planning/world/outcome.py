@@ -24,26 +24,35 @@ class Outcome(IntEnum):
     STALLED = 6  # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner held it
     PLANNER_ERROR = 7  # the planner raised, ran out of time, or returned what no robot can do
     MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
+    IMMOBILISED = 9  # on ground that holds a robot, for as long as the world allows
 
 
 FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCESS))
 
 
-def tell_standstill(outcome: Tensor, positions_m: Tensor, driven_m: Tensor, dt_s: float) -> Tensor:
+def tell_standstill(
+    outcome: Tensor, steps: Tensor, positions_m: Tensor, driven_m: Tensor, dt_s: float
+) -> Tensor:
     """Tells timeouts in which the robot stood: stuck where it drove, stalled where it did not.
 
     Args:
         outcome: shape [B].
-        positions_m: shape [B, N + 1, 2], to the end of the time budget.
+        steps: steps that each episode took, int64, shape [B].
+        positions_m: shape [B, N + 1, 2], those after an episode's end not looked at.
         driven_m: how far each step would have moved the robot on ground of λ = 1, shape [B, N].
         dt_s: time step.
 
     Returns:
         Outcomes, shape [B].
     """
+    if driven_m.shape[1] == 0:
+        return outcome
     window = max(1, round(STUCK_WINDOW_S / dt_s))
-    recent = positions_m[:, -(window + 1) :]
+    back = torch.arange(-window, 1, device=steps.device)
+    place = (steps[:, None] + back).clamp(min=0)
+    recent = positions_m.gather(1, place[..., None].expand(-1, -1, 2))
     moved = torch.linalg.vector_norm(recent - recent[:, :1], dim=2).amax(dim=1)
-    drove = driven_m[:, -window:].sum(dim=1)
+    taken = steps[:, None] + back[:-1]
+    drove = torch.where(taken >= 0, driven_m.gather(1, taken.clamp(min=0)), 0.0).sum(dim=1)
     standing = torch.where(drove >= STUCK_DISTANCE_M, Outcome.STUCK, Outcome.STALLED)
     return torch.where((outcome == Outcome.TIMEOUT) & (moved < STUCK_DISTANCE_M), standing, outcome)

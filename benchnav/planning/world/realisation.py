@@ -1,7 +1,8 @@
 """The λ that robots meet: a value for each episode, step and place.
 
-Noise is keyed by (root key, instance, step), so every planner and setting meets the same luck, whatever
-the batch or the order. Letters in shapes: B episodes, N steps.
+Luck is keyed by (root key, instance, step), or by (root key, instance) where λ stays what it is, so every
+planner and setting meets the same, whatever the batch or the order. Letters in shapes: B episodes, N steps,
+H×W cells, K components.
 """
 
 import copy
@@ -13,8 +14,11 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.world.frozen import draw_frozen
+from benchnav.planning.world.places import Places
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
+from benchnav.terrain import Grid, Terrain
 
 
 class Realisation:
@@ -23,31 +27,41 @@ class Realisation:
     Args:
         terrain: the true maps.
         world: what λ does.
-        steps: steps N of the time budget.
-        key: root of the noise; see `rng.stream_key`.
+        places: starts and goals.
+        steps: most steps N of the time budgets.
+        key: root of the luck; see `rng.stream_key`.
         instances: names each episode's stream under that root, B of them.
+
+    Attributes:
+        field: the λ of every cell where it stays what it is, shape [B, H, W]; None where it is resampled.
+        attempts: how many fields were drawn for each episode, int64, shape [B].
     """
 
     def __init__(
-        self, terrain: Terrain, world: World, steps: int, key: int, instances: Sequence[int]
+        self,
+        terrain: Terrain,
+        world: World,
+        places: Places,
+        steps: int,
+        key: int,
+        instances: Sequence[int],
     ) -> None:
-        """Draws the luck of all steps."""
+        """Draws all luck."""
         self._grid = terrain.grid
+        self.attempts = torch.ones(len(terrain), dtype=torch.int64)
+        self.field: Tensor | None = None
         if world.noise == "stored":
-            if bool(terrain.traversability.isnan().any()):
-                raise ConfigError(
-                    "Expected maps with λ in every cell for `noise` 'stored', got some that were not observed. "
-                    "Take `noise` 'resampled'."
-                )
-            self._mean = terrain.grid.pad(terrain.traversability, outside=0.0)
-            self._std = torch.zeros_like(self._mean)
-        else:
-            self._mean = terrain.grid.pad(terrain.truth.means[:, 0], outside=0.0)
-            self._std = terrain.grid.pad(terrain.truth.stds[:, 0], outside=0.0)
+            self.field = _stored(terrain)
+        elif world.noise == "frozen":
+            self.field, self.attempts = draw_frozen(terrain, world, places, key, instances)
+        if self.field is not None:
+            self._ground = terrain.grid.pad(self.field, outside=0.0)[:, None]
+            return
+        self._ground = _padded_parameters(terrain.truth, terrain.grid)
         # A stream each, so that another time budget leaves the luck of the first steps as it is.
         first = np.zeros(1, dtype=np.int64)
         luck = [rng.normal(rng.stream_key(key, int(i)), first, (steps,)) for i in instances]
-        self._noise = torch.from_numpy(np.concatenate(luck)).to(self._mean)
+        self._noise = torch.from_numpy(np.concatenate(luck)).to(self._ground)
 
     def at(self, state: Tensor, step: Tensor) -> Tensor:
         """λ that robots meet at their next step.
@@ -60,8 +74,15 @@ class Realisation:
             λ in [0, 1], shape [B].
         """
         x, y = state[:, 0], state[:, 1]
-        noise = self._noise.gather(1, step.clamp(max=self._noise.shape[1] - 1)[:, None])[:, 0]
-        return (self._grid.lookup(self._mean, x, y) + self._grid.lookup(self._std, x, y) * noise).clamp(0, 1)
+        if self.field is not None:
+            return self._grid.lookup(self._ground[:, 0], x, y)
+        noise = self._noise.gather(1, step.clamp(max=self._noise.shape[1] - 1)[:, None])[:, :, None]
+        count = self._ground.shape[1]
+        found = self._grid.lookup(
+            self._ground.flatten(0, 1), x.repeat_interleave(count), y.repeat_interleave(count)
+        )
+        weights, means, stds = found.view(len(x), 3, count // 3, 1, 1).unbind(1)
+        return TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
 
     def exchange(self, members: Tensor, others: "Realisation") -> "Realisation":
         """Gives some episodes what they meet in another realisation of the same world.
@@ -71,6 +92,31 @@ class Realisation:
             others: of M episodes on maps of the same grid.
         """
         made = copy.copy(self)
-        for name in ("_mean", "_std", "_noise"):
+        for name in ("_ground", "attempts"):
             setattr(made, name, getattr(self, name).index_copy(0, members, getattr(others, name)))
+        if self.field is not None and others.field is not None:
+            made.field = self.field.index_copy(0, members, others.field)
+            return made
+        # Time budgets may differ; what is beyond an episode's own is never met.
+        most = max(self._noise.shape[1], others._noise.shape[1])
+        own, new = (torch.nn.functional.pad(n, (0, most - n.shape[1])) for n in (self._noise, others._noise))
+        made._noise = own.index_copy(0, members, new)
         return made
+
+
+def _stored(terrain: Terrain) -> Tensor:
+    if bool(terrain.traversability.isnan().any()):
+        raise ConfigError(
+            "Expected maps with λ in every cell for `noise` 'stored', got some that were not observed. "
+            "Take `noise` 'resampled'."
+        )
+    return terrain.traversability
+
+
+def _padded_parameters(truth: TraversabilityMixture, grid: Grid) -> Tensor:
+    """Weights, means and stds framed for lookups, shape [B, 3·K, N]; off the map λ is 0."""
+    framed = []
+    for values, outside in ((truth.weights, 1.0), (truth.means, 0.0), (truth.stds, 0.0)):
+        for k in range(values.shape[1]):
+            framed.append(grid.pad(values[:, k], outside=outside if k == 0 else 0.0))
+    return torch.stack(framed, dim=1)

@@ -14,6 +14,7 @@ from torch import Tensor
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Task
 from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.places import Places
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
 from benchnav.terrain import Terrain
@@ -27,11 +28,13 @@ class SimulationState:
         state: robot states, shape [B, S].
         outcome: `Outcome` of each, int64, shape [B].
         step: steps taken by each, int64, shape [B].
+        held: steps in a row, up to now, on ground that holds a robot, int64, shape [B].
     """
 
     state: Tensor
     outcome: Tensor
     step: Tensor
+    held: Tensor
 
     @property
     def running(self) -> Tensor:
@@ -46,9 +49,14 @@ class Simulation:
         terrain: the true maps.
         task: robot, goal radius; the same that planners are given.
         world: what λ does.
-        goal_m: goals, shape [B, 2].
-        noise_key: root of the noise; see `rng.stream_key`.
+        places: starts and goals.
+        luck_key: root of the luck; see `rng.stream_key`.
         instances: names each episode's stream under that root, B of them.
+
+    Attributes:
+        robot: F.
+        time_budget_s: T of each episode, shape [B].
+        steps: T in time steps, int64, shape [B].
     """
 
     def __init__(
@@ -56,22 +64,35 @@ class Simulation:
         terrain: Terrain,
         task: Task,
         world: World,
-        goal_m: Tensor,
-        noise_key: int,
+        places: Places,
+        luck_key: int,
         instances: Sequence[int],
     ) -> None:
-        """Draws the luck of all steps."""
+        """Draws all luck."""
         self.robot = task.robot
-        self.steps = world.steps(task.robot.dt_s)
-        self._grid, self._goal_m, self._goal_radius_m = terrain.grid, goal_m, task.rules.goal_radius_m
-        self._realisation = Realisation(terrain, world, self.steps, noise_key, instances)
-        self._low = goal_m.new_tensor(task.robot.action_low)
-        self._high = goal_m.new_tensor(task.robot.action_high)
+        self.time_budget_s = world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
+        self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
+        self._grid, self._goal_m, self._goal_radius_m = terrain.grid, places.goal_m, task.rules.goal_radius_m
+        most = int(self.steps.max())
+        self._realisation = Realisation(terrain, world, places, most, luck_key, instances)
+        self._immobile = world.immobile
+        self._low = places.goal_m.new_tensor(task.robot.action_low)
+        self._high = places.goal_m.new_tensor(task.robot.action_high)
+
+    @property
+    def field(self) -> Tensor | None:
+        """The λ of every cell where it stays what it is, shape [B, H, W]; None where it is resampled."""
+        return self._realisation.field
+
+    @property
+    def attempts(self) -> Tensor:
+        """How many fields were drawn until ground joined start and goal, int64, shape [B]."""
+        return self._realisation.attempts
 
     def init(self, start: Tensor) -> SimulationState:
         """Puts the robots at their initial states, shape [B, S]."""
         zero = torch.zeros(len(start), dtype=torch.int64, device=start.device)
-        return SimulationState(start.clone(), zero, zero)
+        return SimulationState(start.clone(), zero, zero, zero)
 
     def step(self, now: SimulationState, action: Tensor) -> tuple[SimulationState, Tensor]:
         """Advances the running episodes by one step; ended ones stay as they are.
@@ -91,9 +112,16 @@ class Simulation:
         arrived = distance(state, self._goal_m) < self._goal_radius_m
         inside = self._grid.contains(state[:, 0], state[:, 1])
         outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
+        held = now.held
+        if self._immobile is not None:
+            count = torch.where(traversability < self._immobile.below, held + 1, 0)
+            held = torch.where(now.running, count, held)
+            most = max(1, round(self._immobile.for_s / self.robot.dt_s))
+            outcome = torch.where(held >= most, Outcome.IMMOBILISED, outcome)
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(arrived, Outcome.SUCCESS, outcome)
-        return SimulationState(state, torch.where(now.running, outcome, now.outcome), step), traversability
+        outcome = torch.where(now.running, outcome, now.outcome)
+        return SimulationState(state, outcome, step, held), traversability
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
         """Where an action would take the robots on ground of λ = 1, shape [B, S]; what was commanded."""
@@ -108,7 +136,8 @@ class Simulation:
             others: M episodes of the same task and world.
         """
         made = copy.copy(self)
-        made._goal_m = self._goal_m.index_copy(0, members, others._goal_m)
+        for name in ("_goal_m", "time_budget_s", "steps"):
+            setattr(made, name, getattr(self, name).index_copy(0, members, getattr(others, name)))
         made._realisation = self._realisation.exchange(members, others._realisation)
         return made
 

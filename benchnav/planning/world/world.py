@@ -1,49 +1,126 @@
 """World: what traversability does to a robot, as a value; and the presets of world and rules."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.free_space import Rules
+from benchnav.planning.free_space import FreeSpace, Rules
 
-NOISES = ("resampled", "stored")
+NOISES = ("resampled", "stored", "frozen")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Immobile:
+    """What holds a robot for good.
+
+    Args:
+        below: λ met under this holds a robot.
+        for_s: an episode ends when it was held for so long without a break, whatever was commanded.
+    """
+
+    below: float = 0.1
+    for_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuses rules that hold always or never."""
+        if not 0 < self.below <= 1:
+            raise ConfigError(f"Expected `immobile.below` in (0, 1], got {self.below}.")
+        if not 0 < self.for_s < float("inf"):
+            raise ConfigError(f"Expected `immobile.for_s` > 0 and finite, got {self.for_s}.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What λ does; the defaults are the paper's. Low λ slows a robot and ends nothing.
+    """What λ does; the defaults are the paper's, where low λ slows a robot and ends nothing.
 
     Args:
-        noise: `resampled` at each step, or `stored`, the map's own realised λ.
+        noise: `resampled` at each step; `stored`, the map's own realised λ; or `frozen`, drawn once an
+            episode as a correlated field, each cell with its own distribution.
+        correlation_m: ℓ of frozen noise: cells at distance d have the correlation exp(−d²/2ℓ²) before each
+            takes its own distribution.
+        immobile: what ends an episode as immobilised; None for nothing.
         time_budget_s: T; an episode that is not at the goal by then has failed.
+        time_budget_ratio: T in multiples of the map's grid reference time at the robot's top speed, in place
+            of `time_budget_s`.
     """
 
     noise: str = "resampled"
-    time_budget_s: float = 100.0
+    correlation_m: float = 1.5
+    immobile: Immobile | None = None
+    time_budget_s: float | None = 100.0
+    time_budget_ratio: float | None = None
 
     def __post_init__(self) -> None:
         """Refuses worlds in which no episode can run."""
-        if self.noise == "frozen":
-            raise ConfigError(
-                "Expected `noise` 'resampled' or 'stored', got 'frozen', which is now 'stored'."
-            )
         if self.noise not in NOISES:
-            raise ConfigError(f"Expected `noise` {' or '.join(map(repr, NOISES))}, got {self.noise!r}.")
-        if not 0 < self.time_budget_s < float("inf"):
-            raise ConfigError(f"Expected `time_budget_s` > 0 and finite, got {self.time_budget_s}.")
+            raise ConfigError(
+                f"Expected `noise` {', '.join(map(repr, NOISES[:-1]))} or {NOISES[-1]!r}, got {self.noise!r}."
+            )
+        if not 0 <= self.correlation_m < float("inf"):
+            raise ConfigError(f"Expected `correlation_m` ≥ 0 and finite, got {self.correlation_m}.")
+        if (self.time_budget_s is None) == (self.time_budget_ratio is None):
+            raise ConfigError(
+                "Expected either `time_budget_s` or `time_budget_ratio`, got "
+                f"{self.time_budget_s} and {self.time_budget_ratio}."
+            )
+        for name in ("time_budget_s", "time_budget_ratio"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ConfigError(f"Expected `{name}` > 0 and finite, got {value}.")
 
-    def steps(self, dt_s: float) -> int:
-        """Number of time steps in the time budget.
+    def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
+        """T of each episode.
+
+        Args:
+            reference_time_s: grid reference times at 1 m/s, NaN where there is none, shape [B].
+            top_speed_mps: of the robot.
+
+        Returns:
+            Seconds, shape [B].
+
+        Raises:
+            ConfigError: T is a multiple of a reference time that is not there.
+        """
+        if self.time_budget_s is not None:
+            return torch.full_like(reference_time_s, self.time_budget_s)
+        assert self.time_budget_ratio is not None
+        if bool(reference_time_s.isnan().any()):
+            raise ConfigError(
+                "Expected maps with a reference time for `time_budget_ratio`, got some that were not asked to "
+                "be solvable. Give `time_budget_s`, or make the maps with `solvable: true`."
+            )
+        return self.time_budget_ratio * reference_time_s / top_speed_mps
+
+    def steps(self, budget_s: Tensor, dt_s: float) -> Tensor:
+        """Time steps in time budgets, int64, shape of `budget_s`.
 
         Raises:
             ConfigError: there is none.
         """
-        steps = round(self.time_budget_s / dt_s)
-        if steps < 1:
+        steps = (budget_s.double() / dt_s).round().long()
+        if bool((steps < 1).any()):
             raise ConfigError(
-                f"Expected `time_budget_s` of at least one time step of {dt_s:g} s, got {self.time_budget_s}."
+                f"Expected a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s."
             )
         return steps
+
+    def to_dict(self) -> dict[str, Any]:
+        """All that bears on what happens, as plain data for JSON; what the noise does not use is left out."""
+        plain = {name: value for name, value in asdict(self).items() if value is not None}
+        if self.noise != "frozen":
+            del plain["correlation_m"]
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> "World":
+        """Reads what `to_dict` gave."""
+        immobile = Immobile(**plain["immobile"]) if "immobile" in plain else None
+        budget = {"time_budget_s": None} if "time_budget_ratio" in plain else {}
+        return cls(**{**plain, **budget, "immobile": immobile})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,4 +136,10 @@ class Preset:
     rules: Rules
 
 
-PRESETS: Mapping[str, Preset] = {"paper": Preset(world=World(), rules=Rules())}
+PRESETS: Mapping[str, Preset] = {
+    "paper": Preset(world=World(), rules=Rules()),
+    "stakes": Preset(
+        world=World(noise="frozen", immobile=Immobile(), time_budget_s=None, time_budget_ratio=3.0),
+        rules=Rules(free_space=FreeSpace(by="mean", above=0.1), slowest=0.05),
+    ),
+}

@@ -19,7 +19,8 @@ def tell(
     moved, drove = (dt_s * torch.tensor([speeds], dtype=torch.float64) for speeds in (moved_mps, drove_mps))
     x = torch.nn.functional.pad(moved.cumsum(dim=1), (1, 0))
     positions = torch.stack((2 + x, torch.full_like(x, 3.0)), dim=2)
-    return Outcome(int(tell_standstill(torch.tensor([outcome]), positions, drove, dt_s)[0]))
+    steps = torch.tensor([len(moved_mps)])
+    return Outcome(int(tell_standstill(torch.tensor([outcome]), steps, positions, drove, dt_s)[0]))
 
 
 def test_a_robot_that_drove_and_did_not_move_is_stuck_and_one_that_did_not_drive_is_stalled() -> None:
@@ -63,7 +64,7 @@ def test_a_robot_that_spins_in_place_is_stalled() -> None:
     ground = torch.stack([torch.full((16, 16), value) for value in (0.9, 0.0)])
     world = World(time_budget_s=12.0)
     goal = torch.tensor([[90.0, 90.0]]).expand(2, 2)
-    simulation = Simulation(factories.terrain(ground, 0.0), factories.task(), world, goal, 0, range(2))
+    simulation = Simulation(factories.terrain(ground, 0.0), factories.task(), world, factories.places(goal), 0, range(2))
     now = simulation.init(torch.tensor([[4.0, 4.0, 0.0]] * 2))
     action = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
     states, driven = [now.state], []
@@ -73,7 +74,7 @@ def test_a_robot_that_spins_in_place_is_stalled() -> None:
         states.append(now.state)
     assert now.state[0, 2] > 9
     positions = torch.stack(states, dim=1)[..., :2]
-    told = tell_standstill(now.outcome, positions, torch.stack(driven, dim=1), 0.1)
+    told = tell_standstill(now.outcome, now.step, positions, torch.stack(driven, dim=1), 0.1)
     assert told.tolist() == [Outcome.STALLED, Outcome.STUCK]
 
 
@@ -82,7 +83,7 @@ def test_going_round_in_a_wide_circle_is_moving_and_in_a_narrow_one_is_not() -> 
         angle = torch.arange(201, dtype=torch.float64) * 2 * math.pi / 50
         positions = torch.stack((5 + radius * angle.cos(), 5 + radius * angle.sin()), dim=1)[None]
         drove = torch.full((1, 200), 2 * math.pi * radius / 50, dtype=torch.float64)
-        told = tell_standstill(torch.tensor([Outcome.TIMEOUT]), positions, drove, DT_S)
+        told = tell_standstill(torch.tensor([Outcome.TIMEOUT]), torch.tensor([200]), positions, drove, DT_S)
         assert told.tolist() == [expected]
 
 
@@ -95,9 +96,8 @@ def test_other_outcomes_stay(outcome: Outcome) -> None:
 def test_an_episode_shorter_than_the_window_and_one_without_steps_are_told() -> None:
     assert tell([0.0] * 5, [2.0] * 5) == Outcome.STUCK
     assert tell([0.0] * 5, [0.1] * 5) == Outcome.STALLED
-    none = tell_standstill(
-        torch.tensor([Outcome.PLANNER_ERROR]), torch.zeros(1, 1, 2), torch.zeros(1, 0), DT_S
-    )
+    ended, steps = torch.tensor([Outcome.PLANNER_ERROR]), torch.tensor([0])
+    none = tell_standstill(ended, steps, torch.zeros(1, 1, 2), torch.zeros(1, 0), DT_S)
     assert none.tolist() == [Outcome.PLANNER_ERROR]
 
 
@@ -106,6 +106,19 @@ def test_each_episode_of_a_batch_is_told_by_itself() -> None:
     x = torch.zeros(4, 201)
     x[3] = torch.arange(201) * 0.01
     drove = torch.tensor([[0.1], [0.1], [0.0], [0.1]]).expand(4, 200)
-    told = tell_standstill(outcome, torch.stack((x, torch.zeros_like(x)), dim=2), drove, DT_S)
+    steps = torch.full((4,), 200)
+    told = tell_standstill(outcome, steps, torch.stack((x, torch.zeros_like(x)), dim=2), drove, DT_S)
     assert told.tolist() == [Outcome.STUCK, Outcome.SUCCESS, Outcome.STALLED, Outcome.TIMEOUT]
     assert outcome.tolist() == [Outcome.TIMEOUT, Outcome.SUCCESS, Outcome.TIMEOUT, Outcome.TIMEOUT]
+
+
+def test_the_last_ten_seconds_of_an_episode_are_those_before_its_own_end() -> None:
+    """A batch goes on until its last episode ends; meanwhile the others stand where they ended."""
+    moved = torch.full((2, 300), 0.02)
+    moved[:, 150:] = 0.0
+    positions = torch.nn.functional.pad(moved.cumsum(dim=1), (1, 0))[..., None] * torch.tensor([1.0, 0.0])
+    outcome, steps = torch.tensor([Outcome.TIMEOUT] * 2), torch.tensor([150, 300])
+    told = tell_standstill(outcome, steps, positions, torch.full((2, 300), 0.1), DT_S)
+    assert told.tolist() == [Outcome.TIMEOUT, Outcome.STUCK]
+    told = tell_standstill(outcome, steps, positions, 0.01 * (moved + 1) * (moved == 0), DT_S)
+    assert told.tolist() == [Outcome.TIMEOUT, Outcome.STUCK]

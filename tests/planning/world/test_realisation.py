@@ -5,17 +5,20 @@ import torch
 
 from benchnav import rng
 from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
 from tests import factories
 
 KEY = rng.stream_key(0, "luck")
+PLACES = factories.places(torch.tensor([[6.0, 6.0]]))
 MIDDLE = torch.tensor([[4.0, 4.0, 0.0]])
 
 
 def realisation(mean: torch.Tensor, std: float = 0.1, noise: str = "resampled", steps: int = 200, **given):  # type: ignore[no-untyped-def]
     settings = {"key": KEY, "instances": range(len(mean)), **given}
-    return Realisation(factories.terrain(mean, std), World(noise=noise), steps, **settings)
+    places = factories.places(torch.full((len(mean), 2), 6.0))
+    return Realisation(factories.terrain(mean, std), World(noise=noise), places, steps, **settings)
 
 
 def met(one: Realisation, batch: int, steps: int) -> torch.Tensor:
@@ -80,7 +83,7 @@ def test_lambda_is_read_in_the_cell_where_the_robot_stands() -> None:
 def test_stored_noise_is_the_maps_realised_traversability() -> None:
     terrain = factories.terrain(torch.full((1, 16, 16), 0.5))
     terrain = replace(terrain, traversability=torch.rand(1, 16, 16))
-    one = Realisation(terrain, World(noise="stored"), 10, KEY, [0])
+    one = Realisation(terrain, World(noise="stored"), PLACES, 10, KEY, [0])
     for step in range(3):
         at = one.at(torch.tensor([[3.3, 1.2, 0.0]]), torch.tensor([step]))
         assert at[0] == terrain.traversability[0, 2, 6]
@@ -91,12 +94,12 @@ def test_stored_noise_needs_every_cell_observed() -> None:
     holed = terrain.traversability.clone()
     holed[0, 3, 3] = torch.nan
     terrain = replace(terrain, traversability=holed)
-    Realisation(terrain, World(noise="resampled"), 10, KEY, [0])
+    Realisation(terrain, World(noise="resampled"), PLACES, 10, KEY, [0])
     with pytest.raises(ConfigError, match="not observed"):
-        Realisation(terrain, World(noise="stored"), 10, KEY, [0])
+        Realisation(terrain, World(noise="stored"), PLACES, 10, KEY, [0])
 
 
-@pytest.mark.parametrize("noise", ["resampled", "stored"])
+@pytest.mark.parametrize("noise", ["resampled", "stored", "frozen"])
 def test_some_episodes_are_exchanged_and_the_others_stay(noise: str) -> None:
     ground = torch.rand(3, 16, 16)
     one = realisation(ground, noise=noise)
@@ -106,3 +109,40 @@ def test_some_episodes_are_exchanged_and_the_others_stay(noise: str) -> None:
     assert torch.equal(mixed[:, 1], before[:, 1])
     assert torch.equal(mixed[:, [2, 0]], met(other, 2, 5))
     assert torch.equal(met(one, 3, 5), before)
+
+
+def two_modes(batch: int, size: int = 16) -> TraversabilityMixture:
+    """λ of N(0.8, 0.1) on 90 % of the ground and N(0.05, 0.05) on the rest, clipped."""
+    shape = (batch, 2, size, size)
+
+    def pair(first: float, second: float) -> torch.Tensor:
+        return torch.tensor([first, second]).view(1, 2, 1, 1).expand(shape).clone()
+
+    return TraversabilityMixture(pair(0.9, 0.1), pair(0.8, 0.05), pair(0.1, 0.05), (0, 0))
+
+
+def test_resampled_noise_has_a_second_mode_where_the_truth_has_one() -> None:
+    terrain = replace(factories.terrain(even(200)), truth=two_modes(200))
+    places = factories.places(torch.full((200, 2), 6.0))
+    one = Realisation(terrain, World(), places, 100, KEY, range(200))
+    drawn = met(one, 200, 100).flatten().numpy()
+    for value in (0.0, 0.03, 0.1, 0.5, 0.8, 0.95):
+        expected = float(two_modes(1).cdf(value)[0, 0, 0])
+        assert (drawn <= value).mean() == pytest.approx(expected, abs=0.01)
+    off = one.at(torch.tensor([[-1.0, 4.0, 0.0]] * 200), torch.zeros(200, dtype=torch.int64))
+    assert off.max() < 1e-8
+
+
+def test_frozen_noise_stays_what_it_is_at_a_place() -> None:
+    one = realisation(even(5), noise="frozen")
+    drawn = met(one, 5, 20)
+    assert (drawn == drawn[0]).all()
+    assert len(drawn[0].unique()) == 5
+    assert one.field is not None
+    assert torch.equal(drawn[0], one.field[:, 8, 8])
+    assert one.at(torch.tensor([[-0.1, 4.0, 0.0]] * 5), torch.zeros(5, dtype=torch.int64)).tolist() == [0] * 5
+
+
+def test_only_resampled_noise_has_no_field() -> None:
+    assert realisation(even(1)).field is None
+    assert torch.equal(realisation(even(1), noise="stored").field, even(1))

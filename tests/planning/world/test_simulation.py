@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import FAILURES, Outcome
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
-from benchnav.planning.world.world import World
+from benchnav.planning.world.world import Immobile, World
 from tests import factories
 
 KEY = rng.stream_key(0, "luck")
@@ -21,12 +23,13 @@ def simulation(
     std: float = 0.0,
     noise: str = "resampled",
     time_budget_s: float = 100.0,
+    immobile: Immobile | None = None,
     **task,  # type: ignore[no-untyped-def]
 ) -> Simulation:
     goal = torch.tensor(goals).expand(len(mean), 2)
-    world = World(noise=noise, time_budget_s=time_budget_s)
+    world = World(noise=noise, time_budget_s=time_budget_s, immobile=immobile)
     return Simulation(
-        factories.terrain(mean, std), factories.task(**task), world, goal, KEY, range(len(mean))
+        factories.terrain(mean, std), factories.task(**task), world, factories.places(goal), KEY, range(len(mean))
     )
 
 
@@ -43,7 +46,8 @@ def test_a_robot_moves_by_f_under_the_lambda_that_it_met() -> None:
     start = poses((4.0, 4.0, 0.3), (2.0, 3.0, 1.0))
     action = torch.tensor([[0.8, -0.4], [0.3, 0.9]])
     now, met = sim.step(sim.init(start), action)
-    truth = Realisation(factories.terrain(even(0.5, 0.8), 0.1), World(), 1000, KEY, range(2))
+    terrain, places = factories.terrain(even(0.5, 0.8), 0.1), factories.places(torch.zeros(2, 2))
+    truth = Realisation(terrain, World(), places, 1000, KEY, range(2))
     assert torch.equal(met, truth.at(start, torch.zeros(2, dtype=torch.int64)))
     assert torch.equal(now.state, Unicycle()(start, action, met))
     assert now.step.tolist() == [1, 1]
@@ -58,7 +62,7 @@ def test_the_tasks_robot_is_the_one_that_moves() -> None:
     start = robot.initial_state(poses((4.0, 4.0, 0.0)))
     now, _ = sim.step(sim.init(start), AHEAD)
     assert torch.equal(now.state, robot(start, AHEAD, torch.ones(1)))
-    assert sim.steps == 4
+    assert sim.steps.tolist() == [4]
 
 
 def test_the_worlds_noise_is_the_one_that_is_met() -> None:
@@ -131,7 +135,7 @@ def test_an_ended_episode_stands_still() -> None:
 
 def test_an_outcome_that_the_simulation_cannot_see_ends_only_running_episodes() -> None:
     outcome = torch.tensor([Outcome.SUCCESS, Outcome.RUNNING, Outcome.RUNNING])
-    now = SimulationState(torch.zeros(3, 3), outcome, torch.tensor([4, 5, 6]))
+    now = SimulationState(torch.zeros(3, 3), outcome, torch.tensor([4, 5, 6]), torch.zeros(3, dtype=torch.int64))
     ended = end(now, torch.tensor([True, True, False]), Outcome.PLANNER_ERROR)
     assert ended.outcome.tolist() == [Outcome.SUCCESS, Outcome.PLANNER_ERROR, Outcome.RUNNING]
     assert ended.running.tolist() == [False, False, True]
@@ -161,4 +165,71 @@ def test_some_episodes_are_exchanged_with_their_goals() -> None:
 def test_every_outcome_but_success_and_running_is_a_failure() -> None:
     assert {outcome.name for outcome in FAILURES} == {
         "TIMEOUT", "STUCK", "STALLED", "OUT_OF_BOUNDS", "PLANNER_FAILURE", "PLANNER_ERROR", "MODEL_ERROR",
+        "IMMOBILISED",
     }  # fmt: skip
+
+
+def held_after(sim: Simulation, *rows: tuple[float, float, float], speed: float = 1.0) -> SimulationState:
+    now = sim.init(poses(*rows))
+    while now.running.any():
+        now, _ = sim.step(now, torch.tensor([[speed, 0.0]]).expand(len(rows), 2))
+    return now
+
+
+def test_ground_under_the_bound_ends_an_episode_after_its_time_and_other_ground_does_not() -> None:
+    immobile = Immobile(below=0.1, for_s=0.5)
+    now = held_after(
+        simulation(even(0.099, 0.1), FAR, time_budget_s=2.0, immobile=immobile), *[(4.0, 4.0, 0.0)] * 2
+    )
+    assert now.outcome.tolist() == [Outcome.IMMOBILISED, Outcome.TIMEOUT]
+    assert now.step.tolist() == [5, 20]
+    longer = simulation(even(0.099), FAR, time_budget_s=2.0, immobile=Immobile(below=0.1, for_s=1.2))
+    assert held_after(longer, (4.0, 4.0, 0.0)).step.tolist() == [12]
+    free = simulation(even(0.0), FAR, time_budget_s=2.0)
+    assert held_after(free, (4.0, 4.0, 0.0)).outcome.tolist() == [Outcome.TIMEOUT]
+
+
+def test_a_robot_is_held_whatever_was_commanded() -> None:
+    sim = simulation(even(0.05), FAR, time_budget_s=2.0, immobile=Immobile(below=0.1, for_s=0.5))
+    assert held_after(sim, (4.0, 4.0, 0.0), speed=0.0).outcome.tolist() == [Outcome.IMMOBILISED]
+
+
+def test_a_break_begins_the_count_anew() -> None:
+    """Two soft cells of 0.5 m, each crossed in less time than holds a robot, with firm ground between."""
+    ground = even(0.5)
+    ground[:, :, [4, 6]] = 0.09
+    crossing_s = 0.5 / 0.09
+    for for_s, outcome in ((crossing_s + 1, Outcome.TIMEOUT), (crossing_s - 1, Outcome.IMMOBILISED)):
+        sim = simulation(
+            ground, FAR, noise="stored", time_budget_s=20.0, immobile=Immobile(below=0.1, for_s=for_s)
+        )
+        assert held_after(sim, (1.9, 4.0, 0.0)).outcome.tolist() == [outcome]
+
+
+def test_arriving_counts_for_more_than_being_held_and_being_held_for_more_than_the_time() -> None:
+    immobile = Immobile(below=0.1, for_s=0.5)
+    arriving = simulation(even(0.05), (4.0 + 1.0 + 0.024, 4.0), time_budget_s=9.0, immobile=immobile)
+    assert held_after(arriving, (4.0, 4.0, 0.0)).outcome.tolist() == [Outcome.SUCCESS]
+    late = simulation(even(0.05), FAR, time_budget_s=0.5, immobile=immobile)
+    assert held_after(late, (4.0, 4.0, 0.0)).outcome.tolist() == [Outcome.IMMOBILISED]
+
+
+def test_each_episode_has_its_own_time_budget() -> None:
+    places = replace(factories.places(torch.full((2, 2), 90.0)), reference_time_s=torch.tensor([0.4, 0.8]))
+    world = World(time_budget_s=None, time_budget_ratio=2.0)
+    sim = Simulation(factories.terrain(even(1.0, 1.0), 0.0), factories.task(), world, places, KEY, range(2))
+    assert sim.time_budget_s.tolist() == pytest.approx([0.8, 1.6])
+    now = held_after(sim, (4.0, 4.0, 0.0), (4.0, 4.0, 0.0))
+    assert now.step.tolist() == [8, 16]
+    assert now.outcome.tolist() == [Outcome.TIMEOUT] * 2
+
+
+def test_some_episodes_are_exchanged_with_their_time_budgets() -> None:
+    def sim(ratio: float) -> Simulation:
+        places = replace(factories.places(torch.full((2, 2), 90.0)), reference_time_s=torch.tensor([0.4, 0.8]))
+        world = World(time_budget_s=None, time_budget_ratio=ratio)
+        return Simulation(factories.terrain(even(1.0, 1.0), 0.0), factories.task(), world, places, KEY, range(2))
+
+    mixed = sim(2.0).exchange(torch.tensor([1, 0]), sim(4.0))
+    assert mixed.steps.tolist() == [32, 16]
+    assert mixed.time_budget_s.tolist() == pytest.approx([3.2, 1.6])

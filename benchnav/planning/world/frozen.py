@@ -1,0 +1,71 @@
+"""Frozen λ: drawn once an episode as a correlated field, each cell with its own distribution.
+
+A field of correlated standard normals goes through each cell's quantile function (`benchnav.copula`). Where
+ground can hold a robot for good, a field that cuts the start off from the goal is drawn again: what is asked
+is which way to take, and there has to be one. Letters in shapes: B episodes, H×W cells.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchnav import rng
+from benchnav.copula import correlated_normal
+from benchnav.errors import ConfigError
+from benchnav.planning.world.places import Places, joined
+from benchnav.planning.world.world import World
+from benchnav.terrain import Terrain
+
+MOST_ATTEMPTS = 100
+
+
+def draw_frozen(
+    terrain: Terrain, world: World, places: Places, key: int, instances: Sequence[int]
+) -> tuple[Tensor, Tensor]:
+    """Draws the λ of B episodes.
+
+    Args:
+        terrain: the true maps.
+        world: correlation length, and what holds a robot.
+        places: starts and goals.
+        key: root of the luck.
+        instances: names each episode's stream under that root, B of them.
+
+    Returns:
+        λ in [0, 1], shape [B, H, W]; and how many fields of each episode were drawn, int64, shape [B].
+
+    Raises:
+        ConfigError: no field of some episode joins its start and goal.
+    """
+    field = torch.zeros_like(terrain.traversability)
+    attempts = torch.zeros(len(terrain), dtype=torch.int64)
+    pending = torch.arange(len(terrain))
+    for attempt in range(MOST_ATTEMPTS):
+        normal = _normals(terrain, world, key, [instances[i] for i in pending.tolist()], attempt)
+        members = pending.to(field.device)
+        drawn = terrain.truth.select(members).from_normal(normal.to(field))
+        field = field.index_copy(0, members, drawn)
+        attempts[pending] += 1
+        if world.immobile is None:
+            return field, attempts
+        ways = joined(drawn >= world.immobile.below, terrain.grid, places.select(members))
+        pending = pending[~ways.cpu()]
+        if len(pending) == 0:
+            return field, attempts
+    raise ConfigError(
+        f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for instance "
+        f"{instances[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
+    )
+
+
+def _normals(terrain: Terrain, world: World, key: int, instances: Sequence[int], attempt: int) -> Tensor:
+    """Correlated standard normals, float64, shape [M, H, W]; a stream an instance and attempt."""
+    grid, first = terrain.grid, np.zeros(1, dtype=np.int64)
+    cells = world.correlation_m / grid.resolution_m
+    fields = [
+        correlated_normal(rng.stream_key(key, int(instance), "field", attempt), first, grid.shape, cells)
+        for instance in instances
+    ]
+    return torch.from_numpy(np.concatenate(fields))

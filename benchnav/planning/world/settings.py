@@ -1,0 +1,98 @@
+"""Worlds as users write them: a preset by name, or a mapping of changes to one."""
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.world.world import PRESETS, Immobile, World
+
+# Fields that may be null, with what they are like where they are not.
+_OPTIONAL: Mapping[str, Any] = {"immobile": Immobile(), "time_budget_s": 100.0, "time_budget_ratio": 3.0}
+
+
+def read_world(
+    world: Any, task: Any = (), short: Mapping[str, Any] | None = None
+) -> tuple[World, Rules, str]:
+    """Reads a world and the rules that go with it.
+
+    Args:
+        world: name of a preset, or a mapping of changes with the preset's name under `preset`; without it
+            they change the paper's.
+        task: a mapping of changes to the preset's rules.
+        short: further changes to the world, for what `world` itself does not name.
+
+    Returns:
+        World, rules, and what tables call them: the preset's name and all that is changed.
+
+    Raises:
+        ConfigError: there is no such preset or field, or a value is of the wrong kind.
+    """
+    for where, value in (("world", world), ("task", task or {})):
+        if not isinstance(value, Mapping) and not (where == "world" and isinstance(value, str)):
+            raise ConfigError(f"Expected `{where}` as a mapping of settings, got {value!r}.")
+    given = {"preset": world} if isinstance(world, str) else dict(world)
+    name = given.pop("preset", "paper")
+    if name not in PRESETS:
+        raise ConfigError(
+            f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{registry.hint(name, PRESETS)}"
+        )
+    preset = PRESETS[name]
+    made_world = _changed_world(preset.world, {**(short or {}), **given})
+    made_rules = _changed(preset.rules, dict(task), "task")
+    changes = _differences(preset.world, made_world) + _differences(preset.rules, made_rules)
+    return made_world, made_rules, " ".join([name, *changes])
+
+
+def _changed_world(preset: World, given: dict[str, Any]) -> World:
+    """Replaces fields of a world; of the two ways to give a time budget one takes the other's place."""
+    budgets = {"time_budget_s", "time_budget_ratio"}
+    named = {name for name in budgets if given.get(name) is not None}
+    if len(named) == 1:
+        given = given | dict.fromkeys(budgets - named)
+    made: World = _changed(preset, given, "world")
+    if "correlation_m" in given and made.noise != "frozen":
+        raise ConfigError(
+            f"Expected `world.correlation_m` with `world.noise` frozen, got it with {made.noise!r}."
+        )
+    return made
+
+
+def _changed(value: Any, changes: dict[str, Any], where: str) -> Any:
+    """Replaces fields of a dataclass by what is given, of dataclasses in it likewise."""
+    known = {f.name: getattr(value, f.name) for f in fields(value)}
+    made = {}
+    for name, change in changes.items():
+        if name not in known:
+            raise ConfigError(
+                f"Expected keys of `{where}` among {', '.join(known)}, got {name!r}.{registry.hint(name, known)}"
+            )
+        like = _OPTIONAL.get(name) if known[name] is None else known[name]
+        if change is None and name in _OPTIONAL:
+            made[name] = None
+        elif isinstance(like, FreeSpace | Immobile) and isinstance(change, Mapping):
+            made[name] = _changed(like, dict(change), f"{where}.{name}")
+        elif isinstance(like, float) and isinstance(change, int | float) and change is not True:
+            made[name] = float(change)
+        elif isinstance(like, str) and isinstance(change, str):
+            made[name] = change
+        else:
+            raise ConfigError(f"Expected `{where}.{name}` like {like!r}, got {change!r}.")
+    return replace(value, **made)
+
+
+def _differences(preset: Any, made: Any) -> list[str]:
+    changed = []
+    for f in fields(preset):
+        before, after = getattr(preset, f.name), getattr(made, f.name)
+        if before == after or (after is None and f.name != "immobile"):
+            continue
+        if isinstance(after, FreeSpace):
+            changed += _differences(before, after)
+        elif isinstance(after, Immobile):
+            changed.append(f"immobile={after.below:g}/{after.for_s:g}s")
+        else:
+            changed.append(f"{f.name}={after:g}" if isinstance(after, float) else f"{f.name}={after}")
+    return changed
