@@ -33,6 +33,45 @@ def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: fl
     return (surface - low) / (surface.max(axis=(1, 2), keepdims=True) - low)
 
 
+def open_fractal(
+    key: int,
+    indices: np.ndarray,
+    shape: tuple[int, int],
+    roughness: float,
+    reference_cells: int,
+) -> np.ndarray:
+    """Synthesises pieces of fractal ground that goes on beyond the map.
+
+    The spectrum is `fractal`'s for wavelengths under the reference side and levels off above it (von
+    Kármán's), so that the ground is as steep on a map of any size. The surface is made on twice the
+    extent, as a torus, and cropped: the map's opposite edges are no neighbours.
+
+    Args:
+        key: stream key.
+        indices: elements of the stream, shape [B].
+        shape: (H, W).
+        roughness: Hurst exponent in (0, 1).
+        reference_cells: side of the square that relief is measured on, in cells.
+
+    Returns:
+        Surfaces scaled so that highest minus lowest is 1 on the mean of the squares that cover the map
+        from its corner, the last of them reaching beyond it; float64, shape [B, H, W].
+
+    Source: von Kármán (1948), "Progress in the statistical theory of turbulence", for the spectrum.
+    """
+    tiles_y, tiles_x = (-(-cells // reference_cells) for cells in shape)
+    covered = tiles_y * reference_cells, tiles_x * reference_cells
+    height, width = 2 * covered[0], 2 * covered[1]
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    amplitude = np.hypot(frequency, 1 / reference_cells) ** -(roughness + 1)
+    spectrum = np.fft.rfft2(rng.normal(key, indices, (height, width))) * amplitude
+    surface = np.fft.irfft2(spectrum, s=(height, width))[:, : covered[0], : covered[1]]
+    tiles = surface.reshape(len(surface), tiles_y, reference_cells, tiles_x, reference_cells)
+    relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
+    low = surface.min(axis=(1, 2))
+    return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
+
+
 def place_craters(
     key: int,
     indices: np.ndarray,

@@ -6,10 +6,12 @@ float64. Letters in shapes: B maps, H×W cells.
 
 import numpy as np
 
-from benchnav import gridgraph, rng
+from benchnav import copula, gridgraph, rng
 from benchnav.datagen import appearance, elevation, latent
 from benchnav.datagen.noise import fractal_perlin
-from benchnav.datagen.scenario import Recipe, Scenario
+from benchnav.datagen.places import draw_places
+from benchnav.datagen.presets import Scenario
+from benchnav.datagen.scenario import REFERENCE_M, Recipe
 from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.errors import ConfigError
 
@@ -73,13 +75,13 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     Returns:
         Seconds, infinite where no free path joins start and goal, shape [B].
     """
-    mean = latent.latent_mean(maps["class_id"], maps["slope_deg"], recipe.classes)
-    expected = latent.expected_traversability(mean, latent.latent_std(maps["class_id"], recipe.classes))
+    expected = latent.expected_of(latent.truth(maps["class_id"], maps["slope_deg"], recipe.classes))
     costs = gridgraph.travel_time_costs(expected, expected > recipe.stuck_threshold, recipe.resolution_m)
+    every = np.arange(len(expected))
     goals = np.zeros(expected.shape, dtype=bool)
-    goals[(slice(None), *recipe.cell_of(recipe.goal_m))] = True
+    goals[(every, *recipe.cells_of(maps["goal_m"]))] = True
     cost, _ = gridgraph.cost_to_go(costs, goals, recipe.grid.shape)
-    return cost[(slice(None), *recipe.cell_of(recipe.start_m))]
+    return cost[(every, *recipe.cells_of(maps["start_m"]))]
 
 
 def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0) -> np.ndarray:
@@ -134,25 +136,45 @@ def complete(
     height = quantise(elevation_m, 13)
     gradient = elevation.horn_gradient(height, recipe.resolution_m)
     slope = quantise(elevation.inclination_deg(*gradient), 10)
-    mean = latent.latent_mean(class_id, slope, recipe.classes)
-    noise = rng.normal(key("traversability"), indices, recipe.grid.shape)
-    noise *= latent.latent_std(class_id, recipe.classes)
     direction = rng.uniform(key("light"), indices, (2,))
     light = appearance.light_direction(
         2 * np.pi * direction[:, 0], _within(scenario.light_height, direction[:, 1])
     )
     brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
+    start_m, goal_m = _places(recipe, key("places"), indices)
     return {
         "rgb": appearance.paint(class_id, colours, brightness),
         "class_id": class_id,
         "elevation_m": height,
         "slope_deg": slope,
-        "traversability": quantise(np.minimum(np.maximum(mean + noise, 0), 1), 16),
+        "traversability": quantise(_realised(recipe, key("traversability"), indices, class_id, slope), 16),
         "environment": environment_of(recipe, indices),
-        "start_m": np.tile(np.asarray(recipe.start_m, np.float64), (len(indices), 1)),
-        "goal_m": np.tile(np.asarray(recipe.goal_m, np.float64), (len(indices), 1)),
+        "start_m": start_m,
+        "goal_m": goal_m,
     }
+
+
+def _realised(
+    recipe: Recipe, key: int, indices: np.ndarray, class_id: np.ndarray, slope_deg: np.ndarray
+) -> np.ndarray:
+    """Draws λ from the truth of each cell, shape [B, H, W]."""
+    if recipe.synthesis == 1:
+        mean = latent.latent_mean(class_id, slope_deg, recipe.classes)
+        noise = rng.normal(key, indices, recipe.grid.shape)
+        noise *= latent.latent_std(class_id, recipe.classes)
+        return np.minimum(np.maximum(mean + noise, 0), 1)
+    correlation_cells = recipe.correlation_m / recipe.resolution_m
+    luck = copula.correlated_normal(key, indices, recipe.grid.shape, correlation_cells)
+    return latent.quantile_of(latent.truth(class_id, slope_deg, recipe.classes), luck)
+
+
+def _places(recipe: Recipe, key: int, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Start and goal of each map, each of shape [B, 2]."""
+    if recipe.places is not None:
+        return draw_places(recipe.places, recipe.grid, key, indices)
+    start_m, goal_m = (np.asarray(end, np.float64) for end in (recipe.start_m, recipe.goal_m))
+    return np.tile(start_m, (len(indices), 1)), np.tile(goal_m, (len(indices), 1))
 
 
 def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
@@ -169,9 +191,15 @@ def _elevation(
         return rng.stream_key(recipe.seed, split, purpose, attempt)
 
     draws = rng.uniform(key("relief"), indices, (2,))
-    ground = elevation.fractal(key("elevation"), indices, recipe.grid.shape, scenario.roughness)
+    if recipe.synthesis == 1:
+        ground = elevation.fractal(key("elevation"), indices, recipe.grid.shape, scenario.roughness)
+    else:
+        reference_cells = max(3, round(REFERENCE_M / recipe.resolution_m))
+        ground = elevation.open_fractal(
+            key("elevation"), indices, recipe.grid.shape, scenario.roughness, reference_cells
+        )
     ground *= _within(scenario.relief_m, draws[:, 0])[:, None, None]
-    low, high = (round(value) for value in scenario.crater_count)
+    low, high = recipe.craters(scenario)
     if high == 0:
         return ground
     count = low + np.floor((high - low + 1) * draws[:, 1])

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from benchnav.errors import ConfigError
 
+_BISECTIONS = 24  # leave an error of at most 2⁻²⁵
 
 Parameters = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -158,3 +159,41 @@ def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
     below = (np.array([[1.0], [0.0]]) - mean.ravel()) / std.ravel()
     integral = below * ndtr(below) + np.exp(-0.5 * below * below) / np.sqrt(2 * np.pi)
     return 1 - std * (integral[0] - integral[1]).reshape(mean.shape)
+
+
+def quantile_of(parameters: Parameters, normal: np.ndarray) -> np.ndarray:
+    """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1), F the mixture's CDF.
+
+    In closed form where one component has all the weight, else by bisection to within 2⁻²⁵;
+    `TraversabilityMixture.from_normal` says the same of tensors.
+
+    Args:
+        parameters: weights, means and standard deviations, each of shape [B, K, H, W].
+        normal: z, shape [B, H, W].
+
+    Returns:
+        λ in [0, 1], shape [B, H, W].
+    """
+    weights, means, stds = parameters
+    heaviest = weights.argmax(axis=1)[:, None]
+    mean, std = (np.take_along_axis(values, heaviest, axis=1)[:, 0] for values in (means, stds))
+    value = np.clip(mean + std * normal, 0, 1)
+    mixed = weights.max(axis=1) < 1
+    if mixed.any():
+        own = tuple(np.moveaxis(values, 1, 0)[:, mixed] for values in parameters)
+        value[mixed] = _bisected_quantile(own, ndtr(normal[mixed]))
+    return value
+
+
+def _bisected_quantile(parameters: tuple[np.ndarray, ...], rank: np.ndarray) -> np.ndarray:
+    """clip(F⁻¹(rank), 0, 1) from parameters of shape [K, N], shape [N]."""
+    weights, means, stds = parameters
+
+    def below(value: np.ndarray | float) -> np.ndarray:
+        return (weights * ndtr((value - means) / stds)).sum(axis=0)
+
+    low, width = np.zeros_like(rank), 1.0
+    for _ in range(_BISECTIONS):
+        width /= 2
+        low = np.where(below(low + width) < rank, low + width, low)
+    return np.where(below(0.0) >= rank, 0.0, np.where(below(1.0) <= rank, 1.0, low + width / 2))

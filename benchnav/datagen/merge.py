@@ -10,7 +10,8 @@ import numpy as np
 
 from benchnav.datagen import schema
 from benchnav.datagen.block import BLOCK_MAPS, Block, spans
-from benchnav.datagen.scenario import Recipe, check_name, recipe_from_dict
+from benchnav.datagen.recipe_rules import check_name
+from benchnav.datagen.scenario import Recipe, recipe_from_dict
 from benchnav.datagen.store import TerrainDataset
 from benchnav.datagen.writer import check_target, writing
 from benchnav.errors import ConfigError, DatasetError

@@ -1,15 +1,11 @@
-"""Recipes and scenarios: everything that fixes a dataset, as data.
+"""Recipes: everything that fixes a dataset, as data.
 
 A recipe is a YAML file. Shipped ones are named by id (`paper-v1`); a user's own is named by path.
-`presets.yaml` holds the shipped class table and scenarios, which a recipe may name or replace.
-A scenario's `severity` s moves every number of it from `std` (s = 0) to the preset (s = 1), and
-beyond.
 """
 
-import re
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,79 +13,16 @@ import numpy as np
 import torch
 import yaml
 
-from benchnav.datagen.latent import TerrainClass
-from benchnav.datagen.schema import FIELDS
+from benchnav.datagen.environments import Unit, deal_classes, deal_units
+from benchnav.datagen.latent import TerrainClass, twins
+from benchnav.datagen.places import Places
+from benchnav.datagen.plain_data import parse, plain
+from benchnav.datagen.presets import PRESETS, RECIPES, Scenario, load_presets, resolve
+from benchnav.datagen.recipe_rules import check_recipe
 from benchnav.errors import ConfigError
 from benchnav.terrain import Grid
 
-RECIPES = Path(__file__).parent / "recipes"
-_MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
-PRESETS = RECIPES / "presets.yaml"
-
-Range = tuple[float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scenario:
-    """Geometry and light of a family of maps; each range is drawn from uniformly, a value a map.
-
-    Args:
-        relief_m: highest minus lowest elevation of the fractal ground.
-        roughness: Hurst exponent of the fractal ground.
-        crater_count: fewest and most craters a map.
-        crater_radius_m: smallest and largest radius of a crater's rim.
-        crater_depth_ratio: depth below the rim over diameter.
-        light_height: z of the unit vector toward the light; 1 is overhead.
-        ambient: share of ambient light.
-    """
-
-    relief_m: Range = (1.4, 1.7)
-    roughness: float = 0.75
-    crater_count: Range = (0.0, 0.0)
-    crater_radius_m: Range = (2.0, 4.5)
-    crater_depth_ratio: float = 0.1
-    light_height: Range = (0.8, 1.0)
-    ambient: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Refuses ranges that are not finite, ordered, or physical."""
-        limits: dict[str, Range] = {
-            "relief_m": (0, 1000),
-            "roughness": (0, 1),
-            "crater_count": (0, 1000),
-            "crater_radius_m": (1e-6, 1e4),
-            "crater_depth_ratio": (0, 1),
-            "light_height": (0, 1),
-            "ambient": (0, 1),
-        }
-        for name, (least, most) in limits.items():
-            value = getattr(self, name)
-            low, high = value if isinstance(value, tuple) else (value, value)
-            if not (np.isfinite(low) and np.isfinite(high) and least <= low <= high <= most):
-                raise ConfigError(
-                    f"Expected scenario `{name}` finite, ordered and within [{least:g}, {most:g}], got {value}."
-                )
-
-    @property
-    def mean_crater_area_m2(self) -> float:
-        """Mean area inside a rim; radii are uniform in their logarithm."""
-        low, high = self.crater_radius_m
-        if low == high:
-            return float(np.pi * low**2)
-        return float(np.pi * (high**2 - low**2) / (2 * np.log(high / low)))
-
-
-def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
-    """Moves every number of a scenario from `base` (severity 0) to `full` (severity 1)."""
-
-    def between(low: Any, high: Any) -> Any:
-        if isinstance(low, tuple):
-            return tuple(between(a, b) for a, b in zip(low, high, strict=True))
-        return low + severity * (high - low)
-
-    return replace(
-        base, **{f.name: between(getattr(base, f.name), getattr(full, f.name)) for f in fields(base)}
-    )
+REFERENCE_M = 32.0  # side of the square that relief and crater counts of synthesis 2 are for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,10 +57,14 @@ class Recipe:
         height: rows of a map.
         width: columns of a map.
         resolution_m: cell width.
-        start_m: (x, y) where navigation starts.
-        goal_m: (x, y) where it ends.
+        start_m: (x, y) where navigation starts; None where `places` says.
+        goal_m: (x, y) where it ends; None where `places` says.
+        places: how start and goal are drawn a map, in place of `start_m` and `goal_m`; synthesis 2 only.
         stuck_threshold: λ_stuck; a cell is truly free when E[λ] exceeds it.
-        synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2.
+        synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2, which knows soft spots, classes
+            that look alike, drawn places and correlated λ, and makes the same ground at any size.
+        correlation_m: ℓ of stored λ: at distance d the luck of two cells has the correlation exp(−d²/2ℓ²);
+            at 0, as in synthesis 1, each cell's is its own.
         environments: number of environments; each shows its own choice of classes.
         occupancy: share of the cells that each class of an environment covers, summing to 1.
         class_periods_m: lattice spacings of the class noise, one an octave.
@@ -141,8 +78,8 @@ class Recipe:
     height: int
     width: int
     resolution_m: float
-    start_m: tuple[float, float]
-    goal_m: tuple[float, float]
+    start_m: tuple[float, float] | None = None
+    goal_m: tuple[float, float] | None = None
     environments: int
     occupancy: tuple[float, ...]
     class_periods_m: tuple[float, ...]
@@ -151,105 +88,61 @@ class Recipe:
     splits: dict[str, Split]
     stuck_threshold: float = 0.3
     synthesis: int = 1
+    places: Places | None = None
+    correlation_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuses recipes that contradict themselves."""
-        extent_x, extent_y = self.grid.extent_m
-        for name in ("start_m", "goal_m"):
-            x, y = getattr(self, name)
-            if not (0 <= x < extent_x and 0 <= y < extent_y):
-                raise ConfigError(
-                    f"Expected `{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y})."
-                )
-        if self.cell_of(self.start_m) == self.cell_of(self.goal_m):
-            raise ConfigError(
-                f"Expected `goal_m` in another cell than `start_m`, got both in that of {self.goal_m}."
-            )
-        if not 0 <= self.stuck_threshold < 1:
-            raise ConfigError(f"Expected `stuck_threshold` in [0, 1), got {self.stuck_threshold}.")
-        if not self.classes:
-            raise ConfigError("Expected at least one class in `classes`, got none.")
-        for name, scenario in self.scenarios.items():
-            if scenario.crater_count[1] > 0 and 2 * scenario.crater_radius_m[1] > min(extent_x, extent_y):
-                raise ConfigError(
-                    f"Expected `crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
-                    f"got {scenario.crater_radius_m}."
-                )
-            covered = scenario.crater_count[1] * scenario.mean_crater_area_m2 / (extent_x * extent_y)
-            if covered > _MOST_CRATERED:
-                raise ConfigError(
-                    f"Expected the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} of a map, "
-                    f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` or `crater_radius_m`."
-                )
-        if not np.isclose(sum(self.occupancy), 1, atol=1e-6) or not all(
-            0 < share <= 1 for share in self.occupancy
-        ):
-            raise ConfigError(f"Expected `occupancy` as shares > 0 summing to 1, got {list(self.occupancy)}.")
-        if len(self.occupancy) > len(self.classes):
-            raise ConfigError(
-                f"Expected at most {len(self.classes)} shares in `occupancy`, one a class, got {len(self.occupancy)}."
-            )
-        most = FIELDS["environment"].most
-        if not 1 <= self.environments <= most:
-            raise ConfigError(f"Expected `environments` in 1–{most}, got {self.environments}.")
-        if not self.class_periods_m or not all(
-            self.resolution_m <= period < np.inf for period in self.class_periods_m
-        ):
-            raise ConfigError(
-                f"Expected `class_periods_m` of at least a cell, {self.resolution_m} m, "
-                f"got {list(self.class_periods_m)}."
-            )
-        if len(self.classes) > 256:
-            raise ConfigError(f"Expected at most 256 classes, got {len(self.classes)}.")
-        check_name("id", self.id)
-        for split_name in self.splits:
-            for part in split_name.split("/"):
-                check_name("split name", part)
-            if any(other.startswith(f"{split_name}/") for other in self.splits):
-                raise ConfigError(f"Expected splits side by side, got one inside {split_name!r}.")
-        if not self.splits:
-            raise ConfigError("Expected at least one split in `splits`, got none.")
-        for name, split in self.splits.items():
-            if split.scenario not in self.scenarios:
-                raise ConfigError(
-                    f"Expected `scenario` of split {name!r} to be one of {sorted(self.scenarios)}, "
-                    f"got {split.scenario!r}."
-                )
+        check_recipe(self)
 
     @property
     def grid(self) -> Grid:
         """Size and resolution of every map."""
         return Grid(self.height, self.width, self.resolution_m)
 
-    def cell_of(self, position_m: tuple[float, float]) -> tuple[int, int]:
-        """Row and column of the cell that a position lies in, read in single precision as it is stored."""
-        row, column = self.grid.cell_of(*torch.tensor(position_m, dtype=torch.float32))
-        return int(row), int(column)
+    def cells_of(self, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
+        row, column = self.grid.cell_of(*torch.from_numpy(positions_m.astype(np.float32)).T)
+        return row.numpy(), column.numpy()
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """Classes that are shown together: in synthesis 2 those of one colour, in the table's order."""
+        if self.synthesis == 1:
+            return tuple((number,) for number in range(len(self.classes)))
+        return tuple(dict.fromkeys(twins(self.classes)))
 
     def environment_classes(self, environment: int) -> np.ndarray:
-        """The classes an environment shows: consecutive deals from one pack, so all are used equally.
-
-        The pack is the class table taken with a stride, so that an environment shows classes of some
-        distance in colour; each time the deals come full circle the stride changes.
+        """The classes an environment shows.
 
         Returns:
             Class indices, distinct, shape [len(occupancy)].
         """
-        count, shown = len(self.classes), len(self.occupancy)
-        strides = [s for s in (3, 1, *range(2, count)) if np.gcd(s, count) == 1]
-        first = environment * shown
-        stride = strides[first // int(np.lcm(shown, count)) % len(strides)]
-        return stride * np.arange(first, first + shown) % count
+        if self.synthesis == 1:
+            return deal_classes(len(self.classes), len(self.occupancy), environment)
+        dealt = deal_units(self.units, len(self.occupancy), max(self.environments, environment + 1))
+        return dealt[environment].copy()
+
+    def craters(self, scenario: Scenario) -> tuple[int, int]:
+        """Fewest and most craters of a map; in synthesis 2 a scenario's counts are for 32 m × 32 m."""
+        extent_x, extent_y = self.grid.extent_m
+        share = 1.0 if self.synthesis == 1 else extent_x * extent_y / REFERENCE_M**2
+        low, high = (round(share * count) for count in scenario.crater_count)
+        return low, high
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the recipe as plain data for JSON, fully resolved."""
-        plain = _plain(asdict(self))
+        data = plain(asdict(self))
+        unused = ("places",) if self.places is None else ("start_m", "goal_m")
+        for name in unused:
+            data.pop(name)
         if self.synthesis == 1:
             # As version 0.1 wrote it, so that its files and readers stay as they are.
-            plain.pop("synthesis")
-            for item in plain["classes"]:
+            for name in ("synthesis", "correlation_m"):
+                data.pop(name)
+            for item in data["classes"]:
                 item.pop("soft")
-        return plain
+        return data
 
 
 def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
@@ -288,16 +181,6 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
             "a recipe shipped with the package."
         )
     return recipe
-
-
-def check_name(kind: str, name: str) -> None:
-    """Refuses names that would not do as a file's or a group's.
-
-    Raises:
-        ConfigError: with `kind` in its message.
-    """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name == "manifest":
-        raise ConfigError(f"Expected {kind} of letters, digits, '.', '_' and '-', got {name!r}.")
 
 
 def override(data: Any, overrides: Sequence[str]) -> Any:
@@ -351,53 +234,14 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
             raise ConfigError(
                 f"Expected names in `{key}` of recipe {origin}, got {list(named)}. Quote numbers."
             )
-    presets = yaml.safe_load(PRESETS.read_text())
+    classes, presets = load_presets(data.get("synthesis"))
     data = {"classes": "default", **data}
     if data["classes"] == "default":
-        data["classes"] = presets["classes"]
-    scenarios = data.get("scenarios", {name: {"preset": name} for name in presets["scenarios"]})
+        data["classes"] = classes
+    scenarios = data.get("scenarios", {name: {"preset": name} for name in presets})
     if isinstance(scenarios, dict):
-        data["scenarios"] = {
-            name: _resolve(entry, presets["scenarios"], name) for name, entry in scenarios.items()
-        }
+        data["scenarios"] = {name: resolve(entry, presets, name) for name, entry in scenarios.items()}
     try:
-        return _parse(Recipe, data)
+        return parse(Recipe, data)
     except ConfigError as error:
         raise ConfigError(f"Recipe {origin}: {error}") from error
-
-
-def _resolve(entry: Any, presets: dict[str, Any], name: str) -> Any:
-    if not isinstance(entry, dict) or "preset" not in entry:
-        return entry
-    preset, severity = entry["preset"], entry.get("severity", 1.0)
-    if not isinstance(preset, str) or preset not in presets:
-        raise ConfigError(
-            f"Expected `preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}."
-        )
-    if not isinstance(severity, int | float) or not np.isfinite(severity):
-        raise ConfigError(
-            f"Expected `severity` of scenario {name!r} to be a finite number, got {severity!r}."
-        )
-    base, full = (_parse(Scenario, presets[key]) for key in ("std", preset))
-    changes = {key: value for key, value in entry.items() if key not in ("preset", "severity")}
-    return {**_plain(asdict(blend(base, full, severity))), **changes}
-
-
-def _parse(kind: type, data: Any) -> Any:
-    """Builds a dataclass from plain data with jsonargparse's type checks, as one-line errors."""
-    from jsonargparse import ArgumentError, ArgumentParser
-
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument("--value", type=kind, required=True)
-    try:
-        return parser.instantiate_classes(parser.parse_object({"value": deepcopy(data)})).value
-    except (ArgumentError, TypeError, ValueError) as error:
-        # "value" is the parser's name for the whole, not a key that the user wrote.
-        message = re.sub(r"\bvalue\.", "", " ".join(str(error).split())).replace("Group 'value'", "It")
-        raise ConfigError(message) from error
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value

@@ -7,14 +7,14 @@ the file's bytes, so they are the same whatever compression, machine or number o
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 FORMAT = "benchnav-dataset"
-FORMAT_VERSION = (1, 0)
+FORMAT_VERSION = (1, 1)  # the newest that is read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
@@ -106,6 +106,11 @@ class SplitDigest:
     def hexdigest(self) -> str:
         """The digest of the maps so far."""
         return self._hash.hexdigest()
+
+
+def version_of(synthesis: Iterable[int]) -> str:
+    """The format version of a file of recipes of the given syntheses: 1.0 unless one is of synthesis 2."""
+    return "1.1" if max(synthesis) > 1 else "1.0"
 
 
 def seal(manifest: Mapping[str, Any]) -> str:

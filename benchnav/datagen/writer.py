@@ -102,7 +102,7 @@ def writing_into(
             assert written == {name: entry["maps"] for name, entry in splits.items()}
             manifest = {
                 "format": schema.FORMAT,
-                "format_version": ".".join(map(str, schema.FORMAT_VERSION)),
+                "format_version": schema.version_of([recipe.synthesis for recipe in recipes]),
                 "id": dataset_id,
                 "generator": {"package": "benchnav", "version": benchnav.__version__},
                 "fields": schema.field_table(height, width),

@@ -3,7 +3,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from benchnav.datagen.scenario import Scenario, blend, load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.presets import Scenario, blend
+from benchnav.datagen.scenario import load_recipe, recipe_from_dict, shipped_recipes
 from benchnav.errors import ConfigError
 
 TINY = yaml.safe_load((Path(load_recipe.__globals__["RECIPES"]) / "tiny-v1.yaml").read_text())

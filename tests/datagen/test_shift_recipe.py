@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from benchnav.datagen.generate import generate
-from benchnav.datagen.scenario import Scenario, Split, load_recipe, recipe_from_dict
+from benchnav.datagen.presets import Scenario
+from benchnav.datagen.scenario import Split, load_recipe, recipe_from_dict
 from benchnav.datagen.schema import FIELDS
 
 SHIFT, PAPER = load_recipe("shift-v1"), load_recipe("paper-v1")

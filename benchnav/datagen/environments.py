@@ -1,0 +1,96 @@
+"""Which classes an environment shows. Letters in shapes: E environments, M classes shown.
+
+Classes are dealt by units: a class, or all classes that share a colour. These are shown together or not
+at all, since the other colours would tell which one it must be.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+
+Unit = tuple[int, ...]
+
+
+def deal_classes(count: int, shown: int, environment: int) -> np.ndarray:
+    """The classes of one environment, each its own unit: consecutive deals from one pack.
+
+    The pack is the class table taken with a stride, so that an environment shows classes of some
+    distance in colour; each time the deals come full circle the stride changes.
+
+    Args:
+        count: number of classes.
+        shown: how many of them an environment shows, M.
+        environment: which environment.
+
+    Returns:
+        Class indices, distinct, shape [M].
+    """
+    steps = strides(count)
+    first = environment * shown
+    stride = steps[first // int(np.lcm(shown, count)) % len(steps)]
+    return stride * np.arange(first, first + shown) % count
+
+
+@lru_cache(maxsize=32)
+def deal_units(units: tuple[Unit, ...], shown: int, environments: int) -> np.ndarray:
+    """The classes of all environments, dealt by units so that all are shown about equally often.
+
+    Those shown least come first; among them the order is that of the pack, as in `deal_classes`, with
+    another stride for each time shown. A unit that does not fit in what is left is passed over for the
+    next that fits.
+
+    Args:
+        units: classes that are shown together.
+        shown: how many classes an environment shows, M.
+        environments: how many environments, E. More of them leave the first as they are.
+
+    Returns:
+        Class indices, distinct in each row, shape [E, M]; the array is shared: do not write to it.
+    """
+    assert not never_shown(units, shown)
+    steps, times = list(dict.fromkeys(strides(len(units)))), np.zeros(len(units), dtype=np.int64)
+    place = np.empty((len(steps), len(units)), dtype=np.int64)
+    for row, stride in enumerate(steps):
+        place[row, stride * np.arange(len(units)) % len(units)] = np.arange(len(units))
+    table = np.empty((environments, shown), dtype=np.int64)
+    for environment in range(environments):
+        order = np.lexsort((place[times % len(steps), np.arange(len(units))], times))
+        dealt = _fill([int(unit) for unit in order], units, shown)
+        times[dealt] += 1
+        table[environment] = [member for unit in dealt for member in units[unit]]
+    table.setflags(write=False)
+    return table
+
+
+def never_shown(units: tuple[Unit, ...], shown: int) -> list[Unit]:
+    """The units that no choice of others fills an environment of `shown` classes with."""
+    lost = []
+    for number, unit in enumerate(units):
+        others = [len(other) for place, other in enumerate(units) if place != number]
+        if shown - len(unit) not in _sums(others):
+            lost.append(unit)
+    return lost
+
+
+def strides(count: int) -> list[int]:
+    """Strides that visit all of a pack, 3 and 1 first; 3 stands twice, as maps of synthesis 1 have it."""
+    return [s for s in (3, 1, *range(2, count)) if np.gcd(s, count) == 1]
+
+
+def _fill(order: list[int], units: tuple[Unit, ...], room: int) -> list[int]:
+    """The first units in their order that fill the room exactly; those with which nothing would are left out."""
+    dealt = []
+    for position, unit in enumerate(order):
+        left = room - len(units[unit])
+        if left in _sums([len(units[other]) for other in order[position + 1 :]]):
+            dealt.append(unit)
+            room = left
+    return dealt
+
+
+def _sums(sizes: list[int]) -> set[int]:
+    """All sums of some of the sizes."""
+    sums = {0}
+    for size in sizes:
+        sums |= {total + size for total in sums}
+    return sums
