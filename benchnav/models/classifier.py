@@ -1,8 +1,7 @@
 """The terrain classifier: from a colour image to class probabilities of every cell.
 
 Any architecture and encoder of segmentation-models-pytorch fits; the default is the U-Net with a
-ResNet-18 encoder of paper III-B. Sources: Ronneberger et al. (2015), "U-Net"; He et al. (2016),
-"Deep residual learning". Letters in shapes: B maps, H×W cells, C classes.
+ResNet-18 encoder of paper III-B. Letters in shapes: B maps, H×W cells, C classes.
 """
 
 from typing import Any
@@ -18,31 +17,7 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.fitting import one_cycle
-
-_STRIDE = 32  # the coarsest of any encoder: sides must be multiples of it
-_DETAIL_CHANNELS = 32
-
-
-class WithFullResolution(nn.Module):
-    """A network whose features are joined by those of the image at full resolution before classes are told.
-
-    Args:
-        network: from images [B, 3, H, W] to features [B, 32, H, W].
-        class_count: C.
-    """
-
-    def __init__(self, network: nn.Module, class_count: int) -> None:
-        """Adds a layer beside the network and two behind it."""
-        super().__init__()
-        self.network = network
-        self.detail = _convolution(3, _DETAIL_CHANNELS)
-        self.head = nn.Sequential(
-            _convolution(2 * _DETAIL_CHANNELS, _DETAIL_CHANNELS), nn.Conv2d(_DETAIL_CHANNELS, class_count, 1)
-        )
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Computes logits [B, C, H, W] of images [B, 3, H, W]."""
-        return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
+from benchnav.models.network import build_network
 
 
 class CrossEntropyWithDice(nn.Module):
@@ -104,30 +79,9 @@ class TerrainClassifier(lightning.LightningModule):
         """Builds the network; leaves PyTorch's global generator as it was.
 
         Raises:
-            ConfigError: there is no such architecture or encoder.
+            ConfigError: there is no such architecture or encoder, or they do not take these settings.
         """
-        architectures, encoder = smp.MODEL_ARCHITECTURES_MAPPING, self.config.encoder
-        if self.config.architecture not in architectures:
-            raise ConfigError(
-                f"Expected `architecture` among {', '.join(architectures)}, got {self.config.architecture!r}."
-            )
-        if encoder not in smp.encoders.get_encoder_names() and not encoder.startswith("tu-"):
-            raise ConfigError(
-                "Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, "
-                f"got {encoder!r}."
-            )
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
-            network = smp.create_model(
-                self.config.architecture,
-                encoder_name=encoder,
-                encoder_weights="imagenet" if self.config.pretrained else None,
-                in_channels=3,
-                classes=_DETAIL_CHANNELS if self.config.full_resolution else self.class_count,
-            )
-            if self.config.full_resolution:
-                network = WithFullResolution(network, self.class_count)
-        return network.to(memory_format=torch.channels_last)
+        return build_network(self.config, self.class_count, seed)
 
     def configure_losses(self) -> nn.Module:
         """The training loss: cross-entropy, a proper score, unless more is asked for."""
@@ -160,7 +114,8 @@ class TerrainClassifier(lightning.LightningModule):
         """
         height, width = rgb.shape[-2:]
         image = (rgb.to(self.colour_mean.dtype) - self.colour_mean) / self.colour_std
-        image = nn.functional.pad(image, (0, -width % _STRIDE, 0, -height % _STRIDE), mode="replicate")
+        stride = 2**self.config.encoder_depth
+        image = nn.functional.pad(image, (0, -width % stride, 0, -height % stride), mode="replicate")
         logits = self.network(image.contiguous(memory_format=torch.channels_last))
         logits = logits[..., :height, :width]
         return logits if self.training else logits / self.temperature
@@ -197,14 +152,11 @@ class TerrainClassifier(lightning.LightningModule):
         """
         try:
             settings = {name: value for name, value in config.items() if name != "temperature"}
-            built = ClassifierConfig(**{**settings, "pretrained": False})
+            channels = tuple(settings.get("decoder_channels", ()))
+            built = ClassifierConfig(**{**settings, "pretrained": False, "decoder_channels": channels})
             temperature = float(config.get("temperature", 1.0))
         except (TypeError, ValueError) as error:
             raise ConfigError(f"Expected the settings of a classifier, got {sorted(config)}.") from error
         model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=temperature)
         model.load_state_dict(tensors)
         return model.eval()
-
-
-def _convolution(channels: int, out: int) -> nn.Module:
-    return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU())

@@ -5,6 +5,8 @@ from typing import Literal
 
 from benchnav.errors import ConfigError
 
+DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClassifierConfig:
@@ -13,6 +15,10 @@ class ClassifierConfig:
     Args:
         architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
         encoder: one of its encoders, for example resnet18.
+        encoder_depth: stages of the encoder, each of which halves the image; fewer make a smaller network
+            that looks less far around a cell.
+        decoder_channels: channels of the decoder's stages, from coarse to fine, as many as there are of the
+            encoder's; where none are given, the architecture's own.
         pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
         full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
             it, so that without this every class boundary is guessed from cells twice as large.
@@ -29,6 +35,8 @@ class ClassifierConfig:
 
     architecture: str = "unet"
     encoder: str = "resnet18"
+    encoder_depth: int = 5
+    decoder_channels: tuple[int, ...] = ()
     pretrained: bool = False
     full_resolution: bool = True
     dice: float = 0.0
@@ -48,8 +56,14 @@ class ClassifierConfig:
         for name in ("label_smoothing", "jitter", "weight_decay"):
             _check_share(name, getattr(self, name))
         _check_least(
-            batch_size=(self.batch_size, 2), max_epochs=(self.max_epochs, 1), patience=(self.patience, 1)
+            encoder_depth=(self.encoder_depth, 1),
+            batch_size=(self.batch_size, 2),
+            max_epochs=(self.max_epochs, 1),
+            patience=(self.patience, 1),
+            **{f"decoder_channels[{place}]": (count, 1) for place, count in enumerate(self.decoder_channels)},
         )
+        if self.encoder_depth > DEEPEST:
+            raise ConfigError(f"Expected `encoder_depth` ≤ {DEEPEST}, got {self.encoder_depth}.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ Every refusal comes before any work is done. Where processes train together, the
 and writes.
 """
 
+import json
 import os
 import tempfile
 from collections.abc import Mapping
@@ -40,7 +41,8 @@ class Target:
         part = self.checkpoint.parts.get(name)
         if part is None:
             return False
-        if config.items() <= part.config.items() and (part.seed, part.data_digest) == (seed, self.digest):
+        wanted, there = (json.loads(json.dumps(dict(settings))) for settings in (config, part.config))
+        if wanted.items() <= there.items() and (part.seed, part.data_digest) == (seed, self.digest):
             self._forget(name)  # a kill may have come between saving and forgetting
             return True
         raise CheckpointError(

@@ -1,6 +1,7 @@
 from types import SimpleNamespace
 
 import pytest
+import segmentation_models_pytorch as smp
 import torch
 
 from benchnav.datagen.store import TerrainDataset
@@ -72,11 +73,85 @@ def test_an_unknown_network_is_refused(name: str, value: str) -> None:
         ("weight_decay", -1.0),
         ("label_smoothing", 1.0),
         ("jitter", 1.0),
+        ("encoder_depth", 0),
+        ("encoder_depth", 6),
+        ("decoder_channels", (32, 0, 16)),
     ],
 )
 def test_settings_that_cannot_train_are_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=name):
         ClassifierConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_the_default_size_is_that_of_segmentation_models_itself() -> None:
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(3)
+        plain = smp.create_model("unet", "resnet18", encoder_weights=None, in_channels=3, classes=32)
+    built = build(3).network.network.state_dict()
+    assert built.keys() == plain.state_dict().keys()
+    assert all(torch.equal(built[name], value) for name, value in plain.state_dict().items())
+
+
+@pytest.mark.parametrize(("depth", "stride"), [(3, 8), (4, 16), (5, 32)])
+def test_maps_are_padded_to_the_stride_of_the_encoder(depth: int, stride: int) -> None:
+    model = build(encoder_depth=depth)
+    seen: list[torch.Tensor] = []
+    model.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    with torch.no_grad():
+        assert model(image(33, 40)).shape == (1, 4, 33, 40)
+    assert seen[0].shape[-2:] == (-(-33 // stride) * stride, -(-40 // stride) * stride)
+
+
+def test_depth_and_channels_reach_encoder_and_decoder() -> None:
+    model = build(encoder_depth=3, decoder_channels=(48, 24, 12))
+    network = model.network.network
+    assert [block.conv1[0].out_channels for block in network.decoder.blocks] == [48, 24, 12]
+    own = build(encoder_depth=3).network.network
+    assert [block.conv1[0].out_channels for block in own.decoder.blocks] == [64, 32, 16]
+    # The fourth and fifth stage are not there to be stored.
+    assert not list(network.encoder.layer3.parameters()) + list(network.encoder.layer4.parameters())
+    assert list(network.encoder.layer2.parameters())
+
+
+@pytest.mark.parametrize("depth", [3, 4])
+def test_every_weight_of_a_smaller_network_is_trained(depth: int) -> None:
+    model = build(encoder_depth=depth).train()
+    assert all(weight.grad is None for weight in model.parameters())
+    model(image(32, 32, batch=2)).sum().backward()
+    assert all(weight.grad is not None for weight in model.parameters())
+
+
+@pytest.mark.parametrize("architecture", ["unet", "linknet", "unetplusplus", "manet"])
+def test_smaller_networks_of_other_architectures(architecture: str) -> None:
+    small = build(architecture=architecture, encoder="mobilenet_v2", encoder_depth=4)
+    with torch.no_grad():
+        assert small(image(32, 32)).shape == (1, 4, 32, 32)
+    assert _weights(small) < _weights(build(architecture=architecture, encoder="mobilenet_v2"))
+
+
+def _weights(model: torch.nn.Module) -> int:
+    return sum(weight.numel() for weight in model.parameters())
+
+
+def test_a_smaller_network_is_read_back_from_plain_settings() -> None:
+    settings = {"encoder_depth": 3, "decoder_channels": [32, 16, 8]}
+    model = build(encoder_depth=3, decoder_channels=(32, 16, 8))
+    again = TerrainClassifier.from_tensors(settings, 4, model.state_dict())
+    with torch.no_grad():
+        assert torch.equal(model(image(32, 32)), again(image(32, 32)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"decoder_channels": (32, 16)}, r"`encoder_depth` 5 and `decoder_channels` \[32, 16\]"),
+        ({"architecture": "fpn", "decoder_channels": (9,)}, "no such setting"),
+        ({"architecture": "fpn", "encoder_depth": 4}, "answers 64 cells with 128"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(settings: dict[str, object], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        build(**settings)
 
 
 def test_training_is_reproducible_and_learns(

@@ -1,0 +1,135 @@
+"""The classifier's network: one of segmentation-models-pytorch, joined by the image at full resolution.
+
+Sources: Ronneberger et al. (2015), "U-Net"; He et al. (2016), "Deep residual learning". Letters in
+shapes: B maps, H×W cells, C classes.
+"""
+
+import inspect
+from typing import Any
+
+import segmentation_models_pytorch as smp
+import torch
+from torch import Tensor, nn
+
+from benchnav.errors import ConfigError
+from benchnav.models.config import DEEPEST, ClassifierConfig
+
+_DETAIL_CHANNELS = 32
+_TRIAL_SIDE = 64
+
+
+class WithFullResolution(nn.Module):
+    """A network whose features are joined by those of the image at full resolution before classes are told.
+
+    Args:
+        network: from images [B, 3, H, W] to features [B, 32, H, W].
+        class_count: C.
+    """
+
+    def __init__(self, network: nn.Module, class_count: int) -> None:
+        """Adds a layer beside the network and two behind it."""
+        super().__init__()
+        self.network = network
+        self.detail = _convolution(3, _DETAIL_CHANNELS)
+        self.head = nn.Sequential(
+            _convolution(2 * _DETAIL_CHANNELS, _DETAIL_CHANNELS), nn.Conv2d(_DETAIL_CHANNELS, class_count, 1)
+        )
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Computes logits [B, C, H, W] of images [B, 3, H, W]."""
+        return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
+
+
+def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.Module:
+    """Builds the network with fresh weights; leaves PyTorch's global generator as it was.
+
+    Args:
+        config: what it is.
+        class_count: C.
+        seed: root seed of the weights.
+
+    Returns:
+        From images [B, 3, H, W], whose sides are multiples of 2^encoder_depth, to logits [B, C, H, W].
+
+    Raises:
+        ConfigError: there is no such architecture or encoder, or they do not take these settings.
+    """
+    _check_names(config)
+    size = _size(config)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        try:
+            network = smp.create_model(
+                config.architecture,
+                encoder_name=config.encoder,
+                encoder_weights="imagenet" if config.pretrained else None,
+                in_channels=3,
+                classes=_DETAIL_CHANNELS if config.full_resolution else class_count,
+                **size,
+            )
+            if config.encoder_depth < DEEPEST:
+                _drop_unused_stages(network)
+        except (ValueError, TypeError) as error:
+            raise ConfigError(
+                f"Expected settings that {config.architecture} of {config.encoder} takes, got `encoder_depth` "
+                f"{config.encoder_depth} and `decoder_channels` {list(config.decoder_channels)}: {error} "
+                "Change them, or leave them out."
+            ) from error
+        if config.full_resolution:
+            network = WithFullResolution(network, class_count)
+    return network.to(memory_format=torch.channels_last)
+
+
+def _check_names(config: ClassifierConfig) -> None:
+    architectures, encoder = smp.MODEL_ARCHITECTURES_MAPPING, config.encoder
+    if config.architecture not in architectures:
+        raise ConfigError(
+            f"Expected `architecture` among {', '.join(architectures)}, got {config.architecture!r}."
+        )
+    if encoder not in smp.encoders.get_encoder_names() and not encoder.startswith("tu-"):
+        raise ConfigError(
+            f"Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, got {encoder!r}."
+        )
+
+
+def _size(config: ClassifierConfig) -> dict[str, Any]:
+    """The settings of the network's size, without those that are left to the architecture."""
+    known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
+    own = known["decoder_channels"].default if "decoder_channels" in known else None
+    if config.decoder_channels and not isinstance(own, tuple):
+        raise ConfigError(
+            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
+            f"got {list(config.decoder_channels)}. Leave them out."
+        )
+    size: dict[str, Any] = {}
+    if config.encoder_depth < DEEPEST:
+        size["encoder_depth"] = config.encoder_depth
+        if isinstance(own, tuple):
+            size["decoder_channels"] = own[-config.encoder_depth :]
+    if config.decoder_channels:
+        size["decoder_channels"] = config.decoder_channels
+    return size
+
+
+def _drop_unused_stages(network: nn.Module) -> None:
+    """Takes out what a lesser depth leaves idle in the encoder: it would be stored all the same.
+
+    Idle is what has weights of which none is given a gradient.
+
+    Raises:
+        ValueError: at this depth the network's answer is not of the image's size.
+    """
+    answer = network.eval()(torch.zeros(1, 3, _TRIAL_SIDE, _TRIAL_SIDE))
+    if answer.shape[-1] != _TRIAL_SIDE:
+        raise ValueError(f"it answers {_TRIAL_SIDE} cells with {answer.shape[-1]}.")
+    answer.sum().backward()
+    for part in list(network.encoder.modules()):
+        for name, inner in list(part.named_children()):
+            weights = list(inner.parameters())
+            if weights and all(weight.grad is None for weight in weights):
+                setattr(part, name, nn.Identity())
+    network.train().zero_grad()
+
+
+def _convolution(channels: int, out: int) -> nn.Module:
+    return nn.Sequential(nn.Conv2d(channels, out, 3, padding=1, bias=False), nn.BatchNorm2d(out), nn.ReLU())
