@@ -357,7 +357,7 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ({"noise": "loud"}, "loud"),
         ({"noise": "frozen"}, "stored"),
         ({"instances": 9}, "0 takes all"),
-        ({"time_budget_s": 0.01}, "time_budget_s"),
+        ({"time_budget_s": 0.01}, "time budget of at least one time step"),
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),

@@ -63,7 +63,7 @@ def read_report(folder: Path) -> Report:
         about = {**about, **convert_about(about, episodes)}
     summary = summarise(episodes)
     return Report(
-        header=tuple(_header(summary, about)),
+        header=(*_header(summary, about), *_redrawn(episodes)),
         table=result_table(summary, about["trials"]),
         warnings=tuple(_warnings(summary, folder)),
         summary=summary,
@@ -118,6 +118,15 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
         f"{trial['labels']['planner']} {change}" for trial in trials for change in trial.get("changed", ())
     )
     return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
+
+
+def _redrawn(episodes: pd.DataFrame) -> list[str]:
+    """How often λ was drawn again; runs of before it was frozen have no such column."""
+    if "redrawn" not in episodes or not episodes["redrawn"].any():
+        return []
+    once = episodes.drop_duplicates(["data", "scenario", "world", "seed", "realisation", "instance"])
+    share = once["redrawn"].sum() / (once["redrawn"] + 1).sum()
+    return [f"Of the draws of λ {100 * share:.1f} % joined start and goal by no ground and were drawn again."]
 
 
 def _world(value: Mapping[str, Any]) -> str:

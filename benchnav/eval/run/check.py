@@ -111,7 +111,7 @@ def _check_split(trial: Trial, known: list[str], dataset: TerrainDataset, instan
 def _check_budgets(
     trials: list[Trial], datasets: dict[str, TerrainDataset], instances: int, say: Say
 ) -> None:
-    """Refuses time budgets that no instance can be driven in at top speed, and tells of those that some cannot."""
+    """Refuses time budgets without a step, and tells of goals that top speed does not reach within them."""
     seen = set()
     for trial in trials:
         task = trial.make_task()
@@ -126,14 +126,10 @@ def _check_budgets(
         trial.world.steps(budget, task.robot.dt_s)
         way = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - radius
         late = way / top_speed > budget.numpy()
-        if late.all():
-            raise ConfigError(
-                f"Expected a time budget that a robot of {top_speed:g} m/s can arrive in, got {float(budget.max()):g} s "
-                f"where the nearest goal of {trial.split} is {way.min() + radius:.1f} m away."
-            )
         if late.any():
             say(
-                f"in {late.sum()} of {len(late)} instances of {trial.split} the goal is too far to be reached within T"
+                f"in {late.sum()} of {len(late)} instances of {trial.split} a robot of {top_speed:g} m/s cannot "
+                f"reach the goal within T"
             )
 
 

@@ -56,7 +56,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     np.testing.assert_allclose(again["success_low"], summary["success_low"], rtol=1e-5)
     text = (folder / "summary.md").read_text()
     for line in (
-        "- World paper: noise resampled, T = 100 s, free where the risk map is above 0.3.",
+        "- World paper: λ resampled, T = 100 s, free where the risk map is above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each trial: 4 episodes on 2 maps.",
         "¹ objective: its own time",
@@ -121,7 +121,7 @@ def test_without_faults_there_is_nothing_to_point_at(tmp_path: Path) -> None:
 def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     print_report(run_folder(tmp_path / "run", episodes()))
     printed = capsys.readouterr().out
-    assert printed.startswith("World paper: noise resampled, T = 100 s")
+    assert printed.startswith("World paper: λ resampled, T = 100 s")
     assert "T if success [s]" in printed
     assert "¹ objective: its own time" in printed
 
@@ -152,7 +152,7 @@ def test_a_run_of_0_1_is_reported(tmp_path: Path) -> None:
     assert row["roughness_mean_radps2"] == pytest.approx(10 * old["roughness"].mean())
     assert (row["score_n"], np.isnan(row["planning_ms_median"])) == (0, True)
     text = (folder / "summary.md").read_text()
-    assert "- World paper time_budget_s=30: noise resampled, T = 30 s." in text
+    assert "- World paper time_budget_s=30: λ resampled, T = 30 s." in text
     assert "mppi samples = 64" in text
     assert "| std | mppi¹ | mean | 50 | 9–91 | 29.8 ± 0.4 | 29.5 | 82.8 ± 6.6 | 1 timeout |" in text
     assert "benchnav-eval run --model oracle" in text

@@ -38,8 +38,8 @@ def made(**changes: object) -> tuple:  # type: ignore[type-arg]
 
 
 def test_metrics_are_those_of_the_episodes_own_steps() -> None:
-    problem, episodes = made()
-    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), True)
+    problem, episodes = made(time_budget_s=torch.tensor([50.0, 70.0]))
+    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
     first, second = table.to_dict("records")
     assert (first["instance"], first["outcome"], first["success"]) == (4, "success", True)
     assert (first["seed"], first["realisation"], first["trial"]) == (7, 2, unit().trial.id)
@@ -54,7 +54,8 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
     assert first["planning_ms"] == pytest.approx(1e3 * 1.6 / 8)
     assert (first["compiled"], first["error"]) == (True, "")
     assert (second["instance"], second["outcome"], second["success"]) == (9, "stuck", False)
-    assert second["total_time_s"] == 100.0
+    assert second["total_time_s"] == 70.0
+    assert (first["redrawn"], second["redrawn"]) == (0, 3)
     assert second["end_time_s"] == pytest.approx(0.4)
     assert np.isnan(second["time_ratio"])
     assert second["score"] == 0
@@ -65,7 +66,7 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
 
 def test_times_are_measured_by_the_robots_top_speed() -> None:
     problem, episodes = made(robot=Unicycle(speed_mps=(0.0, 2.0)))
-    first = episode_rows(unit(), problem, episodes, np.array([0.4, 20.0]), False).iloc[0]
+    first = episode_rows(unit(), problem, episodes, np.array([0.4, 20.0]), [0, 0], False).iloc[0]
     assert first["reference_time_s"] == pytest.approx(0.4)
     assert first["time_ratio"] == pytest.approx(1.0)
     assert first["score"] == pytest.approx(0.5)
@@ -74,7 +75,7 @@ def test_times_are_measured_by_the_robots_top_speed() -> None:
 def test_an_episode_that_ends_at_once_has_no_flattering_zeros() -> None:
     problem, episodes = made()
     at_once = Episodes(**{**vars(episodes), "steps": torch.tensor([0, 1])})
-    table = episode_rows(unit(), problem, at_once, np.array([0.1, 20.0]), False)
+    table = episode_rows(unit(), problem, at_once, np.array([0.1, 20.0]), [0, 0], False)
     nothing = table.iloc[0][["traversability", "path_length_m", "stuck_share", "roughness_radps2"]]
     assert nothing.isna().all()
     assert np.isnan(table.iloc[1]["roughness_radps2"])
@@ -83,12 +84,12 @@ def test_an_episode_that_ends_at_once_has_no_flattering_zeros() -> None:
 
 def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
     problem, episodes = made()
-    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), True)
-    failed = error_rows(unit(), 50.0, "ValueError: no idea")
+    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
+    failed = error_rows(unit(), torch.tensor([50.0, 60.0]), "ValueError: no idea")
     assert list(failed.columns) == list(table.columns)
     assert [str(t) for t in failed.dtypes] == [str(t) for t in table.dtypes]
     assert set(failed["outcome"]) == {"model_error"}
-    assert failed["total_time_s"].tolist() == [50.0, 50.0]
+    assert failed["total_time_s"].tolist() == [50.0, 60.0]
     assert not failed["success"].any()
     assert failed["error"].tolist() == ["ValueError: no idea"] * 2
 
