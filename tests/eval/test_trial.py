@@ -8,6 +8,8 @@ import pytest
 from benchnav.errors import ConfigError
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial, trial_from, trials_of
+from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.world.world import PRESETS, Immobile, World
 
 FAN = "tests.eval.parts:Faulty"
 
@@ -40,6 +42,13 @@ def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
         {"noise": "stored"},
         {"time_budget_s": 50.0},
         {"world": {"noise": "stored", "time_budget_s": 50.0}},
+        {"world": "stakes"},
+        {"world": {"preset": "stakes", "correlation_m": 2.0}},
+        {"world": {"preset": "stakes", "immobile": {"below": 0.2}}},
+        {"world": {"preset": "stakes", "immobile": {"for_s": 3.0}}},
+        {"world": {"preset": "stakes", "immobile": None}},
+        {"world": {"preset": "stakes", "time_budget_ratio": 2.0}},
+        {"world": {"preset": "stakes", "time_budget_s": 2.0}},
         {"task": {"slowest": 0.05}},
         {"task": {"goal_radius_m": 0.5}},
         {"task": {"free_space": {"by": "mean"}}},
@@ -53,7 +62,7 @@ def test_a_trial_is_read_back_from_what_a_run_holds() -> None:
     for trial in trials(
         planners=({"part": FAN, "label": "late", "options": {"after_s": 2.0}}, "straight"),
         task={"free_space": {"by": "mean", "above": 0.1}},
-        world={"noise": "stored"},
+        trials=({"world": [{"noise": "stored"}, "stakes", {"preset": "stakes", "immobile": None}]},),
         robots=({"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}},),
     ):
         again = trial_from({"value": trial.value, "labels": trial.labels})
@@ -176,3 +185,56 @@ def test_a_suite_refuses_what_means_nothing() -> None:
     ):
         with pytest.raises(ConfigError):
             replace(Suite(), **bad)
+
+
+def test_a_world_with_stakes_is_told_apart_by_what_is_changed() -> None:
+    trial = one(world="stakes")
+    assert trial.world == PRESETS["stakes"].world
+    assert trial.rules == PRESETS["stakes"].rules
+    assert trial.world_label == "stakes"
+    changed = one(
+        world={"preset": "stakes", "correlation_m": 2, "immobile": {"below": 0.2}, "time_budget_s": 50},
+        task={"slowest": 0.1, "free_space": {"by": "risk"}},
+    )
+    assert changed.world == World(
+        noise="frozen", correlation_m=2.0, immobile=Immobile(below=0.2, for_s=2.0), time_budget_s=50.0
+    )
+    assert changed.rules == Rules(free_space=FreeSpace(by="risk", above=0.1), slowest=0.1)
+    assert changed.world_label == (
+        "stakes correlation_m=2 immobile=0.2/2s time_budget_s=50 by=risk slowest=0.1"
+    )
+    assert one(world={"preset": "stakes", "immobile": None}).world_label == "stakes immobile=none"
+    held = one(world={"immobile": {"for_s": 4}})
+    assert held.world.immobile == Immobile(below=0.1, for_s=4.0)
+    assert one(world="stakes", time_budget_s=50.0).world.time_budget_s == 50.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"noise": "frozen"}, "is now 'stored'.*world stakes"),
+        ({"world": {"correlation_m": 2.0}}, "with `world.noise` frozen, got it with 'resampled'"),
+        ({"world": {"time_budget_s": 5.0, "time_budget_ratio": 2.0}}, "either"),
+        ({"world": {"time_budget_s": None}}, "either"),
+        ({"world": {"immobile": 3}}, "like {'below': 0.1, 'for_s': 2.0}, got 3"),
+        ({"world": {"immobile": {"belw": 0.2}}}, "Did you mean 'below'"),
+        ({"model": "clairvoyant"}, "can be known for the model 'clairvoyant', got 'paper'"),
+    ],
+)
+def test_worlds_that_contradict_themselves_are_refused(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
+        trials(**changes)
+
+
+def test_the_clairvoyant_is_one_trial_a_planner_for_all_risks() -> None:
+    made = trials(
+        planners=("straight", FAN, "mppi"), risks=("mean", "cvar"), models=("oracle", "clairvoyant"),
+        world="stakes", scenarios=("std",),
+    )  # fmt: skip
+    seen = [(t.labels["model"], t.labels["planner"], t.labels["risk"]) for t in made]
+    assert sorted(seen) == sorted(
+        [("–", "straight", "–"), ("clairvoyant", "Faulty", "–"), ("clairvoyant", "mppi", "–")]
+        + [("oracle", planner, risk) for planner in ("Faulty", "mppi") for risk in ("mean", "cvar")]
+    )
+    for trial in made:
+        assert trial_from({"value": trial.value, "labels": trial.labels}) == trial

@@ -298,3 +298,19 @@ def test_a_family_is_no_model_and_a_checkpoint_of_an_unknown_one_says_so(checkpo
     foreign = replace(load_checkpoint(checkpoint_path), model="theirs")
     with pytest.raises(CheckpointError, match=r"got one of 'theirs'. Install the package"):
         open_checkpoint(foreign)
+
+
+def test_the_oracle_the_ideal_and_the_clairvoyant_know_each_their_own() -> None:
+    terrain = make_terrain()
+    shape = (2, 4, 16, 16)
+    seen = TraversabilityMixture(
+        torch.full(shape, 0.25), torch.rand(shape), torch.full(shape, 0.1), (0, 0, 1, 1)
+    )
+    alike = replace(terrain, look_alikes=seen)
+    assert predict(load_model("oracle"), alike) == terrain.truth
+    assert predict(load_model("ideal"), alike) == seen
+    assert predict(load_model("ideal"), terrain) == terrain.truth
+    known = predict(load_model("clairvoyant"), alike)
+    for level in (0.0, 0.5, 0.99):
+        torch.testing.assert_close(known.cvar(level), terrain.traversability, atol=1e-6, rtol=0)
+    torch.testing.assert_close(known.most_likely().mean(), terrain.traversability, atol=1e-6, rtol=0)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -18,6 +19,10 @@ def test_measures_by_name_are_those_of_the_mixture() -> None:
         ("var", mixture.var(0.9)),
         ("var:0.95", mixture.var(0.95)),
         ("mean", mixture.mean()),
+        ("expected-time", mixture.harmonic_mean(0.05)),
+        ("expected-time:0.2", mixture.harmonic_mean(0.2)),
+        ("chance", mixture.chance(0.1)),
+        ("chance:0.4", mixture.chance(0.4)),
         ("single-class", mixture.most_likely().cvar(0.9)),
         ("single-class:0.2", mixture.most_likely().cvar(0.2)),
         ({"part": "cvar", "options": {"level": 0.3}}, mixture.cvar(0.3)),
@@ -81,3 +86,15 @@ def test_a_measure_changes_nothing_that_it_is_given(name: str) -> None:
     risk.apply(registry.make("risk", name), mixture)
     after = (mixture.weights, mixture.means, mixture.stds)
     assert all(torch.equal(*pair) for pair in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize(("text", "word"), [("chance:1.5", "bound"), ("expected-time:0", "least speed")])
+def test_options_of_other_measures_out_of_range_are_refused(text: str, word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        risk.apply(registry.make("risk", text), random_mixture())
+
+
+def test_single_class_of_components_that_are_no_classes_is_refused_by_name() -> None:
+    mixture = replace(random_mixture(), group=None)
+    with pytest.raises(ConfigError, match="single-class"):
+        risk.apply(registry.make("risk", "single-class"), mixture)

@@ -1,7 +1,7 @@
 """Worlds as users write them: a preset by name, or a mapping of changes to one."""
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any
 
 from benchnav import registry
@@ -79,6 +79,7 @@ def _changed(value: Any, changes: dict[str, Any], where: str) -> Any:
         elif isinstance(like, str) and isinstance(change, str):
             made[name] = change
         else:
+            like = asdict(like) if is_dataclass(like) and not isinstance(like, type) else like
             raise ConfigError(f"Expected `{where}.{name}` like {like!r}, got {change!r}.")
     return replace(value, **made)
 
@@ -91,8 +92,8 @@ def _differences(preset: Any, made: Any) -> list[str]:
             continue
         if isinstance(after, FreeSpace):
             changed += _differences(before, after)
-        elif isinstance(after, Immobile):
-            changed.append(f"immobile={after.below:g}/{after.for_s:g}s")
+        elif f.name == "immobile":
+            changed.append(f"immobile={after.below:g}/{after.for_s:g}s" if after else "immobile=none")
         else:
             changed.append(f"{f.name}={after:g}" if isinstance(after, float) else f"{f.name}={after}")
     return changed
