@@ -171,7 +171,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
             _draw_image(sheet, image, (x, x + wide, y + high, y))
             if paired:
                 soft = soft_ground(block["class_id"][place], classes)
-                _draw_soft_ground(sheet, soft, (x, x + wide / 2, y + high, y))
+                _draw_soft_ground(sheet, soft, (x, x + wide / 2, y + high, y), line=0.2)
             label = sheet.text(x + 0.03, y + 0.03, str(index), size=_TEXT, color="white", va="top")
             label.set_path_effects(outline)
     return figure
@@ -295,9 +295,13 @@ def _draw_contours(panel: Axes, elevation_m: np.ndarray, levels: np.ndarray, gri
 
 
 def _draw_soft_ground(
-    panel: Axes, soft: np.ndarray, extent: tuple[float, float, float, float], hatched: bool = False
+    panel: Axes,
+    soft: np.ndarray,
+    extent: tuple[float, float, float, float],
+    hatched: bool = False,
+    line: float = 0.4,
 ) -> None:
-    """Outlines the cells of bool [H, W] that may hide soft spots, by the cells' own edges."""
+    """Outlines the cells of bool [H, W] that may hide soft spots, by the cells' own edges, in black on white."""
     if not soft.any() or (soft.all() and not hatched):
         return
     left, right, bottom, top = extent
@@ -311,8 +315,8 @@ def _draw_soft_ground(
     if hatched:
         panel.contourf(x, y, member, levels=[0.5, 1.5], colors="none", hatches=[_HATCH])
     if not soft.all():
-        panel.contour(x, y, member, levels=[0.5], colors="white", linewidths=1.0)
-        panel.contour(x, y, member, levels=[0.5], colors="black", linewidths=0.4)
+        panel.contour(x, y, member, levels=[0.5], colors="white", linewidths=2.5 * line)
+        panel.contour(x, y, member, levels=[0.5], colors="black", linewidths=line)
 
 
 def _tick(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
