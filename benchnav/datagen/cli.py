@@ -31,8 +31,11 @@ def create(
         splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
         overwrite: Replace a file that is there.
     """
+    from rich.console import Console
+
     from benchnav.command import show_progress
     from benchnav.datagen.create import create as create_dataset
+    from benchnav.datagen.difficulty import table
     from benchnav.datagen.scenario import load_recipe
     from benchnav.datagen.store import TerrainDataset
     from benchnav.errors import ConfigError
@@ -51,7 +54,9 @@ def create(
         )
     path = Path(out or f"datasets/{chosen.id}.h5").expanduser()
     show_progress(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite), "maps")
-    _report(TerrainDataset(path))
+    made = TerrainDataset(path)
+    _report(made)
+    Console(highlight=False).print(table(made))
 
 
 def list_datasets(folder: str = "") -> None:

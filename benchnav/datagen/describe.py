@@ -26,6 +26,9 @@ def describe(dataset: TerrainDataset) -> dict[str, Any]:
         "grid": asdict(dataset.grid),
         "environments": recipe.environments,
         "stuck_threshold": recipe.stuck_threshold,
+        "synthesis": recipe.synthesis,
+        "places": None if recipe.places is None else asdict(recipe.places),
+        "correlation_m": recipe.correlation_m,
         "splits": {name: {**entry, "stored_bytes": stored[name]} for name, entry in dataset.splits.items()},
         "classes": [asdict(item) for item in recipe.classes],
         "fields": manifest["fields"],
@@ -54,6 +57,7 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
         f"maps of {grid['height']} × {grid['width']} cells of {grid['resolution_m']:g} m, "
         f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
     )
+    yield _making(described)
     splits = Table("split", "scenario", "maps", "MB", "made from", title="splits")
     for name, entry in described["splits"].items():
         origin = ", ".join(_origin(described, part) for part in entry["parts"])
@@ -63,12 +67,32 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
     yield splits
     yield "content digests"
     yield from (f"  {name:12} {entry['digest']}" for name, entry in described["splits"].items())
-    classes = Table("id", "class", "colour", "a", "b", "o", "σ", title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
+    soft = any(item["soft"] for item in described["classes"])
+    heads = ["id", "class", "colour", "a", "b", "o", "σ", *(["soft spots"] if soft else [])]
+    classes = Table(*heads, title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
     for number, item in enumerate(described["classes"]):
         colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
         numbers = (f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise"))
-        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers)
+        spots = [_soft_spots(item["soft"])] if soft else []
+        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers, *spots)
     yield classes
+
+
+def _making(described: dict[str, Any]) -> str:
+    """One line on how the maps were made."""
+    words, places = [f"synthesis {described['synthesis']}"], described["places"]
+    if places:
+        words.append(
+            f"start and goal drawn a map, at least {places['least_distance_m']:g} m apart and "
+            f"{places['margin_m']:g} m from the edges"
+        )
+    if described["correlation_m"]:
+        words.append(f"λ correlated over {described['correlation_m']:g} m")
+    return ", ".join(words)
+
+
+def _soft_spots(spots: dict[str, float] | None) -> str:
+    return f"{spots['weight']:.0%} N({spots['mean']:g}, {spots['std']:g})" if spots else ""
 
 
 def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:

@@ -16,7 +16,8 @@ from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.errors import ConfigError
 
 MOST_ATTEMPTS = 200
-_PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache
+_PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
+_PIECE_CELLS = 2**20
 
 Maps = dict[str, np.ndarray]
 
@@ -36,9 +37,9 @@ def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
         ConfigError: a split asks for solvable maps and the recipe yields none for some index.
     """
     indices = np.asarray(indices, dtype=np.int64)
+    size = max(1, min(_PIECE, _PIECE_CELLS // (recipe.height * recipe.width)))
     pieces = [
-        _generate_piece(recipe, split, indices[i : i + _PIECE])
-        for i in range(0, max(len(indices), 1), _PIECE)
+        _generate_piece(recipe, split, indices[i : i + size]) for i in range(0, max(len(indices), 1), size)
     ]
     return {
         name: np.concatenate([piece[name] for piece in pieces]).astype(field.dtype, copy=False)

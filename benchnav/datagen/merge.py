@@ -19,6 +19,7 @@ from benchnav.errors import ConfigError, DatasetError
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
     "height", "width", "resolution_m", "stuck_threshold", "classes", "environments", "occupancy",
+    "synthesis", "places", "correlation_m",
 )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 Lengths are in inches from the upper left corner and text is in points, as printed over the two columns
 of a page. A class has one colour in every map and figure. The earth tones of the class table look too
 alike, so their order from dark to light is kept and stretched, and every other class is drawn blue.
+Where the classes have soft spots, the ground that may hide them is hatched and outlined.
 """
 
 import textwrap
@@ -41,6 +42,7 @@ _WIDTH, _PAGE, _DPI = 7.2, 9.4, 300.0
 _LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.06, 0.42, 0.94, 0.12
 _TEXT, _TITLE, _LINE, _LETTER = 7.0, 8.0, 0.135, 0.054
 _UNOBSERVED = "0.7"
+_HATCH = "//////"
 _READ_MAPS = 20
 _MARK: dict[str, Any] = {"ls": "", "mfc": "white", "mec": "black", "mew": 0.75, "clip_on": False}
 _MARKS = {"start": _MARK | {"marker": "o", "ms": 3.6}, "goal": _MARK | {"marker": "*", "ms": 6.5}}
@@ -82,6 +84,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     maps["elevation_m"] = maps["elevation_m"] - maps["elevation_m"].min((1, 2), keepdims=True)
     classes, grid = dataset.recipe.classes, dataset.grid
     shown, colours = np.unique(maps["class_id"]), class_colours(classes)
+    soft = soft_ground(maps["class_id"], classes)
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
     sheet = _lay_out(grid, len(indices), names)
     figure = Figure(figsize=sheet.size, dpi=_DPI)
@@ -98,6 +101,10 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
             if field == "elevation_m":
                 _draw_image(panel, veils[row], extent)
                 _draw_contours(panel, maps[field][row], levels, grid)
+            if field == "class_id":
+                _draw_soft_ground(panel, soft[row], extent, hatched=True)
+            if field == "traversability":
+                _draw_soft_ground(panel, soft[row], extent)
             for name, style in _MARKS.items():
                 panel.plot(*maps[f"{name}_m"][row], **style)
             _tick(panel, sheet.panel, left=column == 0, bottom=row == len(indices) - 1)
@@ -108,12 +115,16 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     _write(figure, sheet.across[2], sheet.bottom + 0.2, "x [m]", ha="center", va="top")
     _write(figure, _LEFT, 0.06, f"{dataset.id}, split {split}", size=_TITLE, va="top")
     _draw_bars(figure, sheet, levels)
-    _draw_legends(figure, sheet, names, colours[shown], bool(np.isnan(maps["traversability"]).any()))
+    extra = _extra_marks(bool(np.isnan(maps["traversability"]).any()), bool(soft.any()))
+    _draw_legends(figure, sheet, names, colours[shown], extra)
     return figure
 
 
 def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -> Figure:
     """Draws a thumbnail of the colour image of every map of a split, in order, row by row.
+
+    Where the classes have soft spots, the ground that may hide them is outlined, and the stored λ stands
+    to the right of each image.
 
     Args:
         dataset: where the maps are.
@@ -130,7 +141,10 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     if most < 1:
         raise ConfigError(f"Expected `most` ≥ 1, got {most}.")
     held, grid = dataset.map_count(split), dataset.grid
-    count, ratio, gap = min(held, most), grid.height / grid.width, 0.05
+    classes = dataset.recipe.classes
+    paired = any(item.soft for item in classes)
+    across = grid.width * (2 if paired else 1)
+    count, ratio, gap = min(held, most), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
     wide = min(max((_WIDTH - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
@@ -140,7 +154,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     top = 0.1 + _LINE * len(lines)
     height = top + -(-count // columns) * (high + gap)
     # A whole number of dots a cell keeps all cells of one size, unless that takes too many dots.
-    dots = max(1, round(_DPI * wide / grid.width)) * grid.width / wide
+    dots = max(1, round(_DPI * wide / across)) * across / wide
     figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
     _write(figure, gap, 0.05, "\n".join(lines), size=_TITLE, va="top")
     sheet = _add_axes(figure, (0, 0, width, height), "thumbnails")
@@ -148,13 +162,24 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     sheet.axis("off")
     outline: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
     for first in range(0, count, _READ_MAPS):
-        block = dataset.read(split, range(first, min(first + _READ_MAPS, count)), ("rgb",))["rgb"]
-        for index, rgb in enumerate(block, start=first):
+        fields = ("rgb", "class_id", "traversability") if paired else ("rgb",)
+        block = dataset.read(split, range(first, min(first + _READ_MAPS, count)), fields)
+        for place, rgb in enumerate(np.moveaxis(block["rgb"], 1, -1)):
+            index = first + place
             x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
-            _draw_image(sheet, np.moveaxis(rgb, 0, -1), (x, x + wide, y + high, y))
+            image = np.concatenate([rgb, _coloured(block["traversability"][place])], 1) if paired else rgb
+            _draw_image(sheet, image, (x, x + wide, y + high, y))
+            if paired:
+                soft = soft_ground(block["class_id"][place], classes)
+                _draw_soft_ground(sheet, soft, (x, x + wide / 2, y + high, y), line=0.2)
             label = sheet.text(x + 0.03, y + 0.03, str(index), size=_TEXT, color="white", va="top")
             label.set_path_effects(outline)
     return figure
+
+
+def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.ndarray:
+    """Cells whose class has soft spots, bool, shape of `class_id`."""
+    return np.array([item.soft is not None for item in classes])[class_id]
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
@@ -163,6 +188,12 @@ def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     rank = np.argsort(np.argsort(luminance, kind="stable"), kind="stable")
     place = rank / max(len(classes) - 1, 1)
     return np.where((rank % 2 == 0)[:, None], _EARTH(place), _BLUE(place))[:, :3]
+
+
+def _coloured(traversability: np.ndarray) -> np.ndarray:
+    """λ in the colours of the sheets, from [H, W] to uint8 [H, W, 3]."""
+    shades = matplotlib.colormaps["viridis"].with_extremes(bad=_UNOBSERVED)
+    return shades(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
 
 
 def contact_columns(count: int, ratio: float) -> int:
@@ -263,6 +294,31 @@ def _draw_contours(panel: Axes, elevation_m: np.ndarray, levels: np.ndarray, gri
         panel.contour(x, y, elevation_m, levels=crossed, colors="black", linewidths=0.35, alpha=0.7)
 
 
+def _draw_soft_ground(
+    panel: Axes,
+    soft: np.ndarray,
+    extent: tuple[float, float, float, float],
+    hatched: bool = False,
+    line: float = 0.4,
+) -> None:
+    """Outlines the cells of bool [H, W] that may hide soft spots, by the cells' own edges, in black on white."""
+    if not soft.any() or (soft.all() and not hatched):
+        return
+    left, right, bottom, top = extent
+    # Two points a cell, next to its edges, so that contours keep to the edges.
+    along_y, along_x = (
+        np.repeat(np.arange(cells) / cells, 2) + np.tile([1e-4, 1 - 1e-4], cells) / cells
+        for cells in soft.shape
+    )
+    x, y = left + (right - left) * along_x, bottom + (top - bottom) * along_y
+    member = np.repeat(np.repeat(soft, 2, axis=0), 2, axis=1).astype(np.float64)
+    if hatched:
+        panel.contourf(x, y, member, levels=[0.5, 1.5], colors="none", hatches=[_HATCH])
+    if not soft.all():
+        panel.contour(x, y, member, levels=[0.5], colors="white", linewidths=2.5 * line)
+        panel.contour(x, y, member, levels=[0.5], colors="black", linewidths=line)
+
+
 def _tick(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
     for axis, inches in zip((panel.xaxis, panel.yaxis), size, strict=True):
         # A tick at the very end is left out, as its number would touch the next panel's first.
@@ -289,12 +345,22 @@ def _draw_bars(figure: Figure, sheet: _Sheet, levels: np.ndarray) -> None:
             bar.set_xlabel(label, size=_TEXT, labelpad=1.5, linespacing=1.1)
 
 
+def _extra_marks(unobserved: bool, soft: bool) -> list[Artist]:
+    """Entries of the legend for what few maps show."""
+    marks: list[Artist] = []
+    if unobserved:
+        marks.append(Patch(facecolor=_UNOBSERVED, label="unobserved"))
+    if soft:
+        marks.append(Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label="may hide soft spots"))
+    return marks
+
+
 def _draw_legends(
-    figure: Figure, sheet: _Sheet, names: Sequence[str], colours: np.ndarray, unobserved: bool
+    figure: Figure, sheet: _Sheet, names: Sequence[str], colours: np.ndarray, extra: Sequence[Artist]
 ) -> None:
     """Explains the marks over the panels, and the classes under the first two columns."""
     marks: list[Artist] = [Line2D([], [], label=name, **style) for name, style in _MARKS.items()]
-    marks += [Patch(facecolor=_UNOBSERVED, label="unobserved")] * unobserved
+    marks += extra
     classes = [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
     style: dict[str, Any] = {
         "fontsize": _TEXT, "frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.1,

@@ -76,12 +76,12 @@ def _check_places(recipe: "Recipe") -> None:
 def _check_scenarios(recipe: "Recipe") -> None:
     extent_x, extent_y = recipe.grid.extent_m
     for name, scenario in recipe.scenarios.items():
-        if scenario.crater_count[1] > 0 and 2 * scenario.crater_radius_m[1] > min(extent_x, extent_y):
+        most = scenario.crater_count[1] if recipe.synthesis == 1 else recipe.craters(scenario)[1]
+        if most > 0 and 2 * scenario.crater_radius_m[1] > min(extent_x, extent_y):
             raise ConfigError(
                 f"Expected `crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
                 f"got {scenario.crater_radius_m}."
             )
-        most = scenario.crater_count[1] if recipe.synthesis == 1 else recipe.craters(scenario)[1]
         covered = most * scenario.mean_crater_area_m2 / (extent_x * extent_y)
         if covered > _MOST_CRATERED:
             raise ConfigError(

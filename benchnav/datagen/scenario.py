@@ -6,6 +6,7 @@ A recipe is a YAML file. Shipped ones are named by id (`paper-v1`); a user's own
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ class Recipe:
         row, column = self.grid.cell_of(*torch.from_numpy(positions_m.astype(np.float32)).T)
         return row.numpy(), column.numpy()
 
-    @property
+    @cached_property
     def units(self) -> tuple[Unit, ...]:
         """Classes that are shown together: in synthesis 2 those of one colour, in the table's order."""
         if self.synthesis == 1:

@@ -1,4 +1,4 @@
-"""Dataset format 1.0: fields, manifest and content digests; `docs/format.md` describes it for readers.
+"""Dataset formats 1.0 and 1.1: fields, manifest and content digests; `docs/format.md` describes it for readers.
 
 One HDF5 file is one dataset. Groups are splits; each holds the fields of `FIELDS` and the SHA-256 of
 every entry. The manifest is a JSON text in the dataset `manifest`. Digests cover logical arrays, not

@@ -1,4 +1,4 @@
-"""Reading datasets of format 1.0 (HDF5).
+"""Reading datasets of formats 1.0 and 1.1 (HDF5).
 
 Readers open the file at each call, so they may be passed to other processes.
 """
@@ -25,7 +25,7 @@ READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, Attribute
 
 
 class TerrainDataset:
-    """Reads a dataset of format 1.0.
+    """Reads a dataset of format 1.0 or 1.1.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""Writing dataset files of format 1.0 (HDF5), whole or not at all, one writer at a time.
+"""Writing dataset files (HDF5), whole or not at all, one writer at a time.
 
 What is unfinished lives in the folder `.NAME.partial` beside the target, whose name never holds a
 partial file.

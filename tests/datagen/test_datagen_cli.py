@@ -228,3 +228,67 @@ def test_shipped_recipes_load_and_full_has_the_papers_maps() -> None:
     }  # fmt: skip
     with pytest.raises(ConfigError, match="shipped recipe"):
         load_recipe("full")
+
+
+def test_a_dataset_with_stakes_from_making_to_mending(datagen: Call, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+    changes = [
+        "id=mine", "height=32", "width=32", "places={least_distance_m: 8, margin_m: 1}",
+        "splits={train: {scenario: std, maps: 3}, test/hg: {scenario: hg, maps: 2, solvable: true}}",
+    ]  # fmt: skip
+    assert datagen("create", "stakes-v1", *changes, "--out", "d.h5") == 0
+    made = capsys.readouterr().out
+    assert "λ_stuck 0.1" in made
+    assert made.rstrip().splitlines()[-1].split()[0] == "test/hg"
+    assert datagen("show", "d.h5") == 0
+    shown = capsys.readouterr().out
+    for words in (
+        "format 1.1", "synthesis 2", "at least 8 m apart and 1 m from the edges", "λ correlated over 1.5 m",
+        "soft spots", "10% N(0.05, 0.05)",
+    ):  # fmt: skip
+        assert words in shown
+    assert sum("10% N" in line for line in shown.splitlines()) == 4
+    assert datagen("show", "d.h5", "--json") == 0
+    described = json.loads(capsys.readouterr().out)
+    assert described["places"] == {"least_distance_m": 8, "margin_m": 1}
+    assert described["classes"][1]["soft"]["weight"] == 0.1
+    with h5py.File("d.h5", "r+") as file:
+        file["train/start_m"][1] = 0
+        file["test/hg/traversability"][0] = 0
+    assert datagen("validate", "d.h5") == 1
+    assert datagen("repair", "d.h5") == 0
+    # Repair tells digests, and not again how hard the maps are.
+    assert "λ_stuck" not in capsys.readouterr().out
+    assert datagen("validate", "d.h5") == 0
+    assert datagen("preview", "d.h5", "--split", "train", "--out", "p.png") == 0
+    assert datagen("preview", "d.h5", "--split", "train", "--contact-sheet") == 0
+
+
+def test_show_of_a_dataset_of_synthesis_1_tells_of_no_soft_spots(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5") == 0
+    capsys.readouterr()
+    assert datagen("show", "d.h5") == 0
+    shown = capsys.readouterr().out
+    assert "synthesis 1\n" in shown
+    assert "soft spots" not in shown
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("classes.1.soft", "override"),
+        ("synthesis=1", "`synthesis: 2` with `soft`"),
+        ("synthesis=3", "`synthesis` 1 or 2"),
+        ("places={least_distance_m: 99, margin_m: 3}", "`least_distance_m`"),
+        ("places={margin_m: 3}", "least_distance_m"),
+        ("start_m=[3, 3]", "either `start_m` and `goal_m`, or `places`"),
+        ("correlation_m=9", "`correlation_m`"),
+        ("correlation_m=far", "correlation_m"),
+        ("occupancy=[1.0]", "`occupancy`"),
+    ],
+)
+def test_bad_stakes_are_one_line(datagen: Call, capsys, change: str, expected: str) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "stakes-v1", "id=mine", change) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert expected in told[-1]
+    assert len(told) == 1
+    assert not list(Path().iterdir())

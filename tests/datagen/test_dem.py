@@ -11,10 +11,12 @@ import pytest
 
 from benchnav.datagen.appearance import light_direction, shade
 from benchnav.datagen.dem import import_dem
+from benchnav.datagen.places import Places
 from benchnav.datagen.schema import quantise
 from benchnav.datagen.store import TerrainDataset
 from benchnav.datagen.validate import find_faults
 from benchnav.errors import BenchnavError, ConfigError
+from tests.datagen.small import small_stakes
 from tests.factories import tiny_recipe
 
 rasterio = pytest.importorskip("rasterio")
@@ -521,3 +523,29 @@ def test_the_remedy_of_the_message_is_one(tmp_path: Path, case: str) -> None:
     assert ran.exit_code == 0, ran.output
     source = source_of(read(Path(words[-1]), **rasters))
     np.testing.assert_allclose(source["lowest_m"], 500, atol=0.001)
+
+
+# Recipes of synthesis 2
+
+
+def test_places_and_luck_are_drawn_on_real_ground_too(tmp_path: Path) -> None:
+    places = Places(least_distance_m=6, margin_m=1)
+    recipe = small_stakes(height=16, width=24, places=places)
+    values = rough(32, 48).astype(np.float64) / 8
+    whole = read(write(tmp_path / "dem.tif", values), recipe=recipe, solvable=True)
+    assert whole.manifest["format_version"] == "1.1"
+    assert whole.recipe.places == places
+    maps = maps_of(whole)
+    assert len(np.unique(maps["start_m"], axis=0)) == len(maps["start_m"]) == 4
+    assert (np.hypot(*(maps["start_m"] - maps["goal_m"]).T) >= 6).all()
+    for name in ("start_m", "goal_m"):
+        assert (maps[name] >= 1).all()
+        assert (maps[name] < (11, 7)).all()
+    assert (maps["reference_time_s"] > 6).all()
+    assert (maps["traversability"] < 0.15).any()
+    # A map's draws go by its number in the raster, whichever others are left out.
+    values[0, 0] = -1
+    rest = read(write(tmp_path / "hole.tif", values, nodata=-1), recipe=recipe, solvable=True)
+    assert source_of(rest)["kept"] == [0, 1, 3]
+    for name, found in maps_of(rest).items():
+        np.testing.assert_array_equal(found, maps[name][[0, 1, 3]])

@@ -1,6 +1,7 @@
-"""Format 1.0 stays readable, and its maps stay the same on every machine.
+"""Formats 1.0 and 1.1 stay readable, and their maps stay the same on every machine.
 
-`tests/data/golden-1.0.h5` was made by `benchnav-datagen create tests/data/golden.yaml`.
+`tests/data/golden-1.0.h5` was made by `benchnav-datagen create tests/data/golden.yaml`, and
+`golden-1.1.h5` by `benchnav-datagen create tests/datagen/golden-1.1.yaml`.
 """
 
 import json
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from benchnav.datagen import schema
+from benchnav.datagen.create import create
 from benchnav.datagen.generate import generate
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
@@ -26,6 +28,16 @@ DIGESTS = {
     "test/hg": "e488981e71592cc64bab2f150b382f32c1b71be822e98f7cdfc673ead85f71ba",
     "test/dusk": "4ddfa3680ac1bbbdf4b52397d234c37fdedc1336574f9123addc3c28741263b3",
 }
+SECOND = Path(__file__).parent / "golden-1.1.h5"
+SECOND_DIGESTS = {
+    "train": "ab407c74c577c024148a7baf8a99ab4ae1d67072133ca6a3190c33057873ca5c",
+    "test/hg": "da7da0122f061b7e8f81a28f2baa8a1077e6eb5e3f1ec2710a8f583b6ead4381",
+    "test/dusk": "f8b99914ddda6379c6b7756dc706b8c9d0bb03ef60ccb5199b0e1744ce276f23",
+}
+VERSIONS = [
+    pytest.param("1.0", GOLDEN, DATA / "golden.yaml", DIGESTS, id="1.0"),
+    pytest.param("1.1", SECOND, SECOND.with_suffix(".yaml"), SECOND_DIGESTS, id="1.1"),
+]
 
 
 def dispatched() -> list[str]:
@@ -34,16 +46,40 @@ def dispatched() -> list[str]:
     return [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)]
 
 
-def test_the_golden_file_is_sound_and_holds_what_its_recipe_makes() -> None:
-    dataset = TerrainDataset(GOLDEN)
-    assert find_faults(GOLDEN) == []
-    assert {name: entry["digest"] for name, entry in dataset.splits.items()} == DIGESTS
-    recipe = load_recipe(DATA / "golden.yaml")
+@pytest.mark.parametrize(("version", "path", "source", "digests"), VERSIONS)
+def test_the_golden_file_is_sound_and_holds_what_its_recipe_makes(
+    version: str, path: Path, source: Path, digests: dict[str, str]
+) -> None:
+    dataset = TerrainDataset(path)
+    assert dataset.manifest["format_version"] == version
+    assert find_faults(path) == []
+    assert {name: entry["digest"] for name, entry in dataset.splits.items()} == digests
+    recipe = load_recipe(source)
     assert dataset.recipe == recipe
     for split, entry in dataset.splits.items():
         made = generate(recipe, split, np.arange(entry["maps"]))
         for name, values in dataset.read(split).items():
             np.testing.assert_array_equal(values, made[name])
+
+
+def test_version_1_1_has_the_fields_of_1_0(tmp_path: Path) -> None:
+    first, second = TerrainDataset(GOLDEN).manifest, TerrainDataset(SECOND).manifest
+    assert list(first) == list(second)
+    assert first["fields"] == second["fields"]
+    new = {"synthesis", "places", "correlation_m"}
+    assert set(second["recipes"][0]) - set(first["recipes"][0]) == new
+    assert set(first["recipes"][0]) - set(second["recipes"][0]) == {"start_m", "goal_m"}
+
+
+def test_version_1_0_is_written_as_ever(tmp_path: Path) -> None:
+    path = tmp_path / "d.h5"
+    for _ in create(load_recipe(DATA / "golden.yaml"), path):
+        pass
+    with h5py.File(path) as made, h5py.File(GOLDEN) as golden:
+        texts = [json.loads(file["manifest"][()]) for file in (made, golden)]
+    for text in texts:
+        del text["generator"], text["manifest_digest"]
+    assert json.dumps(texts[0]) == json.dumps(texts[1])
 
 
 def test_the_golden_file_is_laid_out_as_documented() -> None:
@@ -80,11 +116,14 @@ def test_the_golden_file_is_laid_out_as_documented() -> None:
     ids=["no vector instructions", "plain BLAS and C library", "threads"],
 )
 def test_digests_are_the_same_on_other_processors(tmp_path: Path, settings: dict[str, str]) -> None:
+    sources = [str(DATA / "golden.yaml"), str(SECOND.with_suffix(".yaml"))]
     code = (
         "from pathlib import Path; from benchnav.datagen.scenario import load_recipe; "
         "from benchnav.datagen.create import create\n"
-        f"for _ in create(load_recipe({str(DATA / 'golden.yaml')!r}), Path('d.h5')): pass"
+        f"for number, source in enumerate({sources!r}):\n"
+        "    for _ in create(load_recipe(source), Path(f'{number}.h5')): pass"
     )
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | settings, check=True)
-    made = TerrainDataset(tmp_path / "d.h5")
-    assert {name: entry["digest"] for name, entry in made.splits.items()} == DIGESTS
+    for number, digests in enumerate((DIGESTS, SECOND_DIGESTS)):
+        made = TerrainDataset(tmp_path / f"{number}.h5")
+        assert {name: entry["digest"] for name, entry in made.splits.items()} == digests

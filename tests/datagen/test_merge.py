@@ -12,6 +12,7 @@ from benchnav.datagen.scenario import Recipe
 from benchnav.datagen.store import TerrainDataset
 from benchnav.datagen.validate import find_faults
 from benchnav.errors import DatasetError
+from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
 
@@ -73,6 +74,27 @@ def test_all_reasons_are_given_at_once(tmp_path: Path) -> None:
     assert not (tmp_path / "m.h5").exists()
     with pytest.raises(DatasetError, match="fewer than two"):
         run([first], tmp_path / "m.h5")
+
+
+def test_maps_made_in_another_way_are_refused(tmp_path: Path) -> None:
+    recipe = small_stakes()
+    first = tiny_dataset(tmp_path / "a.h5", only(recipe, "train"))
+    second = tiny_dataset(tmp_path / "b.h5", only(replace(recipe, seed=1), "train"))
+    merged = run([first, second], tmp_path / "m.h5")
+    assert merged.manifest["format_version"] == "1.1"
+    assert find_faults(merged.path) == []
+    apart = replace(recipe.places, least_distance_m=9)
+    plain = replace(tiny_recipe(), environments=12, stuck_threshold=0.1)
+    for name, other in (
+        ("places", replace(recipe, places=apart)),
+        ("places", replace(recipe, places=None, start_m=(4, 4), goal_m=(12, 12))),
+        ("correlation_m", replace(recipe, correlation_m=1.0)),
+        ("synthesis", plain),
+    ):
+        path = tiny_dataset(tmp_path / "other.h5", only(replace(other, seed=3), "train"))
+        with pytest.raises(DatasetError, match=f"unlike {name} "):
+            run([first, path], tmp_path / "n.h5")
+        path.unlink()
 
 
 def test_a_damaged_source_is_refused_and_an_existing_target_kept(tmp_path: Path) -> None:

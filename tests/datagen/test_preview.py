@@ -21,10 +21,12 @@ from benchnav.datagen.preview import (
     preview_figure,
     save_contact_sheet,
     save_preview,
+    soft_ground,
 )
 from benchnav.datagen.scenario import Recipe, load_recipe
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import ConfigError, DatasetError
+from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
 BARS = ("elevation_m", "slope_deg", "traversability")
@@ -340,3 +342,72 @@ def test_nothing_to_draw_is_refused(dataset: TerrainDataset) -> None:
         contact_sheet_figure(dataset, "train", most=0)
     with pytest.raises(DatasetError, match="indices in 0–7"):
         preview_figure(dataset, "train", [8])
+
+
+@pytest.fixture(scope="module")
+def stakes(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
+    return TerrainDataset(tiny_dataset(tmp_path_factory.mktemp("stakes") / "d.h5", small_stakes()))
+
+
+def hatched(panel: Axes) -> list[Any]:
+    return [drawn for drawn in panel.collections if any(getattr(drawn, "hatches", None) or [])]
+
+
+def test_soft_ground_is_hatched_and_outlined(stakes: TerrainDataset) -> None:
+    figure = preview_figure(stakes, "train", [0, 1])
+    drawn = panels(figure)
+    maps = stakes.read("train", [0, 1])
+    soft = soft_ground(maps["class_id"], stakes.recipe.classes)
+    names = {"wet_clay", "loose_soil", "fine_sand", "dune_sand"}
+    for number, item in enumerate(stakes.recipe.classes):
+        assert (soft[maps["class_id"] == number] == (item.name in names)).all()
+    grid = stakes.grid
+    y, x = ((np.arange(cells) + 0.5) * grid.resolution_m for cells in grid.shape)
+    centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    for row in range(2):
+        (area,) = hatched(drawn[f"class_id {row}"])
+        # A path of pieces and holes: a point is inside where they wind around it.
+        (path,) = area.get_paths()
+        rings = path.to_polygons(closed_only=True)
+        inside = sum(matplotlib.path.Path(ring).contains_points(centres).astype(int) for ring in rings) % 2
+        np.testing.assert_array_equal(inside.reshape(grid.shape).astype(bool), soft[row])
+        assert not hatched(drawn[f"traversability {row}"])
+        assert len(drawn[f"traversability {row}"].collections) == 2
+        for plain in ("rgb", "slope_deg"):
+            assert not drawn[f"{plain} {row}"].collections
+    assert legend_names(figure)[:3] == ["start", "goal", "may hide soft spots"]
+    check_texts(figure)
+
+
+def test_a_sheet_without_soft_ground_says_nothing_of_it(
+    stakes: TerrainDataset, dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_values(stakes, monkeypatch, class_id=np.zeros_like)
+    for made in (preview_figure(stakes, "train", [0]), preview_figure(dataset, "train", [0])):
+        assert "may hide soft spots" not in legend_names(made)
+        assert not panels(made)["class_id 0"].collections
+
+
+def test_a_map_that_is_soft_all_over_is_hatched_whole(
+    stakes: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_values(stakes, monkeypatch, class_id=np.ones_like)
+    drawn = panels(preview_figure(stakes, "train", [0]))
+    assert len(drawn["class_id 0"].collections) == 1
+    assert not drawn["traversability 0"].collections
+
+
+def test_a_contact_sheet_of_soft_ground_shows_stored_traversability(stakes: TerrainDataset) -> None:
+    figure = contact_sheet_figure(stakes, "train")
+    maps = stakes.read("train")
+    (sheet,) = figure.axes
+    assert len(sheet.images) == 8
+    for index, image in enumerate(sheet.images):
+        shown = np.asarray(image.get_array())
+        assert shown.shape == (32, 64, 3)
+        np.testing.assert_array_equal(shown[:, :32], maps["rgb"][index].transpose(1, 2, 0))
+        shade = matplotlib.colormaps["viridis"](maps["traversability"][index], bytes=True)[..., :3]
+        np.testing.assert_array_equal(shown[:, 32:], shade)
+        left, right, bottom, top = image.get_extent()
+        assert (right - left) == pytest.approx(2 * (bottom - top))
+    check_texts(figure)

@@ -1,0 +1,151 @@
+"""How hard the maps of a dataset are to cross, a split at a time.
+
+Hard ground is told before anything is trained or driven on it: where a straight line to the goal is free
+on nearly every map, no planner has anything to plan. Letters in shapes: B maps, H×W cells.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from benchnav.datagen import latent
+from benchnav.datagen.block import BLOCK_MAPS, spans
+from benchnav.datagen.generate import Maps
+from benchnav.datagen.scenario import Recipe
+from benchnav.datagen.store import TerrainDataset
+from benchnav.terrain import Grid
+
+_FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
+_HEADS = (
+    "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difficulty:
+    """What stands in a robot's way on the maps of a split.
+
+    Args:
+        maps: number of maps.
+        stuck: share of the cells whose true E[λ] is at most λ_stuck.
+        soft_ground: share of the cells whose class has soft spots.
+        soft_spots: share of the ground that is a soft spot, in the mean over all draws of λ.
+        straight: number of maps on which all cells of the straight line from start to goal have a true
+            E[λ] above λ_stuck.
+        reference_times_s: grid reference times of the maps that have one.
+    """
+
+    maps: int
+    stuck: float
+    soft_ground: float
+    soft_spots: float
+    straight: int
+    reference_times_s: np.ndarray
+
+
+def of_maps(maps: Maps, recipe: Recipe) -> Difficulty:
+    """Measures some maps.
+
+    Args:
+        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
+        recipe: class table, resolution and λ_stuck.
+    """
+    weights, means, stds = latent.truth(
+        maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes
+    )
+    stuck = latent.expected_of((weights, means, stds)) <= recipe.stuck_threshold
+    spots = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])[maps["class_id"]]
+    on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
+    times = maps["reference_time_s"].astype(np.float64)
+    return Difficulty(
+        maps=len(stuck),
+        stuck=float(stuck.mean()),
+        soft_ground=float((spots > 0).mean()),
+        soft_spots=float(spots.mean()),
+        straight=int((~(stuck & on_line).any(axis=(1, 2))).sum()),
+        reference_times_s=times[np.isfinite(times)],
+    )
+
+
+def of_split(dataset: TerrainDataset, split: str) -> Difficulty:
+    """Measures all maps of a split, some at a time.
+
+    Raises:
+        DatasetError: there is no such split, or its data are damaged.
+    """
+    pieces = (
+        of_maps(dataset.read(split, range(*span), _FIELDS), dataset.recipe)
+        for span in spans(dataset.map_count(split), BLOCK_MAPS)
+    )
+    return _together(pieces)
+
+
+def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.ndarray:
+    """The cells that the straight line between two positions runs through.
+
+    A line along a border between cells lies in those beyond it, as positions do; a corner that is only
+    touched is not run through.
+
+    Args:
+        grid: size and resolution.
+        start_m: (x, y), shape [B, 2].
+        goal_m: (x, y), shape [B, 2].
+
+    Returns:
+        bool, shape [B, H, W].
+    """
+    start = start_m.astype(np.float64) / grid.resolution_m
+    along = goal_m.astype(np.float64) / grid.resolution_m - start
+    # Where the line is cut by the grid's lines: as shares of its length, sorted.
+    cuts = [np.zeros((len(start), 1)), np.ones((len(start), 1))]
+    for axis, cells in enumerate((grid.width, grid.height)):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            cut = (np.arange(1, cells) - start[:, axis, None]) / along[:, axis, None]
+        cuts.append(np.where((cut > 0) & (cut < 1), cut, 0))
+    shares = np.sort(np.concatenate(cuts, axis=1), axis=1)
+    middle = start[:, None] + (0.5 * (shares[:, 1:] + shares[:, :-1]))[..., None] * along[:, None]
+    # Cuts of both kinds at a corner may differ in their last bits.
+    member, piece = np.nonzero(np.diff(shares, axis=1) > 1e-12)
+    column, row = np.floor(middle[member, piece]).astype(np.int64).T
+    crossed = np.zeros((len(start), *grid.shape), dtype=bool)
+    crossed[member, row.clip(0, grid.height - 1), column.clip(0, grid.width - 1)] = True
+    return crossed
+
+
+def table(dataset: TerrainDataset) -> Table:
+    """Lays out how hard every split of a dataset is, for a terminal."""
+    title = f"what stands in the way (λ_stuck {dataset.recipe.stuck_threshold:g})"
+    laid = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
+    laid.add_column("split", no_wrap=True)
+    for head in _HEADS:
+        laid.add_column(head, justify="right", no_wrap=True)
+    for split in dataset.splits:
+        found = of_split(dataset, split)
+        shares = (f"{100 * share:.1f}" for share in (found.stuck, found.soft_ground, found.soft_spots))
+        times = found.reference_times_s
+        typical, spread = "-", "-"
+        if len(times):
+            typical, spread = f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}"
+        laid.add_row(split, *shares, typical, spread, f"{found.straight}/{found.maps}")
+    return laid
+
+
+def _together(pieces: Iterable[Difficulty]) -> Difficulty:
+    """Of maps measured in pieces, the whole."""
+    parts = list(pieces)
+    counts = np.array([part.maps for part in parts])
+
+    def mean(name: str) -> float:
+        return float(np.average([getattr(part, name) for part in parts], weights=counts))
+
+    return Difficulty(
+        maps=int(counts.sum()),
+        stuck=mean("stuck"),
+        soft_ground=mean("soft_ground"),
+        soft_spots=mean("soft_spots"),
+        straight=sum(part.straight for part in parts),
+        reference_times_s=np.concatenate([part.reference_times_s for part in parts]),
+    )
