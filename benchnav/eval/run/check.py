@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from benchnav import registry
+from benchnav.datagen.scenario import load_recipe, shipped_recipes
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.unit import Extent
@@ -98,14 +99,24 @@ def _check_split(trial: Trial, known: list[str], dataset: TerrainDataset, instan
     if trial.scenario not in known:
         raise ConfigError(
             f"Expected `scenarios` among {known} of {dataset.path}, got {trial.scenario!r}."
-            f"{registry.hint(trial.scenario, known)}"
+            f"{registry.hint(trial.scenario, known)}{_make_all(dataset, trial.split, 1)}"
         )
     there = dataset.map_count(trial.split)
     if instances > there:
         raise ConfigError(
             f"Expected `instances` at most {there}, the maps of {trial.split} in {dataset.path}, "
-            f"got {instances}. 0 takes all."
+            f"got {instances}. 0 takes all.{_make_all(dataset, trial.split, instances)}"
         )
+
+
+def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
+    """How to make the maps that a file lacks, where its shipped recipe has them."""
+    if dataset.id not in shipped_recipes():
+        return ""
+    whole = load_recipe(dataset.id).splits.get(split)
+    if whole is None or whole.maps < maps:
+        return ""
+    return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
 
 
 def _check_budgets(
