@@ -22,6 +22,7 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, predict
+from benchnav.models.probabilities import class_probabilities
 from benchnav.models.scores import (
     LEVEL,
     PIT_BINS,
@@ -201,7 +202,7 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
         maps, cells = maps + len(terrain), cells + transformed.numel()
         if isinstance(model, ClassModel):
             classes = classes or [_ClassTally(model, terrain)]
-            classes[0].add(mixture.weights, terrain)
+            classes[0].add(class_probabilities(mixture, len(model.class_names)), terrain)
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
     squared_observed, squared_expected, nll, score, covered, in_tail = (sums / cells).tolist()
@@ -310,8 +311,8 @@ class _ClassTally:
 def _choose(mixture: TraversabilityMixture, cells: Tensor) -> TraversabilityMixture:
     """The chosen ones (bool, shape [B, H, W]) of a mixture's cells, as a map of one row: [K, 1, N]."""
     parameters = (mixture.weights, mixture.means, mixture.stds)
-    chosen = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
-    return TraversabilityMixture(*chosen, mixture.group)
+    weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
+    return TraversabilityMixture(weights, means, stds, mixture.group)
 
 
 def _score_cells(

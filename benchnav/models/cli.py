@@ -150,7 +150,7 @@ def train_mdn(
     target = open_target(Path(out), fresh, [MDN], training_digest(dataset), options, overwrite)
     if target.holds(MDN, asdict(mdn), seed):
         return
-    network, metrics = fit_mdn(mdn, dataset, seed, options)
+    network, metrics = fit_mdn(mdn, dataset, seed, options, half_precision)
     _say(
         f"mdn: best epoch {metrics['epoch']:.0f}, validation NLL {metrics['valid_loss']:.4f}, "
         f"RMSE {metrics['valid_rmse']:.4f}"
@@ -225,17 +225,45 @@ def _train_members(
 ) -> None:
     for index, part in enumerate(_members(members)):
         if not target.holds(part, asdict(config), seed + index):
-            trained = _fit_classifier(config, dataset, seed + index, options, part)
-            target.add(part, replace(trained, half_precision=half_precision))
+            trained = _fit_classifier(config, dataset, seed + index, options, part, half_precision)
+            target.add(part, trained)
+    _calibrate_pool(target, dataset, seed)
+
+
+def _calibrate_pool(target: "Target", dataset: "TerrainDataset", seed: int) -> None:
+    """Fits the temperature of the pool of all classifiers that are there, as they are kept."""
+    from benchnav.models.checkpoint import as_stored, member_names
+    from benchnav.models.classifier import TerrainClassifier
+    from benchnav.models.data import VALID, read_maps
+    from benchnav.models.fitting import is_first_process
+    from benchnav.models.temperature import fit_pool_temperature
+
+    there = target.checkpoint
+    parts = [there.part(name) for name in member_names(there)]
+    if len(parts) == 1 or not is_first_process():
+        return
+    classes = len(there.class_names)
+    members = [
+        TerrainClassifier.from_tensors(part.config, classes, as_stored(part.tensors, part.half_precision))
+        for part in parts
+    ]
+    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), seed)
+    _say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
+    target.set_pool_temperature(temperature)
 
 
 def _fit_classifier(
-    config: ClassifierConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions", part: str
+    config: ClassifierConfig,
+    dataset: "TerrainDataset",
+    seed: int,
+    options: "FitOptions",
+    part: str,
+    half_precision: bool,
 ) -> "Part":
     from benchnav.models.checkpoint import Part
     from benchnav.models.training import fit_classifier, training_digest
 
-    model, metrics = fit_classifier(config, dataset, seed, options, part)
+    model, metrics = fit_classifier(config, dataset, seed, options, part, half_precision)
     _say(
         f"{part}: best epoch {metrics['epoch']:.0f}, validation accuracy {metrics['valid_accuracy']:.4f}, "
         f"mIoU {metrics['valid_miou']:.4f}, loss {metrics['valid_loss']:.4f}, "
@@ -248,6 +276,7 @@ def _fit_classifier(
         metrics=metrics,
         data_id=dataset.id,
         data_digest=training_digest(dataset),
+        half_precision=half_precision,
     )
 
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from benchnav.errors import BenchnavError, CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import GP, Checkpoint, member_names
+from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_table import SlopeTable
 from benchnav.terrain import Observation
 
@@ -22,23 +23,28 @@ CHUNK_CELLS = 2**17
 class FusedModel:
     """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class.
 
-    P(c) is the average of the members' probabilities. The paper's `single-class` option is
-    `TraversabilityMixture.most_likely` of the prediction.
+    P(c) is the average of the members' probabilities, calibrated as a whole. The paper's `single-class`
+    option is `TraversabilityMixture.most_likely` of the prediction.
 
     Args:
         classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         table: the GPs over slope.
         class_names: names of the C classes.
+        pool_temperature: of the averaged probabilities (see `models.temperature`).
     """
 
     def __init__(
-        self, classifiers: Sequence[nn.Module], table: SlopeTable, class_names: tuple[str, ...]
+        self,
+        classifiers: Sequence[nn.Module],
+        table: SlopeTable,
+        class_names: tuple[str, ...],
+        pool_temperature: float = 1.0,
     ) -> None:
         """Sets the classifiers to evaluation."""
         if len(class_names) != len(table.mean):
             raise ConfigError(f"Expected a GP for each of {len(class_names)} classes, got {len(table.mean)}.")
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
-        self.table, self.class_names = table, class_names
+        self.table, self.class_names, self.pool_temperature = table, class_names, pool_temperature
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """Predicts on the observation's device, to which the classifiers are moved.
@@ -52,12 +58,13 @@ class FusedModel:
         weights = self._probabilities(self.classifiers[0], observation)
         for classifier in self.classifiers[1:]:
             weights += self._probabilities(classifier, observation)
+        weights = sharpen(weights / len(self.classifiers), self.pool_temperature)
         means, stds = self.table.lookup(observation.slope_deg.float())
         classes = tuple(range(len(self.class_names)))
-        return TraversabilityMixture(weights / len(self.classifiers), means, stds, classes)
+        return TraversabilityMixture(weights, means, stds, classes)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
-        """Class probabilities of each member.
+        """Class probabilities of each member, before the pool's temperature.
 
         Args:
             observation: B maps of any size.
@@ -84,7 +91,7 @@ class FusedModel:
                 TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
             ]
             table = SlopeTable(**{name: tensors[name] for name in ("mean", "std", "noise_std")})
-            return cls(classifiers, table, names)
+            return cls(classifiers, table, names, checkpoint.pool_temperature)
         except (BenchnavError, KeyError, RuntimeError) as error:
             raise CheckpointError(
                 f"Expected tensors that fit the checkpoint's settings, got: {error}. Train the model again."

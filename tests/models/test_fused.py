@@ -33,6 +33,17 @@ def test_probabilities_of_members_are_averaged() -> None:
     assert isinstance(ensemble, EnsembleModel)
 
 
+def test_the_average_is_calibrated_as_a_whole_and_the_members_are_not() -> None:
+    observation, members = make_terrain(batch=3).observe(), [Linear(seed) for seed in range(2)]
+    plain = FusedModel(members, linear_table(), NAMES)
+    pool = FusedModel(members, linear_table(), NAMES, pool_temperature=0.5)
+    squares = plain.predict(observation).weights ** 2
+    torch.testing.assert_close(
+        pool.predict(observation).weights, squares / squares.sum(1, keepdim=True), rtol=1e-4, atol=1e-6
+    )
+    assert torch.equal(pool.member_probabilities(observation), plain.member_probabilities(observation))
+
+
 def test_members_are_chunked_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     observation = make_terrain(batch=5).observe()
     model = FusedModel([Linear(0), Linear(1)], linear_table(), NAMES)
