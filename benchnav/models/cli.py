@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from benchnav.datagen.store import TerrainDataset
     from benchnav.models.checkpoint import Part
     from benchnav.models.fitting import FitOptions
+    from benchnav.models.latent_gp import LatentGPs
     from benchnav.models.target import Target
 
 _HELD_OUT = 0.1  # of slip logs
@@ -68,7 +70,7 @@ def train_gp(
         out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
             their class table.
         gp: Settings of the GPs.
-        seed: Root seed of the subsample.
+        seed: Root seed of the rows of slip logs that are held out to measure on.
         trainer: Settings of Lightning's trainer, of which the accelerator alone counts.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
@@ -281,14 +283,14 @@ def _fit_classifier(
 
 
 def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions") -> "Part":
-    from benchnav.models.calibration import measure_latent
+    from benchnav.models.calibration import measure_latent, read_chunks
     from benchnav.models.checkpoint import Part
-    from benchnav.models.pixels import read_pixels
+    from benchnav.models.slope_sums import sum_split
     from benchnav.models.training import fit_gps, training_digest
 
-    table = read_pixels(dataset, "train", config.max_points, seed)
-    model = fit_gps(config, table, options)
-    measured = measure_latent(model.tabulate(), dataset.terrain("valid"))
+    model = fit_gps(config, sum_split(dataset, "train"), options)
+    _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
+    measured = measure_latent(model.tabulate(), read_chunks(dataset, "valid"))
     metrics = {f"valid_{name}": value for name, value in measured.items()}
     _say(
         f"gp: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
@@ -307,36 +309,36 @@ def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, option
 def _train_gp_on_logs(
     data: str, out: str, config: LatentGPConfig, seed: int, options: "FitOptions", overwrite: bool
 ) -> None:
+    from benchnav.models.cells import cell_nll, hold_out
     from benchnav.models.checkpoint import CONFIG, Checkpoint, Part, load_checkpoint
-    from benchnav.models.pixels import hold_out, pixel_nll
     from benchnav.models.slip_logs import read_slip_logs
+    from benchnav.models.slope_sums import SlopeSums
     from benchnav.models.target import open_target
     from benchnav.models.training import fit_gps
 
     logs = read_slip_logs(data)
     there = (Path(out) / CONFIG).is_file()
     names = load_checkpoint(out).class_names if there else logs.class_names
-    table = logs.pixels(names, config.max_points, seed)
+    cells = logs.cells(names)
+    sums = SlopeSums.of(cells, len(names))
     target = open_target(
         Path(out), Checkpoint(class_names=names), ["gp"], f"file:{logs.digest}", options, overwrite
     )
-    counts = dict(zip(names, table.count.tolist(), strict=True))
-    if few := [
-        f"{name} {count}" for name, count in counts.items() if 0 < count < min(_FEW_ROWS, config.max_points)
-    ]:
+    counts = dict(zip(names, sums.count.tolist(), strict=True))
+    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
         print(
             f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes "
             f"({', '.join(few)}); what is predicted of them is little more than the prior",
             file=sys.stderr,
         )
     metrics = {}
-    if int(table.count.max()) >= 1 / _HELD_OUT:
-        kept, held = hold_out(table, _HELD_OUT, seed)
-        metrics["held_out_nll"] = pixel_nll(held, fit_gps(config, kept, options).tabulate())
-        _say(
-            f"gp: NLL of {int(held.count.sum())} rows held out {metrics['held_out_nll']:.4f}; now with all rows"
-        )
-    model = fit_gps(config, table, options)
+    if max(counts.values()) >= 1 / _HELD_OUT:
+        kept, held = hold_out(cells, _HELD_OUT, seed)
+        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options)
+        metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
+        _say(f"gp: NLL of {len(held)} rows held out {metrics['held_out_nll']:.4f}; now with all rows")
+    model = fit_gps(config, sums, options)
+    _say_soft_modes(model, names)
     seen = ", ".join(f"{name} {count}" for name, count in counts.items())
     _say(f"gp: rows learned from: {seen}")
     part = Part(
@@ -348,6 +350,18 @@ def _train_gp_on_logs(
         data_digest=f"file:{logs.digest}",
     )
     target.add("gp", part)
+
+
+def _say_soft_modes(model: "LatentGPs", class_names: "Sequence[str]") -> None:
+    """Names the classes that were found to have a second mode."""
+    if model.soft is None:
+        return
+    numbers = (values.tolist() for values in (model.soft.weight, model.soft.mean, model.soft.std))
+    modes = zip(class_names, *numbers, strict=True)
+    listed = [
+        f"{name} {weight:.1%} of N({mean:.3f}, {std:.3f})" for name, weight, mean, std in modes if weight
+    ]
+    _say(f"gp: soft spots of {', '.join(listed)}")
 
 
 def _say(line: str) -> None:

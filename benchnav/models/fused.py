@@ -21,7 +21,7 @@ CHUNK_CELLS = 2**17
 
 
 class FusedModel:
-    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class.
+    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class, and two where it has soft spots.
 
     P(c) is the average of the members' probabilities, calibrated as a whole. The paper's `single-class`
     option is `TraversabilityMixture.most_likely` of the prediction.
@@ -53,7 +53,8 @@ class FusedModel:
             observation: B maps of any size.
 
         Returns:
-            Mixture with float32 parameters of shape [B, C, H, W].
+            Mixture with float32 parameters of shape [B, K, H, W]: the C classes in order, and behind them
+            the second modes of those that have one; `group` tells whose they are.
         """
         weights = self._probabilities(self.classifiers[0], observation)
         for classifier in self.classifiers[1:]:
@@ -61,7 +62,15 @@ class FusedModel:
         weights = sharpen(weights / len(self.classifiers), self.pool_temperature)
         means, stds = self.table.lookup(observation.slope_deg.float())
         classes = tuple(range(len(self.class_names)))
-        return TraversabilityMixture(weights, means, stds, classes)
+        if self.table.soft is None:
+            return TraversabilityMixture(weights, means, stds, classes)
+        soft = self.table.soft.to(weights.device)
+        owners = soft.weight.nonzero().flatten()
+        share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
+        second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
+        pairs = zip((weights * (1 - share), means, stds), second, strict=True)
+        weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
+        return TraversabilityMixture(weights, means, stds, (*classes, *owners.tolist()))
 
     def member_probabilities(self, observation: Observation) -> Tensor:
         """Class probabilities of each member, before the pool's temperature.
@@ -90,7 +99,7 @@ class FusedModel:
             classifiers = [
                 TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
             ]
-            table = SlopeTable(**{name: tensors[name] for name in ("mean", "std", "noise_std")})
+            table = SlopeTable.from_tensors(tensors)
             return cls(classifiers, table, names, checkpoint.pool_temperature)
         except (BenchnavError, KeyError, RuntimeError) as error:
             raise CheckpointError(

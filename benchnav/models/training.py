@@ -13,7 +13,8 @@ from benchnav.models.config import ClassifierConfig, LatentGPConfig
 from benchnav.models.data import TRAIN, VALID, MapData, MapDataset
 from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit
 from benchnav.models.latent_gp import LatentGPs, load_batches
-from benchnav.models.pixels import PixelTable
+from benchnav.models.slope_sums import SlopeSums
+from benchnav.models.soft_modes import find_soft_modes, main_bins
 from benchnav.models.temperature import fit_temperature, sample_logits
 
 CHUNK_CELLS = 2**17
@@ -94,18 +95,23 @@ def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, 
     }
 
 
-def fit_gps(config: LatentGPConfig, table: PixelTable, options: FitOptions = _DEFAULT) -> LatentGPs:
-    """Trains the class-wise GPs on a table of cells, in float64 on one device; nothing is drawn.
+def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFAULT) -> LatentGPs:
+    """Trains the class-wise GPs on sums over cells, in float64 on one device; nothing is drawn.
 
     Args:
         config: what to train.
-        table: cells by class, from maps or from a robot's logs.
+        sums: of the cells of all classes, from maps or from a robot's logs.
         options: how to train; of the trainer's settings the accelerator alone counts.
 
     Returns:
         The GPs, on the CPU.
     """
-    model = LatentGPs(config, len(table.count), table.steepest_deg)
+    censored = config.likelihood == "censored"
+    soft, bins = None, sums.bins(censored)
+    if config.second_component and censored:
+        soft, share = find_soft_modes(sums)
+        bins = main_bins(sums, soft, share) if soft else bins
+    model = LatentGPs(config, len(sums.count), sums.steepest_deg, soft)
     accelerator = {name: value for name, value in options.trainer.items() if name == "accelerator"}
     fit(
         model,
@@ -113,7 +119,7 @@ def fit_gps(config: LatentGPConfig, table: PixelTable, options: FitOptions = _DE
         FitOptions(trainer=accelerator),
         {},
         [],
-        {"train_dataloaders": load_batches(config, table)},
+        {"train_dataloaders": load_batches(config, bins)},
         max_epochs=config.epochs,
         precision="64-true",
     )

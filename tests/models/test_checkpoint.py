@@ -11,8 +11,10 @@ from benchnav.errors import CheckpointError
 from benchnav.models import checkpoint as module
 from benchnav.models.checkpoint import Part, as_stored, load_checkpoint, save_checkpoint
 from benchnav.models.classifier import TerrainClassifier
+from benchnav.models.contract import check_model
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import load_model, predict
+from benchnav.models.slope_table import SlopeTable, SoftModes
 
 from .support import make_terrain
 
@@ -102,6 +104,30 @@ def test_the_temperature_of_a_pool_is_kept_until_the_pool_is_another(folder: Pat
     ]
     assert versions == ["2.0", "2.1"]
     assert "pool_temperature" not in json.loads((folder / "config.json").read_text())
+
+
+def test_second_modes_are_kept_beside_the_tables_and_told_by_the_version(
+    folder: Path, tmp_path: Path
+) -> None:
+    there = load_checkpoint(folder)
+    table = SlopeTable.from_tensors(there.part("gp").tensors)
+    assert table.soft is None
+    soft = SoftModes(
+        weight=torch.full((10,), 0.1), mean=torch.linspace(0, 0.5, 10), std=torch.full((10,), 0.05)
+    )
+    part = replace(there.part("gp"), tensors=replace(table, soft=soft).to_tensors())
+    save_checkpoint(tmp_path / "soft", there.with_part("gp", part))
+    again = load_model(tmp_path / "soft").table.soft  # type: ignore[union-attr]
+    for name in ("weight", "mean", "std"):
+        assert torch.equal(getattr(again, name), getattr(soft, name))
+    versions = [
+        json.loads((path / "config.json").read_text())["format_version"]
+        for path in (folder, tmp_path / "soft")
+    ]
+    assert versions == ["2.0", "2.1"]
+    terrain = make_terrain(classes=10)
+    assert predict(load_model(tmp_path / "soft"), terrain).weights.shape[1] == 20
+    check_model(load_model(tmp_path / "soft"))
 
 
 @pytest.mark.parametrize("value", [0, -1.0, "hot", None])
