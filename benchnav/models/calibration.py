@@ -22,6 +22,7 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, predict
+from benchnav.models.probabilities import class_probabilities
 from benchnav.models.scores import (
     LEVEL,
     PIT_BINS,
@@ -174,12 +175,16 @@ def evaluate(
         CheckpointError: the model was trained on another class table.
     """
     for split in choose_splits(model, dataset, splits):
-        step = max(1, CHUNK_CELLS // (dataset.grid.height * dataset.grid.width))
-        count = dataset.map_count(split)
-        chunks = (
-            dataset.terrain(split, range(start, min(start + step, count))) for start in range(0, count, step)
-        )
+        chunks = read_chunks(dataset, split)
         yield split, measure(model, chunks, rng.generator(rng.stream_key(seed, "models", "pit", split)))
+
+
+def read_chunks(dataset: TerrainDataset, split: str) -> Iterator[Terrain]:
+    """Reads the maps of a split, some at a time."""
+    step = max(1, CHUNK_CELLS // (dataset.grid.height * dataset.grid.width))
+    count = dataset.map_count(split)
+    for start in range(0, count, step):
+        yield dataset.terrain(split, range(start, min(start + step, count)))
 
 
 def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generator) -> Quality:
@@ -201,7 +206,7 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
         maps, cells = maps + len(terrain), cells + transformed.numel()
         if isinstance(model, ClassModel):
             classes = classes or [_ClassTally(model, terrain)]
-            classes[0].add(mixture.weights, terrain)
+            classes[0].add(class_probabilities(mixture, len(model.class_names)), terrain)
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
     squared_observed, squared_expected, nll, score, covered, in_tail = (sums / cells).tolist()
@@ -220,26 +225,32 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
     )
 
 
-def measure_latent(table: SlopeTable, terrain: Terrain) -> dict[str, float]:
+def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, float]:
     """Measures the GPs apart from the classifier, each cell read with its true class.
 
     Args:
         table: the GPs over slope.
-        terrain: B maps.
+        chunks: the maps, at least one, a few at a time.
 
     Returns:
         `latent_rmse` to f_c(ψ), `noise_error` (largest relative error of a class's σ_c that occurs) and
         `nll` of λ as realised.
     """
-    table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
-    own = terrain.class_id.unsqueeze(1)
-    mean, std = (values.gather(1, own) for values in table.lookup(terrain.slope_deg))
-    mixture = _choose(TraversabilityMixture(torch.ones_like(mean), mean, std), known)
-    noise_error = (table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0] - 1).abs()
+    squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
+    for terrain in chunks:
+        table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
+        own = table.own(terrain.class_id, terrain.slope_deg)
+        squares += float((own.means[:, 0] - terrain.truth.means[:, 0]).double().square().sum())
+        cells += terrain.class_id.numel()
+        observed = terrain.traversability[known].unsqueeze(0)
+        surprise -= float(_choose(own, known).log_prob(observed).double().sum())
+        seen += int(known.sum())
+        ratio = table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0]
+        noise_error = max(noise_error, float((ratio - 1).abs().max()))
     return {
-        "latent_rmse": float((mean.squeeze(1) - terrain.truth.means[:, 0]).square().mean().sqrt()),
-        "noise_error": float(noise_error.max()),
-        "nll": float(-mixture.log_prob(terrain.traversability[known].unsqueeze(0)).mean()),
+        "latent_rmse": (squares / cells) ** 0.5,
+        "noise_error": noise_error,
+        "nll": surprise / max(1, seen),
     }
 
 
@@ -310,8 +321,8 @@ class _ClassTally:
 def _choose(mixture: TraversabilityMixture, cells: Tensor) -> TraversabilityMixture:
     """The chosen ones (bool, shape [B, H, W]) of a mixture's cells, as a map of one row: [K, 1, N]."""
     parameters = (mixture.weights, mixture.means, mixture.stds)
-    chosen = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
-    return TraversabilityMixture(*chosen, mixture.group)
+    weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
+    return TraversabilityMixture(weights, means, stds, mixture.group)
 
 
 def _score_cells(

@@ -26,7 +26,8 @@ import benchnav
 from benchnav.errors import CheckpointError
 
 FORMAT = "benchnav-checkpoint"
-FORMAT_VERSION = (2, 0)
+FORMAT_VERSION = (2, 1)
+OLDEST_VERSION = (2, 0)  # written as long as nothing newer is in it
 CONFIG = "config.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
@@ -72,11 +73,14 @@ class Checkpoint:
         class_names: names of the C classes, in the order of their ids.
         parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
         model: registered name of the family that rebuilds the model.
+        pool_temperature: of the averaged probabilities of several classifiers (see `models.temperature`);
+            1 changes nothing.
     """
 
     class_names: tuple[str, ...]
     parts: Mapping[str, Part] = field(default_factory=dict)
     model: str = FUSED
+    pool_temperature: float = 1.0
 
     def part(self, name: str) -> Part:
         """Gives a part.
@@ -92,8 +96,9 @@ class Checkpoint:
         return self.parts[name]
 
     def with_part(self, name: str, part: Part) -> "Checkpoint":
-        """Gives a copy in which one part is added or replaced."""
-        return replace(self, parts={**self.parts, name: part})
+        """Gives a copy in which one part is added or replaced; another classifier makes another pool."""
+        pooled = 1.0 if is_member(name) else self.pool_temperature
+        return replace(self, parts={**self.parts, name: part}, pool_temperature=pooled)
 
 
 def member_name(index: int) -> str:
@@ -101,10 +106,26 @@ def member_name(index: int) -> str:
     return f"{CLASSIFIER}-{index + 1}" if index else CLASSIFIER
 
 
+def is_member(name: str) -> bool:
+    """Tells whether a part is a classifier."""
+    return name.partition("-")[0] == CLASSIFIER
+
+
 def member_names(checkpoint: Checkpoint) -> list[str]:
     """Names of the classifiers that are there, the first one in any case."""
     names = [member_name(index) for index in range(len(checkpoint.parts))]
     return [name for name in names if name in checkpoint.parts] or [CLASSIFIER]
+
+
+def as_stored(tensors: Mapping[str, Tensor], half_precision: bool) -> dict[str, Tensor]:
+    """Gives tensors as they are read back: those kept as float16 are rounded to it.
+
+    Args:
+        tensors: by name.
+        half_precision: whether kernels are kept as float16.
+    """
+    kept = {name: _to_store(value, half_precision) for name, value in tensors.items()}
+    return {name: _as_read(value) for name, value in kept.items()}
 
 
 def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
@@ -168,7 +189,15 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         }
         if config["class_count"] != len(config["class_names"]):
             raise ValueError("class_count is not the number of class_names")
-        return Checkpoint(class_names=tuple(config["class_names"]), parts=parts, model=config["model"])
+        pooled = float(config.get("pool_temperature", 1.0))
+        if not 0 < pooled < float("inf"):
+            raise ValueError(f"pool_temperature is {pooled}")
+        return Checkpoint(
+            class_names=tuple(config["class_names"]),
+            parts=parts,
+            model=config["model"],
+            pool_temperature=pooled,
+        )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
 
@@ -194,7 +223,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav checkpoint."
         )
-    if version > FORMAT_VERSION or version[0] < FORMAT_VERSION[0]:
+    if version > FORMAT_VERSION or version < OLDEST_VERSION:
         remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
         raise CheckpointError(
             f"Expected format version {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
@@ -208,7 +237,7 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
     folder.mkdir()
     parts = {}
     for name, part in checkpoint.parts.items():
-        tensors = {key: _stored(value, part.half_precision) for key, value in part.tensors.items()}
+        tensors = {key: _to_store(value, part.half_precision) for key, value in part.tensors.items()}
         content = safetensors.torch.save(tensors)
         _write_bytes(folder / f"{name}.safetensors", content)
         parts[name] = {
@@ -220,12 +249,15 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
             "half_precision": part.half_precision,
             "sha256": hashlib.sha256(content).hexdigest(),
         }
+    pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
+    soft = GP in checkpoint.parts and any(name.startswith("soft_") for name in checkpoint.parts[GP].tensors)
     config = {
         "format": FORMAT,
-        "format_version": ".".join(map(str, FORMAT_VERSION)),
+        "format_version": ".".join(map(str, FORMAT_VERSION if pooled or soft else OLDEST_VERSION)),
         "model": checkpoint.model,
         "class_count": len(checkpoint.class_names),
         "class_names": list(checkpoint.class_names),
+        **pooled,
         "parts": parts,
     }
     _write_bytes(folder / CONFIG, (json.dumps(config, indent=1) + "\n").encode())
@@ -238,7 +270,7 @@ def _write_bytes(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _stored(value: Tensor, half: bool) -> Tensor:
+def _to_store(value: Tensor, half: bool) -> Tensor:
     # Kernels alone: running variances and biases are few, and may leave float16's range.
     value = value.detach().cpu().contiguous()
     return value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
@@ -256,7 +288,11 @@ def _read_tensors(path: Path, digest: str) -> dict[str, Tensor]:
         tensors = safetensors.torch.load(content)
     except safetensors.SafetensorError as error:
         raise _damaged(path, str(error)) from error
-    return {name: value.float() if value.dtype == torch.float16 else value for name, value in tensors.items()}
+    return {name: _as_read(value) for name, value in tensors.items()}
+
+
+def _as_read(value: Tensor) -> Tensor:
+    return value.float() if value.dtype == torch.float16 else value
 
 
 def _damaged(path: Path, why: str) -> CheckpointError:

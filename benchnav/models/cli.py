@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from benchnav.datagen.store import TerrainDataset
     from benchnav.models.checkpoint import Part
     from benchnav.models.fitting import FitOptions
+    from benchnav.models.latent_gp import LatentGPs
     from benchnav.models.target import Target
 
 _HELD_OUT = 0.1  # of slip logs
@@ -68,7 +70,7 @@ def train_gp(
         out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
             their class table.
         gp: Settings of the GPs.
-        seed: Root seed of the subsample.
+        seed: Root seed of the rows of slip logs that are held out to measure on.
         trainer: Settings of Lightning's trainer, of which the accelerator alone counts.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
@@ -150,7 +152,7 @@ def train_mdn(
     target = open_target(Path(out), fresh, [MDN], training_digest(dataset), options, overwrite)
     if target.holds(MDN, asdict(mdn), seed):
         return
-    network, metrics = fit_mdn(mdn, dataset, seed, options)
+    network, metrics = fit_mdn(mdn, dataset, seed, options, half_precision)
     _say(
         f"mdn: best epoch {metrics['epoch']:.0f}, validation NLL {metrics['valid_loss']:.4f}, "
         f"RMSE {metrics['valid_rmse']:.4f}"
@@ -225,17 +227,45 @@ def _train_members(
 ) -> None:
     for index, part in enumerate(_members(members)):
         if not target.holds(part, asdict(config), seed + index):
-            trained = _fit_classifier(config, dataset, seed + index, options, part)
-            target.add(part, replace(trained, half_precision=half_precision))
+            trained = _fit_classifier(config, dataset, seed + index, options, part, half_precision)
+            target.add(part, trained)
+    _calibrate_pool(target, dataset, seed)
+
+
+def _calibrate_pool(target: "Target", dataset: "TerrainDataset", seed: int) -> None:
+    """Fits the temperature of the pool of all classifiers that are there, as they are kept."""
+    from benchnav.models.checkpoint import as_stored, member_names
+    from benchnav.models.classifier import TerrainClassifier
+    from benchnav.models.data import VALID, read_maps
+    from benchnav.models.fitting import is_first_process
+    from benchnav.models.temperature import fit_pool_temperature
+
+    there = target.checkpoint
+    parts = [there.part(name) for name in member_names(there)]
+    if len(parts) == 1 or not is_first_process():
+        return
+    classes = len(there.class_names)
+    members = [
+        TerrainClassifier.from_tensors(part.config, classes, as_stored(part.tensors, part.half_precision))
+        for part in parts
+    ]
+    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), seed)
+    _say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
+    target.set_pool_temperature(temperature)
 
 
 def _fit_classifier(
-    config: ClassifierConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions", part: str
+    config: ClassifierConfig,
+    dataset: "TerrainDataset",
+    seed: int,
+    options: "FitOptions",
+    part: str,
+    half_precision: bool,
 ) -> "Part":
     from benchnav.models.checkpoint import Part
     from benchnav.models.training import fit_classifier, training_digest
 
-    model, metrics = fit_classifier(config, dataset, seed, options, part)
+    model, metrics = fit_classifier(config, dataset, seed, options, part, half_precision)
     _say(
         f"{part}: best epoch {metrics['epoch']:.0f}, validation accuracy {metrics['valid_accuracy']:.4f}, "
         f"mIoU {metrics['valid_miou']:.4f}, loss {metrics['valid_loss']:.4f}, "
@@ -248,18 +278,19 @@ def _fit_classifier(
         metrics=metrics,
         data_id=dataset.id,
         data_digest=training_digest(dataset),
+        half_precision=half_precision,
     )
 
 
 def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions") -> "Part":
-    from benchnav.models.calibration import measure_latent
+    from benchnav.models.calibration import measure_latent, read_chunks
     from benchnav.models.checkpoint import Part
-    from benchnav.models.pixels import read_pixels
+    from benchnav.models.slope_sums import sum_split
     from benchnav.models.training import fit_gps, training_digest
 
-    table = read_pixels(dataset, "train", config.max_points, seed)
-    model = fit_gps(config, table, options)
-    measured = measure_latent(model.tabulate(), dataset.terrain("valid"))
+    model = fit_gps(config, sum_split(dataset, "train"), options)
+    _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
+    measured = measure_latent(model.tabulate(), read_chunks(dataset, "valid"))
     metrics = {f"valid_{name}": value for name, value in measured.items()}
     _say(
         f"gp: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
@@ -278,36 +309,36 @@ def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, option
 def _train_gp_on_logs(
     data: str, out: str, config: LatentGPConfig, seed: int, options: "FitOptions", overwrite: bool
 ) -> None:
+    from benchnav.models.cells import cell_nll, hold_out
     from benchnav.models.checkpoint import CONFIG, Checkpoint, Part, load_checkpoint
-    from benchnav.models.pixels import hold_out, pixel_nll
     from benchnav.models.slip_logs import read_slip_logs
+    from benchnav.models.slope_sums import SlopeSums
     from benchnav.models.target import open_target
     from benchnav.models.training import fit_gps
 
     logs = read_slip_logs(data)
     there = (Path(out) / CONFIG).is_file()
     names = load_checkpoint(out).class_names if there else logs.class_names
-    table = logs.pixels(names, config.max_points, seed)
+    cells = logs.cells(names)
+    sums = SlopeSums.of(cells, len(names))
     target = open_target(
         Path(out), Checkpoint(class_names=names), ["gp"], f"file:{logs.digest}", options, overwrite
     )
-    counts = dict(zip(names, table.count.tolist(), strict=True))
-    if few := [
-        f"{name} {count}" for name, count in counts.items() if 0 < count < min(_FEW_ROWS, config.max_points)
-    ]:
+    counts = dict(zip(names, sums.count.tolist(), strict=True))
+    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
         print(
             f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes "
             f"({', '.join(few)}); what is predicted of them is little more than the prior",
             file=sys.stderr,
         )
     metrics = {}
-    if int(table.count.max()) >= 1 / _HELD_OUT:
-        kept, held = hold_out(table, _HELD_OUT, seed)
-        metrics["held_out_nll"] = pixel_nll(held, fit_gps(config, kept, options).tabulate())
-        _say(
-            f"gp: NLL of {int(held.count.sum())} rows held out {metrics['held_out_nll']:.4f}; now with all rows"
-        )
-    model = fit_gps(config, table, options)
+    if max(counts.values()) >= 1 / _HELD_OUT:
+        kept, held = hold_out(cells, _HELD_OUT, seed)
+        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options)
+        metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
+        _say(f"gp: NLL of {len(held)} rows held out {metrics['held_out_nll']:.4f}; now with all rows")
+    model = fit_gps(config, sums, options)
+    _say_soft_modes(model, names)
     seen = ", ".join(f"{name} {count}" for name, count in counts.items())
     _say(f"gp: rows learned from: {seen}")
     part = Part(
@@ -319,6 +350,18 @@ def _train_gp_on_logs(
         data_digest=f"file:{logs.digest}",
     )
     target.add("gp", part)
+
+
+def _say_soft_modes(model: "LatentGPs", class_names: "Sequence[str]") -> None:
+    """Names the classes that were found to have a second mode."""
+    if model.soft is None:
+        return
+    numbers = (values.tolist() for values in (model.soft.weight, model.soft.mean, model.soft.std))
+    modes = zip(class_names, *numbers, strict=True)
+    listed = [
+        f"{name} {weight:.1%} of N({mean:.3f}, {std:.3f})" for name, weight, mean, std in modes if weight
+    ]
+    _say(f"gp: soft spots of {', '.join(listed)}")
 
 
 def _say(line: str) -> None:

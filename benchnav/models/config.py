@@ -1,5 +1,6 @@
 """Settings of the two learned halves of a model; light to import, so that commands start fast."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -70,19 +71,42 @@ class ClassifierConfig:
 class LatentGPConfig:
     """What the class-wise GPs are and how they are trained.
 
+    The prior decides what is predicted of a class without data, and of slopes steeper than any seen.
+
     Args:
         likelihood: censored, which fits observations clipped to [0, 1], or gaussian.
+        second_component: give a class a second mode of λ that slope does not explain, where the data show
+            one; with the censored likelihood alone.
         inducing_points: how many, evenly over the slopes of the training data.
         epochs: equal parts of training, after each of which progress is shown.
         epoch_steps: steps an epoch, each over all cells.
-        max_points: most cells of a class to learn from.
+        prior_level: λ on flat ground before any data.
+        prior_fall: by which it falls with each degree of slope.
+        prior_fall_std: standard deviation of that fall.
+        prior_std: standard deviation of the function about this line, to begin with.
+        prior_std_range: within which the data may change it.
+        length_deg: length scale of the function, to begin with.
+        length_range_deg: within which the data may change it.
+        noise_std: standard deviation of λ about the function before any data.
+        noise_spread: standard deviation of its logarithm.
+        noise_std_range: within which the data may change it.
     """
 
     likelihood: Literal["censored", "gaussian"] = "censored"
+    second_component: bool = True
     inducing_points: int = 16
     epochs: int = 4
     epoch_steps: int = 10
-    max_points: int = 10_000
+    prior_level: float = 0.5
+    prior_fall: float = 0.03
+    prior_fall_std: float = 0.015
+    prior_std: float = 0.5
+    prior_std_range: tuple[float, float] = (0.3, 1.0)
+    length_deg: float = 8.0
+    length_range_deg: tuple[float, float] = (2.0, 10.0)
+    noise_std: float = 0.2
+    noise_spread: float = 0.5
+    noise_std_range: tuple[float, float] = (0.01, 1.0)
 
     def __post_init__(self) -> None:
         """Refuses settings that cannot train."""
@@ -92,8 +116,24 @@ class LatentGPConfig:
             inducing_points=(self.inducing_points, 2),
             epochs=(self.epochs, 1),
             epoch_steps=(self.epoch_steps, 1),
-            max_points=(self.max_points, 1),
         )
+        for name in ("prior_level", "prior_fall"):
+            if not math.isfinite(getattr(self, name)):
+                raise ConfigError(f"Expected a finite `{name}`, got {getattr(self, name)}.")
+        for name in ("prior_fall_std", "noise_spread"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"Expected `{name}` > 0, got {getattr(self, name)}.")
+        for name, limits in (
+            ("prior_std", "prior_std_range"),
+            ("length_deg", "length_range_deg"),
+            ("noise_std", "noise_std_range"),
+        ):
+            low, high = getattr(self, limits)
+            if not 0 < low < getattr(self, name) < high < math.inf:
+                raise ConfigError(
+                    f"Expected `{name}` between the bounds of `{limits}`, both > 0, "
+                    f"got {getattr(self, name)} for {low} to {high}."
+                )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,6 +23,7 @@ from benchnav.datagen.store import mixture_of
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import AnyModel, predict
+from benchnav.models.probabilities import class_probabilities
 from benchnav.terrain import Terrain
 
 SHAPES = ((32, 32), (20, 37))
@@ -44,8 +45,9 @@ def check_model(
     observation's device, of one floating-point dtype; finite parameters, weights ≥ 0 that sum to 1,
     standard deviations ≥ 0; the observation left as it was, and with it the global generators of
     Python, NumPy and PyTorch; the same answer when asked again, and for a map alone what it is in a
-    batch; `class_names`, where given, one a component; `member_probabilities`, where given, of shape
-    [M, B, C, H, W], with the weights for their average.
+    batch; `class_names`, where given, one a class, which is a component, or what `group` sums up;
+    `member_probabilities`, where given, of shape [M, B, C, H, W], and the class probabilities, in each
+    cell, in the order of their average, which may have been calibrated as a whole.
 
     Args:
         model: any model; the oracle is given the Terrain.
@@ -90,15 +92,15 @@ def _breaches(model: AnyModel, terrain: Terrain, tolerance: float) -> Iterator[s
     whole, again, alone = answers
     if not _alike(whole, again, 0):
         yield "Expected the same answer for the same maps, got another when asked again."
-    if not _alike(TraversabilityMixture(*(values[-1:] for values in _values(whole))), alone, tolerance):
+    weights, means, stds = (values[-1:] for values in _values(whole))
+    if not _alike(TraversabilityMixture(weights, means, stds, whole.group), alone, tolerance):
         yield "Expected of a map alone what was predicted of it in a batch, got something else."
     yield from _unsound_classes(model, terrain, whole, tolerance)
 
 
 def _try(act: Callable[[Terrain], Any], terrain: Terrain) -> tuple[Any, list[str]]:
     """Lets a model act; gives what it answers, None for none, and what it did that it should not."""
-    names = [field.name for field in fields(terrain) if field.name != "grid"]
-    before, states = {name: getattr(terrain, name).clone() for name in names}, _generators()
+    before, states = {name: layer.clone() for name, layer in _layers(terrain).items()}, _generators()
     answer, breaches = None, []
     try:
         answer = act(terrain)
@@ -106,7 +108,7 @@ def _try(act: Callable[[Terrain], Any], terrain: Terrain) -> tuple[Any, list[str
         breaches.append(str(error))
     except Exception as error:
         breaches.append(f"Expected an answer, got {type(error).__name__}: {error}")
-    changed = [name for name in names if not torch.equal(before[name], getattr(terrain, name))]
+    changed = [name for name, layer in _layers(terrain).items() if not torch.equal(before[name], layer)]
     if changed:
         breaches.append(f"Expected the observation to stay as it was, got another {' and '.join(changed)}.")
     breaches += [
@@ -115,6 +117,13 @@ def _try(act: Callable[[Terrain], Any], terrain: Terrain) -> tuple[Any, list[str
         if states.get(whose, state) != state
     ]
     return answer, breaches
+
+
+def _layers(terrain: Terrain) -> dict[str, Tensor]:
+    """Every tensor of the maps by name, those of the truth among them."""
+    layers = {field.name: getattr(terrain, field.name) for field in fields(terrain)}
+    truth = dict(zip(("weights", "means", "stds"), _values(terrain.truth), strict=True))
+    return {name: layer for name, layer in (layers | truth).items() if isinstance(layer, Tensor)}
 
 
 def _unsound(mixture: TraversabilityMixture, tolerance: float) -> Iterator[str]:
@@ -140,8 +149,12 @@ def _unsound_classes(
 ) -> Iterator[str]:
     """Tells where what a model says of classes does not fit its mixture."""
     names, components = getattr(model, "class_names", None), mixture.weights.shape[-3]
-    if names is not None and len(names) != components:
+    if names is not None and mixture.group is None and len(names) != components:
         yield f"Expected a name in `class_names` for each of {components} components, got {len(names)}."
+        return
+    if names is not None and mixture.group is not None and max(mixture.group) >= len(names):
+        yield f"Expected classes in `group` under {len(names)}, the number of `class_names`, got {max(mixture.group)}."
+        return
     if not hasattr(model, "member_probabilities"):
         return
     if names is None:
@@ -150,12 +163,13 @@ def _unsound_classes(
     yield from effects
     if effects and members is None:
         return
-    shape = mixture.weights.shape
+    weights = mixture.weights if names is None else class_probabilities(mixture, len(names))
+    shape = weights.shape
     if not isinstance(members, Tensor) or members.shape[1:] != shape or len(members) == 0:
         got = list(members.shape) if isinstance(members, Tensor) else type(members).__name__
         yield f"Expected `member_probabilities` of shape [M, {', '.join(map(str, shape))}], got {got}."
-    elif not _close(members.mean(0), mixture.weights, tolerance):
-        yield "Expected the average of `member_probabilities` to be the weights, got something else."
+    elif not _in_order(members.mean(0), weights, tolerance):
+        yield "Expected class probabilities in the order of the average of `member_probabilities`, got another."
 
 
 def _make_terrain(recipe: str, height: int, width: int, device: torch.device) -> Terrain:
@@ -173,16 +187,16 @@ def _make_terrain(recipe: str, height: int, width: int, device: torch.device) ->
     )
     maps = generate(made, "contract", np.arange(_MAPS))
     true = truth(maps["class_id"], maps["slope_deg"].astype(np.float64), made.classes)
-    layers = {
-        "rgb": maps["rgb"],
-        "class_id": maps["class_id"].astype(np.int64),
-        "elevation_m": maps["elevation_m"],
-        "slope_deg": maps["slope_deg"],
-        "traversability": maps["traversability"],
-    }
-    tensors = {name: torch.from_numpy(layer) for name, layer in layers.items()}
-    mixture = mixture_of(true, per_class=true[0].shape[1])
-    return Terrain(**tensors, truth=mixture, grid=made.grid).to(device)
+    made_terrain = Terrain(
+        rgb=torch.from_numpy(maps["rgb"]),
+        class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
+        elevation_m=torch.from_numpy(maps["elevation_m"]),
+        slope_deg=torch.from_numpy(maps["slope_deg"]),
+        truth=mixture_of(true, per_class=true[0].shape[1]),
+        traversability=torch.from_numpy(maps["traversability"]),
+        grid=made.grid,
+    )
+    return made_terrain.to(device)
 
 
 def _generators() -> dict[str, bytes]:
@@ -203,6 +217,12 @@ def _values(mixture: TraversabilityMixture) -> tuple[Tensor, Tensor, Tensor]:
 
 def _alike(first: TraversabilityMixture, second: TraversabilityMixture, tolerance: float) -> bool:
     return all(_close(*pair, tolerance) for pair in zip(_values(first), _values(second), strict=True))
+
+
+def _in_order(average: Tensor, weights: Tensor, tolerance: float) -> bool:
+    """Whether a class that weighs more on average does not weigh less in the end, in any cell."""
+    order = average.argsort(1, descending=True)
+    return bool((weights.gather(1, order).diff(dim=1) <= tolerance).all())
 
 
 def _close(values: Tensor, expected: Tensor, tolerance: float) -> bool:

@@ -181,7 +181,7 @@ class MapData(lightning.LightningDataModule):
         if batch_size < 2:
             raise ConfigError(f"Expected `batch_size` ≥ 2, got {batch_size}.")
         self.batch_size, self.seed, self.jitter = batch_size, seed, jitter
-        self.train, self.valid = (_read_maps(dataset, split, fields) for split in (TRAIN, VALID))
+        self.train, self.valid = (read_maps(dataset, split, fields) for split in (TRAIN, VALID))
         if len(self.train) < 2:
             raise DatasetError(f"Expected at least 2 training maps in {dataset.path}, got {len(self.train)}.")
 
@@ -212,6 +212,7 @@ class MapData(lightning.LightningDataModule):
         return DataLoader(maps, batch_size=None, sampler=sampler, generator=torch.Generator())
 
 
-def _read_maps(dataset: TerrainDataset, split: str, fields: tuple[str, ...]) -> MapDataset:
+def read_maps(dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",)) -> MapDataset:
+    """Reads the colours and other fields of a split into memory."""
     read = dataset.read(split, fields=("rgb", *fields))
     return MapDataset({name: torch.from_numpy(values) for name, values in read.items()})

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from benchnav.errors import BenchnavError, CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import GP, Checkpoint, member_names
+from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_table import SlopeTable
 from benchnav.terrain import Observation
 
@@ -20,25 +21,30 @@ CHUNK_CELLS = 2**17
 
 
 class FusedModel:
-    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class.
+    """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class, and two where it has soft spots.
 
-    P(c) is the average of the members' probabilities. The paper's `single-class` option is
-    `TraversabilityMixture.most_likely` of the prediction.
+    P(c) is the average of the members' probabilities, calibrated as a whole. The paper's `single-class`
+    option is `TraversabilityMixture.most_likely` of the prediction.
 
     Args:
         classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         table: the GPs over slope.
         class_names: names of the C classes.
+        pool_temperature: of the averaged probabilities (see `models.temperature`).
     """
 
     def __init__(
-        self, classifiers: Sequence[nn.Module], table: SlopeTable, class_names: tuple[str, ...]
+        self,
+        classifiers: Sequence[nn.Module],
+        table: SlopeTable,
+        class_names: tuple[str, ...],
+        pool_temperature: float = 1.0,
     ) -> None:
         """Sets the classifiers to evaluation."""
         if len(class_names) != len(table.mean):
             raise ConfigError(f"Expected a GP for each of {len(class_names)} classes, got {len(table.mean)}.")
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
-        self.table, self.class_names = table, class_names
+        self.table, self.class_names, self.pool_temperature = table, class_names, pool_temperature
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """Predicts on the observation's device, to which the classifiers are moved.
@@ -47,17 +53,27 @@ class FusedModel:
             observation: B maps of any size.
 
         Returns:
-            Mixture with float32 parameters of shape [B, C, H, W].
+            Mixture with float32 parameters of shape [B, K, H, W]: the C classes in order, and behind them
+            the second modes of those that have one; `group` tells whose they are.
         """
         weights = self._probabilities(self.classifiers[0], observation)
         for classifier in self.classifiers[1:]:
             weights += self._probabilities(classifier, observation)
+        weights = sharpen(weights / len(self.classifiers), self.pool_temperature)
         means, stds = self.table.lookup(observation.slope_deg.float())
         classes = tuple(range(len(self.class_names)))
-        return TraversabilityMixture(weights / len(self.classifiers), means, stds, classes)
+        if self.table.soft is None:
+            return TraversabilityMixture(weights, means, stds, classes)
+        soft = self.table.soft.to(weights.device)
+        owners = soft.weight.nonzero().flatten()
+        share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
+        second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
+        pairs = zip((weights * (1 - share), means, stds), second, strict=True)
+        weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
+        return TraversabilityMixture(weights, means, stds, (*classes, *owners.tolist()))
 
     def member_probabilities(self, observation: Observation) -> Tensor:
-        """Class probabilities of each member.
+        """Class probabilities of each member, before the pool's temperature.
 
         Args:
             observation: B maps of any size.
@@ -83,8 +99,8 @@ class FusedModel:
             classifiers = [
                 TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
             ]
-            table = SlopeTable(**{name: tensors[name] for name in ("mean", "std", "noise_std")})
-            return cls(classifiers, table, names)
+            table = SlopeTable.from_tensors(tensors)
+            return cls(classifiers, table, names, checkpoint.pool_temperature)
         except (BenchnavError, KeyError, RuntimeError) as error:
             raise CheckpointError(
                 f"Expected tensors that fit the checkpoint's settings, got: {error}. Train the model again."

@@ -1,11 +1,11 @@
 """Class-wise Gaussian processes: each class's latent traversability as a function of slope.
 
-The prior of each class's function is 0.5 on flat ground, falling by 0.03 ± 0.015 a degree, plus a
-Matérn 5/2 process. It says that a robot hardly gains traversability on steeper ground and is likely
-to be stuck at thirty-odd degrees, and no more: where a class has no data — it never occurs, or the
-slope is steeper than any seen — the GP falls back to this trend with a spread that grows with slope.
-The Matérn process keeps a spread of at least 0.3 and a length scale of at most 10°, so that the data
-say nothing sure about slopes ten degrees beyond them.
+The prior of each class's function is a line over slope, 0.5 on flat ground and falling by 0.03 ± 0.015
+a degree unless `LatentGPConfig` says otherwise, plus a Matérn 5/2 process. It says that a robot hardly
+gains traversability on steeper ground and is likely to be stuck at thirty-odd degrees, and no more:
+where a class has no data — it never occurs, or the slope is steeper than any seen — the GP falls back to
+this trend with a spread that grows with slope. The Matérn process keeps a spread of at least 0.3 and a
+length scale of at most 10°, so that the data say nothing sure about slopes ten degrees beyond them.
 
 A batch of C independent sparse variational GPs, fitted to all cells at once in bins of slope. The
 posterior of the inducing values takes natural gradients, for which a Gaussian likelihood needs one
@@ -29,18 +29,12 @@ from torch.utils.data import DataLoader
 
 from benchnav.errors import ConfigError
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.likelihood import expected_log_prob, sum_bins
-from benchnav.models.pixels import PixelTable
-from benchnav.models.slope_table import STEP_DEG, SlopeTable, table_slopes
+from benchnav.models.likelihood import expected_log_prob
+from benchnav.models.slope_table import STEP_DEG, SlopeTable, SoftModes, table_slopes
 
 _SLOPE_UNIT_DEG = 10.0
-_PRIOR_MEAN = 0.5  # on flat ground: the middle of traversability's range
-_FALL, _FALL_STD = 0.3, 0.15  # a unit of slope
-_PRIOR_STD, _PRIOR_STD_RANGE = 0.5, (0.3, 1.0)
-_LENGTHSCALE_DEG, _LENGTHSCALE_RANGE_DEG = 8.0, (2.0, 10.0)
-_NOISE_STD, _NOISE_STD_RANGE = 0.2, (0.01, 1.0)
-_NOISE_SPREAD = 0.5  # of the logarithm of the noise before any data
 _LEAST_SPAN_DEG = 5.0
+_GONE = {"max_points"}  # settings of earlier versions that change nothing any more
 _NATURAL_RATE, _RPROP_STEP, _RPROP_RANGE = 0.9, 0.1, (1e-6, 0.5)
 
 
@@ -49,9 +43,10 @@ class SlopeGP(gpytorch.models.ApproximateGP):
 
     Args:
         inducing: slopes of the inducing points, shape [C, M].
+        config: what says their prior.
     """
 
-    def __init__(self, inducing: Tensor) -> None:
+    def __init__(self, inducing: Tensor, config: LatentGPConfig) -> None:
         """Builds them; `start` puts them at their prior."""
         batch = inducing.shape[:1]
         posterior = NaturalVariationalDistribution(inducing.shape[1], batch)
@@ -60,23 +55,24 @@ class SlopeGP(gpytorch.models.ApproximateGP):
         # GPyTorch's own start would draw on the global generator.
         strategy.variational_params_initialized.fill_(1)
         super().__init__(strategy)
-        shortest, longest = (bound / _SLOPE_UNIT_DEG for bound in _LENGTHSCALE_RANGE_DEG)
+        shortest, longest = (bound / _SLOPE_UNIT_DEG for bound in config.length_range_deg)
         self.matern = gpytorch.kernels.ScaleKernel(
             gpytorch.kernels.MaternKernel(
                 nu=2.5, batch_shape=batch, lengthscale_constraint=Interval(shortest, longest)
             ),
             batch_shape=batch,
-            outputscale_constraint=Interval(*(std**2 for std in _PRIOR_STD_RANGE)),
+            outputscale_constraint=Interval(*(std**2 for std in config.prior_std_range)),
         )
-        self.matern.base_kernel.lengthscale = _LENGTHSCALE_DEG / _SLOPE_UNIT_DEG
-        self.matern.outputscale = _PRIOR_STD**2
+        self.matern.base_kernel.lengthscale = config.length_deg / _SLOPE_UNIT_DEG
+        self.matern.outputscale = config.prior_std**2
         self.trend = gpytorch.kernels.LinearKernel(batch_shape=batch)
-        self.trend.variance = _FALL_STD**2
+        self.level, self.fall = config.prior_level, config.prior_fall * _SLOPE_UNIT_DEG
+        self.trend.variance = (config.prior_fall_std * _SLOPE_UNIT_DEG) ** 2
         self.trend.requires_grad_(False)
 
     def forward(self, x: Tensor) -> MultivariateNormal:
         """The prior at slopes `x`, shape [C, N, 1]."""
-        return MultivariateNormal(_PRIOR_MEAN - _FALL * x[..., 0], self.matern(x) + self.trend(x))
+        return MultivariateNormal(self.level - self.fall * x[..., 0], self.matern(x) + self.trend(x))
 
     @torch.no_grad()
     def start(self) -> None:
@@ -103,22 +99,29 @@ class LatentGPs(lightning.LightningModule):
         class_count: C.
         steepest_deg: steepest slope of each class's training data, shape [C]; inducing points lie up to
             there.
+        soft: second modes of the classes beside the GPs; None where no class has one.
     """
 
-    def __init__(self, config: LatentGPConfig, class_count: int, steepest_deg: Tensor) -> None:
+    def __init__(
+        self,
+        config: LatentGPConfig,
+        class_count: int,
+        steepest_deg: Tensor,
+        soft: SoftModes | None = None,
+    ) -> None:
         """Builds the GPs at their prior, in float64."""
         super().__init__()
         self.automatic_optimization = False
-        self.config, self.class_count = config, class_count
+        self.config, self.class_count, self.soft = config, class_count, soft
         self.steepest_deg = [round(slope, 4) for slope in steepest_deg.tolist()]
         reach = torch.tensor(self.steepest_deg, dtype=torch.float64)
         places = torch.linspace(0, 1, config.inducing_points, dtype=torch.float64)
-        self.gp = SlopeGP(reach.clamp(min=_LEAST_SPAN_DEG).unsqueeze(-1) * places / _SLOPE_UNIT_DEG)
+        self.gp = SlopeGP(reach.clamp(min=_LEAST_SPAN_DEG).unsqueeze(-1) * places / _SLOPE_UNIT_DEG, config)
         self.likelihood = gpytorch.likelihoods.GaussianLikelihood(
             batch_shape=torch.Size([class_count]),
-            noise_constraint=Interval(*(std**2 for std in _NOISE_STD_RANGE)),
+            noise_constraint=Interval(*(std**2 for std in config.noise_std_range)),
         )
-        self.likelihood.noise = _NOISE_STD**2
+        self.likelihood.noise = config.noise_std**2
         self.double()
         self.gp.start()
 
@@ -135,7 +138,7 @@ class LatentGPs(lightning.LightningModule):
     def training_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
         """Takes one step up the evidence lower bound of each class, over all its cells.
 
-        A class without any is left at its prior. A batch is what `sum_bins` gives.
+        A class without any is left at its prior. A batch is what `SlopeSums.bins` gives.
         """
         bound = self.bound(batch)
         optimizers = self.optimizers()
@@ -153,11 +156,12 @@ class LatentGPs(lightning.LightningModule):
         """The evidence lower bound of each class's cells and its noise, shape [C]; 0 without cells.
 
         Args:
-            bins: from `sum_bins`.
+            bins: from `SlopeSums.bins`.
         """
         latent, noise = self(bins["slope_deg"]), self.likelihood.noise
         fit = expected_log_prob(bins, latent.mean, latent.variance, noise).sum(-1)
-        surprise = (0.5 * noise.squeeze(-1).log() - math.log(_NOISE_STD)) / _NOISE_SPREAD
+        usual, spread = math.log(self.config.noise_std), self.config.noise_spread
+        surprise = (0.5 * noise.squeeze(-1).log() - usual) / spread
         divergence = self.gp.variational_strategy.kl_divergence()
         return torch.where(bins["count"] > 0, fit - divergence - 0.5 * surprise**2, 0.0)
 
@@ -170,7 +174,10 @@ class LatentGPs(lightning.LightningModule):
             noise = self.likelihood.noise
             std = (latent.variance.clamp(min=0) + noise).sqrt()
         return SlopeTable(
-            mean=latent.mean.float(), std=std.float(), noise_std=noise.sqrt().squeeze(-1).float()
+            mean=latent.mean.float(),
+            std=std.float(),
+            noise_std=noise.sqrt().squeeze(-1).float(),
+            soft=self.soft,
         )
 
     @torch.no_grad()
@@ -202,16 +209,15 @@ class LatentGPs(lightning.LightningModule):
         amplitude = self.gp.matern.outputscale.sqrt()
         reach = self.gp.matern.base_kernel.lengthscale.flatten() * _SLOPE_UNIT_DEG
         bend = 5 * amplitude / reach**2
-        slope = 5 / 3 * (amplitude / reach) ** 2 + (_FALL_STD / _SLOPE_UNIT_DEG) ** 2
+        slope = 5 / 3 * (amplitude / reach) ** 2 + self.config.prior_fall_std**2
         noise = self.likelihood.noise.sqrt().flatten()
         share = STEP_DEG**2 / 8
         return share * norm * bend, share * (stretch * slope / noise + stretch.sqrt() * bend)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the table and all parameters by name, for a checkpoint."""
-        table = self.tabulate()
         state = {f"state.{name}": value for name, value in self.state_dict().items()}
-        return {"mean": table.mean, "std": table.std, "noise_std": table.noise_std, **state}
+        return {**self.tabulate().to_tensors(), **state}
 
     @classmethod
     def from_tensors(
@@ -229,8 +235,13 @@ class LatentGPs(lightning.LightningModule):
             RuntimeError: the tensors do not fit them.
         """
         try:
-            settings = {name: value for name, value in config.items() if name != "steepest_deg"}
-            model = cls(LatentGPConfig(**settings), class_count, torch.tensor(config["steepest_deg"]))
+            settings: dict[str, Any] = {
+                name: tuple(value) if isinstance(value, list) else value
+                for name, value in config.items()
+                if name not in {"steepest_deg", *_GONE}
+            }
+            soft = SlopeTable.from_tensors(tensors).soft
+            model = cls(LatentGPConfig(**settings), class_count, torch.tensor(config["steepest_deg"]), soft)
         except (KeyError, TypeError) as error:
             raise ConfigError(f"Expected the settings of the GPs, got {sorted(config)}.") from error
         prefix = "state."
@@ -238,13 +249,12 @@ class LatentGPs(lightning.LightningModule):
         return model.eval()
 
 
-def load_batches(config: LatentGPConfig, table: PixelTable) -> DataLoader[dict[str, Tensor]]:
+def load_batches(config: LatentGPConfig, bins: dict[str, Tensor]) -> DataLoader[dict[str, Tensor]]:
     """Makes the loader of training batches, each of them all cells.
 
     Args:
         config: what is trained.
-        table: cells by class.
+        bins: from `SlopeSums.bins`.
     """
-    bins = sum_bins(table, config.likelihood == "censored")
     # A generator of its own keeps the loader from drawing on PyTorch's global one.
     return DataLoader([bins] * config.epoch_steps, batch_size=None, generator=torch.Generator())  # type: ignore[arg-type]

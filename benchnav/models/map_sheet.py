@@ -21,6 +21,7 @@ from benchnav.datagen.preview import class_colours
 from benchnav.datagen.store import TerrainDataset
 from benchnav.models.figures import TEXT
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
+from benchnav.models.probabilities import class_probabilities
 from benchnav.models.uncertainty import mutual_information, predictive_entropy
 
 TITLES = {
@@ -85,7 +86,8 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
         true = Oracle().predict_terrain(terrain).mean()
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if isinstance(model, ClassModel):
-            layers |= {"class_true": terrain.class_id, "class_found": mixture.weights.argmax(1)}
+            classes = class_probabilities(mixture, len(model.class_names))
+            layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
         layers |= {
             "expected_true": true,
             "expected": mixture.mean(),
@@ -93,7 +95,7 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
             "width": mixture.var(0.05) - mixture.var(0.95),
         }
         if isinstance(model, ClassModel):
-            layers["entropy"] = predictive_entropy(mixture.weights)
+            layers["entropy"] = predictive_entropy(classes)
         if isinstance(model, EnsembleModel):
             members = model.member_probabilities(terrain.observe())
             layers |= {"information": mutual_information(members)} if len(members) > 1 else {}

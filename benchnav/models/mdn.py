@@ -21,10 +21,10 @@ from torchmetrics import MeanSquaredError
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import BenchnavError, CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.checkpoint import Checkpoint
+from benchnav.models.checkpoint import Checkpoint, as_stored
 from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.config import ClassifierConfig, MDNConfig
-from benchnav.models.data import MapData
+from benchnav.models.data import MapData, MapDataset
 from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit, one_cycle
 from benchnav.models.training import training_digest
 from benchnav.terrain import Observation
@@ -250,7 +250,11 @@ class MixtureDensityModel:
 
 
 def fit_mdn(
-    config: MDNConfig, dataset: TerrainDataset, seed: int = 0, options: FitOptions = _DEFAULT
+    config: MDNConfig,
+    dataset: TerrainDataset,
+    seed: int = 0,
+    options: FitOptions = _DEFAULT,
+    half_precision: bool = False,
 ) -> tuple[MixtureDensityNetwork, dict[str, float]]:
     """Trains a network on the split `train` until the split `valid` no longer gains.
 
@@ -259,6 +263,8 @@ def fit_mdn(
         dataset: the maps.
         seed: root seed of weights, order and augmentation.
         options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
+        half_precision: whether its kernels will be kept as float16, to which they are rounded before it is
+            measured.
 
     Returns:
         The network with its best weights, on the CPU, and what was measured on `valid`.
@@ -278,7 +284,34 @@ def fit_mdn(
         max_epochs=config.max_epochs,
         precision=default_precision(),
     )
-    return network.cpu().eval(), metrics
+    network.cpu().eval()
+    if half_precision:
+        network.load_state_dict(as_stored(network.state_dict(), half_precision))
+        metrics = {**metrics, **measure_network(network, data.valid)}
+    return network, metrics
+
+
+def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[str, float]:
+    """Measures a network as training does: `valid_loss` and `valid_rmse`.
+
+    Args:
+        network: in evaluation, on the CPU.
+        maps: with `rgb`, `slope_deg` and `traversability`.
+    """
+    fields, step = maps.fields, max(1, _CHUNK_CELLS // maps.fields["slope_deg"][0].numel())
+    loss, squares, cells = 0.0, 0.0, 0
+    with torch.inference_mode():
+        for start in range(0, len(maps), step):
+            batch = {name: values[start : start + step] for name, values in fields.items()}
+            log_weights, means, stds = network(batch["rgb"], batch["slope_deg"])
+            observed = batch["traversability"]
+            seen = observed.isfinite()
+            count = int(seen.sum())
+            loss += float(censored_nll(log_weights, means, stds, observed)) * count
+            gap = TraversabilityMixture(log_weights.exp(), means, stds).mean()[seen] - observed[seen]
+            squares += float(gap.double().square().sum())
+            cells += count
+    return {"valid_loss": loss / max(1, cells), "valid_rmse": (squares / max(1, cells)) ** 0.5}
 
 
 def _seen(batch: dict[str, Tensor]) -> int:

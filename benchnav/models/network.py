@@ -68,7 +68,7 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
                 **size,
             )
             if config.encoder_depth < DEEPEST:
-                _drop_unused_stages(network)
+                _drop_unused_stages(network, network.encoder)
         except (ValueError, TypeError) as error:
             raise ConfigError(
                 f"Expected settings that {config.architecture} of {config.encoder} takes, got `encoder_depth` "
@@ -111,8 +111,8 @@ def _size(config: ClassifierConfig) -> dict[str, Any]:
     return size
 
 
-def _drop_unused_stages(network: nn.Module) -> None:
-    """Takes out what a lesser depth leaves idle in the encoder: it would be stored all the same.
+def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:
+    """Takes out what a lesser depth leaves idle in a network's encoder: it would be stored all the same.
 
     Idle is what has weights of which none is given a gradient.
 
@@ -123,7 +123,7 @@ def _drop_unused_stages(network: nn.Module) -> None:
     if answer.shape[-1] != _TRIAL_SIDE:
         raise ValueError(f"it answers {_TRIAL_SIDE} cells with {answer.shape[-1]}.")
     answer.sum().backward()
-    for part in list(network.encoder.modules()):
+    for part in list(encoder.modules()):
         for name, inner in list(part.named_children()):
             weights = list(inner.parameters())
             if weights and all(weight.grad is None for weight in weights):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import DatasetError
-from benchnav.models.pixels import PixelTable
+from benchnav.models.cells import Cells, observed_cells
 
 COLUMNS = ("class", "slope_deg", "traversability")
 
@@ -46,17 +46,14 @@ class SlipLogs:
     traversability: Tensor
     digest: str
 
-    def pixels(self, class_names: tuple[str, ...], max_points: int = 10_000, seed: int = 0) -> PixelTable:
-        """Groups the rows by the classes of a class table.
+    def cells(self, class_names: tuple[str, ...]) -> Cells:
+        """Gives the rows with the ids of a class table.
 
         Args:
             class_names: the class table; integer ids of the log are indices into it.
-            max_points: most rows to keep of a class.
-            seed: root seed of the draw.
 
         Raises:
             DatasetError: the log has a class that the table lacks.
-            ConfigError: `max_points` is not positive.
         """
         if self.by_id:
             if len(self.class_names) > len(class_names):
@@ -68,7 +65,7 @@ class SlipLogs:
         else:
             places = [_find_class(name, class_names) for name in self.class_names]
             ids = torch.tensor(places)[self.class_id]
-        return PixelTable.group(ids, self.slope_deg, self.traversability, len(class_names), max_points, seed)
+        return observed_cells(ids, self.slope_deg, self.traversability, len(class_names))
 
 
 def read_slip_logs(path: str | Path) -> SlipLogs:

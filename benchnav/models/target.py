@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from benchnav.errors import CheckpointError
-from benchnav.models.checkpoint import CLASSIFIER, CONFIG, Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import (
+    CLASSIFIER,
+    CONFIG,
+    Checkpoint,
+    Part,
+    is_member,
+    load_checkpoint,
+    save_checkpoint,
+)
 from benchnav.models.fitting import FitOptions, forget, interrupted, is_first_process
 
 
@@ -53,10 +61,18 @@ class Target:
     def add(self, name: str, part: Part) -> None:
         """Saves a trained part with the rest."""
         self.checkpoint = self.checkpoint.with_part(name, part)
-        if not is_first_process():
-            return
+        if is_first_process():
+            self._save()
+            self._forget(name)
+
+    def set_pool_temperature(self, temperature: float) -> None:
+        """Saves the temperature of the pool of classifiers with the rest."""
+        self.checkpoint = replace(self.checkpoint, pool_temperature=temperature)
+        if is_first_process():
+            self._save()
+
+    def _save(self) -> None:
         save_checkpoint(self.folder, self.checkpoint)
-        self._forget(name)
         size = sum(path.stat().st_size for path in self.folder.iterdir())
         parts = " and ".join(sorted(self.checkpoint.parts))
         print(f"wrote {self.folder} with {parts} ({size / 1e6:.1f} MB)")
@@ -94,11 +110,11 @@ def open_target(
     if overwrite:
         # Members of an ensemble stand or fall together.
         dropped = {
-            name for name in checkpoint.parts if name in parts or (_is_member(name) and CLASSIFIER in parts)
+            name for name in checkpoint.parts if name in parts or (is_member(name) and CLASSIFIER in parts)
         }
-        checkpoint = replace(
-            checkpoint, parts={name: part for name, part in checkpoint.parts.items() if name not in dropped}
-        )
+        kept = {name: part for name, part in checkpoint.parts.items() if name not in dropped}
+        pooled = 1.0 if any(map(is_member, dropped)) else checkpoint.pool_temperature
+        checkpoint = replace(checkpoint, parts=kept, pool_temperature=pooled)
     elif trained and not options.resume and is_first_process():
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
@@ -139,7 +155,3 @@ def _what_is_there(folder: Path, fresh: Checkpoint, overwrite: bool) -> Checkpoi
 
 def _describe(checkpoint: Checkpoint) -> str:
     return f"a {checkpoint.model} model of the classes {', '.join(checkpoint.class_names)}"
-
-
-def _is_member(name: str) -> bool:
-    return name.partition("-")[0] == CLASSIFIER

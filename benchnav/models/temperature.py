@@ -1,9 +1,13 @@
 """Temperature scaling: one number by which logits are divided, so that confidence fits accuracy.
 
 It is fitted to the validation maps by maximum likelihood and leaves every most likely class as it is.
-Source: Guo et al. (2017), "On calibration of modern neural networks". Letters in shapes: B maps, H×W
-cells, C classes, N cells.
+The average of several calibrated classifiers is not sure enough of itself, the less so the more they
+differ. So it is given a temperature of its own: first pool, then calibrate. Sources: Guo et al. (2017),
+"On calibration of modern neural networks"; Rahaman and Thiery (2021), "Uncertainty quantification and
+deep ensembles". Letters in shapes: B maps, H×W cells, C classes, N cells.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -33,6 +37,21 @@ def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
 
     reach = float(np.log(_LARGEST))
     return float(np.exp(minimize_scalar(loss, bounds=(-reach, reach), method="bounded").x))
+
+
+def fit_pool_temperature(members: Sequence[nn.Module], maps: MapDataset, seed: int = 0) -> float:
+    """Finds the temperature of the average of several classifiers' probabilities, for `probabilities.sharpen`.
+
+    Args:
+        members: each calibrated by itself, from uint8 images [B, 3, H, W] to logits [B, C, H, W].
+        maps: with `rgb` and `class_id`.
+        seed: root seed of the cells to fit to.
+    """
+    average, class_id = torch.zeros(()), torch.zeros(0, dtype=torch.int64)
+    for member in members:
+        logits, class_id = sample_logits(member, maps, seed)
+        average = average + logits.double().softmax(1) / len(members)
+    return fit_temperature(average.log(), class_id)
 
 
 def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -2,17 +2,22 @@
 
 from dataclasses import asdict
 
+import torch
 from lightning.pytorch.callbacks import EarlyStopping
+from torchmetrics.functional.classification import multiclass_jaccard_index
 
 from benchnav.datagen.store import TerrainDataset
-from benchnav.models.checkpoint import CLASSIFIER, GP
+from benchnav.models.checkpoint import CLASSIFIER, GP, as_stored
 from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.config import ClassifierConfig, LatentGPConfig
-from benchnav.models.data import TRAIN, VALID, MapData
+from benchnav.models.data import TRAIN, VALID, MapData, MapDataset
 from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit
 from benchnav.models.latent_gp import LatentGPs, load_batches
-from benchnav.models.pixels import PixelTable
+from benchnav.models.slope_sums import SlopeSums
+from benchnav.models.soft_modes import find_soft_modes, main_bins
 from benchnav.models.temperature import fit_temperature, sample_logits
+
+CHUNK_CELLS = 2**17
 
 _DEFAULT = FitOptions()
 
@@ -28,6 +33,7 @@ def fit_classifier(
     seed: int = 0,
     options: FitOptions = _DEFAULT,
     part: str = CLASSIFIER,
+    half_precision: bool = False,
 ) -> tuple[TerrainClassifier, dict[str, float]]:
     """Trains a classifier on the split `train` until the split `valid` no longer gains.
 
@@ -37,10 +43,12 @@ def fit_classifier(
         seed: root seed of weights, order and augmentation.
         options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
         part: name that it will bear.
+        half_precision: whether its kernels will be kept as float16, to which they are rounded before its
+            temperature is fitted and it is measured.
 
     Returns:
         The classifier with its best weights and its temperature, on the CPU, and what was measured on
-        `valid`.
+        `valid`, the loss before the temperature.
     """
     data = MapData(dataset, config.batch_size, seed, config.jitter)
     model = TerrainClassifier(config, len(dataset.recipe.classes), *data.colour_statistics(), seed)
@@ -57,22 +65,53 @@ def fit_classifier(
         precision=default_precision(),
     )
     model.cpu().eval()
+    if half_precision:
+        model.load_state_dict(as_stored(model.state_dict(), half_precision))
+        metrics = {**metrics, **measure_classifier(model, data.valid)}
     model.temperature = fit_temperature(*sample_logits(model, data.valid, seed))
     return model, metrics
 
 
-def fit_gps(config: LatentGPConfig, table: PixelTable, options: FitOptions = _DEFAULT) -> LatentGPs:
-    """Trains the class-wise GPs on a table of cells, in float64 on one device; nothing is drawn.
+def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, float]:
+    """Measures a classifier as training does: `valid_loss`, `valid_accuracy` and `valid_miou`.
+
+    Args:
+        model: in evaluation, on the CPU.
+        maps: with `rgb` and `class_id`.
+    """
+    rgb, class_id = maps.fields["rgb"], maps.fields["class_id"].long()
+    step, loss, found = max(1, CHUNK_CELLS // class_id[0].numel()), 0.0, []
+    with torch.inference_mode():
+        for start in range(0, len(maps), step):
+            some = slice(start, start + step)
+            logits = model(rgb[some])
+            loss += float(model.loss(logits, class_id[some])) * len(logits)
+            found.append(logits.argmax(1))
+    chosen = torch.cat(found)
+    return {
+        "valid_loss": loss / len(maps),
+        "valid_accuracy": float((chosen == class_id).double().mean()),
+        "valid_miou": float(multiclass_jaccard_index(chosen, class_id, model.class_count)),
+    }
+
+
+def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFAULT) -> LatentGPs:
+    """Trains the class-wise GPs on sums over cells, in float64 on one device; nothing is drawn.
 
     Args:
         config: what to train.
-        table: cells by class, from maps or from a robot's logs.
+        sums: of the cells of all classes, from maps or from a robot's logs.
         options: how to train; of the trainer's settings the accelerator alone counts.
 
     Returns:
         The GPs, on the CPU.
     """
-    model = LatentGPs(config, len(table.count), table.steepest_deg)
+    censored = config.likelihood == "censored"
+    soft, bins = None, sums.bins(censored)
+    if config.second_component and censored:
+        soft, share = find_soft_modes(sums)
+        bins = main_bins(sums, soft, share) if soft else bins
+    model = LatentGPs(config, len(sums.count), sums.steepest_deg, soft)
     accelerator = {name: value for name, value in options.trainer.items() if name == "accelerator"}
     fit(
         model,
@@ -80,7 +119,7 @@ def fit_gps(config: LatentGPConfig, table: PixelTable, options: FitOptions = _DE
         FitOptions(trainer=accelerator),
         {},
         [],
-        {"train_dataloaders": load_batches(config, table)},
+        {"train_dataloaders": load_batches(config, bins)},
         max_epochs=config.epochs,
         precision="64-true",
     )

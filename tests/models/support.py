@@ -9,7 +9,8 @@ from benchnav.datagen.create import create
 from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.pixels import PixelTable
+from benchnav.models.cells import Cells
+from benchnav.models.slope_sums import SlopeSums
 from benchnav.models.slope_table import SlopeTable, table_slopes
 from benchnav.terrain import Grid, Terrain
 
@@ -67,13 +68,18 @@ def latent(slope_deg: torch.Tensor) -> torch.Tensor:
     )
 
 
-def make_table(points: int, seed: int = 0, steepest_deg: float = 25) -> PixelTable:
-    """Draws observations of the three classes at random slopes."""
+def make_cells(points: int, seed: int = 0, steepest_deg: float = 25) -> Cells:
+    """Draws observations of the three classes, so many of each, at random slopes."""
     generator = torch.Generator().manual_seed(seed)
     slope = steepest_deg * torch.rand(points, generator=generator)
     noise = NOISE[:, None] * torch.randn(3, points, generator=generator)
-    return PixelTable(
-        slope_deg=slope.expand(3, -1).contiguous(),
-        traversability=(latent(slope) + noise).clamp(0, 1),
-        count=torch.full((3,), points),
+    return Cells(
+        class_id=torch.arange(3).repeat_interleave(points),
+        slope_deg=slope.repeat(3),
+        traversability=(latent(slope) + noise).clamp(0, 1).flatten(),
     )
+
+
+def make_sums(points: int, seed: int = 0, steepest_deg: float = 25) -> SlopeSums:
+    """Sums of `make_cells`."""
+    return SlopeSums.of(make_cells(points, seed, steepest_deg), 3)

@@ -12,6 +12,7 @@ from benchnav.models.calibration import choose_splits, evaluate, measure, measur
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.scores import crps
+from benchnav.models.slope_table import SoftModes
 from benchnav.models.uncertainty import mutual_information, predictive_entropy
 from benchnav.terrain import Grid, Observation
 from tests.factories import normal
@@ -153,11 +154,44 @@ def test_latent_metrics_read_each_cell_with_its_own_class() -> None:
     own = terrain.class_id[:, None]
     mean, std = mean.gather(1, own)[:, 0], std.gather(1, own)[:, 0]
     perfect = replace(terrain, truth=normal(mean, std))
-    exact = measure_latent(table, perfect)
+    exact = measure_latent(table, [perfect])
     assert exact["latent_rmse"] == pytest.approx(0, abs=1e-6)
     assert exact["noise_error"] == pytest.approx(0, abs=1e-6)
     shifted = replace(terrain, truth=normal(mean + 0.1, std))
-    assert measure_latent(table, shifted)["latent_rmse"] == pytest.approx(0.1, rel=1e-4)
+    assert measure_latent(table, [shifted])["latent_rmse"] == pytest.approx(0.1, rel=1e-4)
+    # In pieces as in one.
+    pieces = [shifted.select(torch.tensor(which)) for which in ([0], [1, 2, 3])]
+    assert measure_latent(table, pieces) == pytest.approx(measure_latent(table, [shifted]))
+    louder = replace(terrain, truth=normal(mean, std / 1.25))
+    pieces = [perfect.select(torch.tensor([0])), louder.select(torch.tensor([1]))]
+    assert measure_latent(table, pieces)["noise_error"] == pytest.approx(0.25, rel=1e-5)
+
+
+def test_a_second_mode_counts_in_the_nll_of_the_processes_and_not_in_their_error() -> None:
+    terrain, table = make_terrain(batch=2), linear_table()
+    soft = SoftModes(weight=torch.full((3,), 0.4), mean=torch.full((3,), 0.1), std=torch.full((3,), 0.3))
+    plain, both = (measure_latent(one, [terrain]) for one in (table, replace(table, soft=soft)))
+    assert both["latent_rmse"] == plain["latent_rmse"]
+    own = replace(table, soft=soft).own(terrain.class_id, terrain.slope_deg)
+    wanted = -float(own.log_prob(terrain.traversability).mean())
+    assert both["nll"] == pytest.approx(wanted, rel=1e-5)
+    assert both["nll"] != pytest.approx(plain["nll"], rel=1e-2)
+
+
+def test_the_classes_are_measured_whole_where_they_have_two_modes() -> None:
+    terrain = make_terrain(batch=2)
+    soft = SoftModes(
+        weight=torch.tensor([0.6, 0.0, 0.0]), mean=torch.full((3,), 0.1), std=torch.full((3,), 0.3)
+    )
+    names = ("a", "b", "c")
+    plain, both = (
+        measure(FusedModel([torch.nn.Identity()], table, names), [terrain], generator(1))
+        for table in (linear_table(), replace(linear_table(), soft=soft))
+    )
+    assert both.classes[0].confusion == plain.classes[0].confusion
+    assert both.classes[0].brier == pytest.approx(plain.classes[0].brier)
+    assert both.classes[0].entropy == pytest.approx(plain.classes[0].entropy)
+    assert both.traversability.nll != plain.traversability.nll
 
 
 def test_splits_are_measured_one_at_a_time(dataset: TerrainDataset) -> None:
@@ -205,7 +239,7 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
     for name in ("rmse_observed", "rmse_expected", "nll", "crps"):
         assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-6), name
     assert sum(found.pit) == 2 * 16 * 11
-    latent = [measure_latent(linear_table(), one)["nll"] for one in (holed, rest)]
+    latent = [measure_latent(linear_table(), [one])["nll"] for one in (holed, rest)]
     assert latent[0] == pytest.approx(latent[1], rel=1e-6)
     with pytest.raises(DatasetError, match="observed"):
         measure(

@@ -9,10 +9,12 @@ import torch
 
 from benchnav.errors import CheckpointError
 from benchnav.models import checkpoint as module
-from benchnav.models.checkpoint import Part, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import Part, as_stored, load_checkpoint, save_checkpoint
 from benchnav.models.classifier import TerrainClassifier
+from benchnav.models.contract import check_model
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import load_model, predict
+from benchnav.models.slope_table import SlopeTable, SoftModes
 
 from .support import make_terrain
 
@@ -70,6 +72,71 @@ def test_half_precision_is_small_and_close(folder: Path, tmp_path: Path) -> None
     assert all(p.dtype == torch.float32 for p in classifier.parameters())
 
 
+def test_weights_are_measured_as_they_are_read_back(folder: Path, tmp_path: Path) -> None:
+    part = load_checkpoint(folder).part("classifier")
+    sharp = {
+        name: value + 1e-5 if value.is_floating_point() else value for name, value in part.tensors.items()
+    }
+    for half in (True, False):
+        kept = replace(part, tensors=sharp, half_precision=half)
+        save_checkpoint(tmp_path / str(half), load_checkpoint(folder).with_part("classifier", kept))
+        read = load_checkpoint(tmp_path / str(half)).part("classifier").tensors
+        stored = as_stored(sharp, half)
+        assert read.keys() == stored.keys()
+        assert all(torch.equal(read[name], value) for name, value in stored.items())
+    assert all(torch.equal(value, sharp[name]) for name, value in as_stored(sharp, False).items())
+
+
+def test_the_temperature_of_a_pool_is_kept_until_the_pool_is_another(folder: Path, tmp_path: Path) -> None:
+    there = load_checkpoint(folder)
+    assert there.pool_temperature == 1
+    pooled = replace(there.with_part("classifier-2", there.part("classifier")), pool_temperature=0.25)
+    save_checkpoint(tmp_path / "pool", pooled)
+    again = load_checkpoint(tmp_path / "pool")
+    assert again.pool_temperature == 0.25
+    assert load_model(tmp_path / "pool").pool_temperature == 0.25  # type: ignore[union-attr]
+    assert again.with_part("gp", there.part("gp")).pool_temperature == 0.25
+    assert again.with_part("classifier-3", there.part("classifier")).pool_temperature == 1
+    # A reader that knows nothing of it is told by the version; every other checkpoint is as before.
+    versions = [
+        json.loads((path / "config.json").read_text())["format_version"]
+        for path in (folder, tmp_path / "pool")
+    ]
+    assert versions == ["2.0", "2.1"]
+    assert "pool_temperature" not in json.loads((folder / "config.json").read_text())
+
+
+def test_second_modes_are_kept_beside_the_tables_and_told_by_the_version(
+    folder: Path, tmp_path: Path
+) -> None:
+    there = load_checkpoint(folder)
+    table = SlopeTable.from_tensors(there.part("gp").tensors)
+    assert table.soft is None
+    soft = SoftModes(
+        weight=torch.full((10,), 0.1), mean=torch.linspace(0, 0.5, 10), std=torch.full((10,), 0.05)
+    )
+    part = replace(there.part("gp"), tensors=replace(table, soft=soft).to_tensors())
+    save_checkpoint(tmp_path / "soft", there.with_part("gp", part))
+    again = load_model(tmp_path / "soft").table.soft  # type: ignore[union-attr]
+    for name in ("weight", "mean", "std"):
+        assert torch.equal(getattr(again, name), getattr(soft, name))
+    versions = [
+        json.loads((path / "config.json").read_text())["format_version"]
+        for path in (folder, tmp_path / "soft")
+    ]
+    assert versions == ["2.0", "2.1"]
+    terrain = make_terrain(classes=10)
+    assert predict(load_model(tmp_path / "soft"), terrain).weights.shape[1] == 20
+    check_model(load_model(tmp_path / "soft"))
+
+
+@pytest.mark.parametrize("value", [0, -1.0, "hot", None])
+def test_a_temperature_that_is_none_is_refused(folder: Path, value: object) -> None:
+    edit(folder, pool_temperature=value)
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_checkpoint(folder)
+
+
 def test_a_folder_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"Expected a checkpoint folder with config\.json"):
         load_checkpoint(tmp_path)
@@ -102,11 +169,11 @@ def test_a_damaged_config_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("version", "remedy"), [("2.1", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
+    ("version", "remedy"), [("2.2", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
 )
 def test_another_format_is_refused(folder: Path, version: str, remedy: str) -> None:
     edit(folder, format_version=version)
-    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.0 .* got {version}.*{remedy}"):
+    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.1 .* got {version}.*{remedy}"):
         load_checkpoint(folder)
 
 

@@ -57,6 +57,23 @@ def with_members(members: Callable[[Tensor], object]) -> Good:
     return Bad()
 
 
+def with_soft_spots(owner: int) -> Good:
+    """The second class is split into a firm and a soft component, of which the latter is told to be another's."""
+
+    class Split(Good):
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            whole = super().predict(observation)
+            first, second = whole.weights.unbind(1)
+            weights = torch.stack([first, 0.1 * second, 0.9 * second], 1)
+            means, stds = whole.means[:, [0, 1, 1]], whole.stds[:, [0, 1, 1]]
+            return TraversabilityMixture(weights, means, stds, (0, 1, owner))
+
+        def member_probabilities(self, observation: Observation) -> Tensor:
+            return Good.predict(self, observation).weights[None]
+
+    return Split()
+
+
 def meddling(act: Callable[[Observation], object]) -> Good:
     def change(mixture: TraversabilityMixture, observation: Observation) -> TraversabilityMixture:
         act(observation)
@@ -169,8 +186,13 @@ BAD = {
     "members that are none": (with_members(lambda weights: None), "got NoneType"),
     "members of another average": (
         with_members(lambda weights: weights.flip(1)[None]),
-        "average of `member_probabilities`",
+        "order of the average of `member_probabilities`",
     ),
+    "components of a class without a name": (
+        changed(lambda mixture, _: replace(mixture, group=(0, 2))),
+        "classes in `group` under 2, the number of `class_names`, got 2",
+    ),
+    "members whose soft spots are summed up wrongly": (with_soft_spots(0), "order of the average"),
     "members that raise": (with_members(lambda weights: weights[9]), "IndexError"),
     "members that draw": (
         with_members(lambda weights: weights[None] + 0 * torch.rand(1)),
@@ -203,6 +225,18 @@ def test_every_breach_is_named_once_with_the_maps_it_was_found_on() -> None:
     assert message.count("[maps of 9×9, 12×7]") == 2
     assert "(1) " in message
     assert "(2) " in message
+
+
+def test_components_of_one_class_are_summed_up() -> None:
+    check_model(with_soft_spots(1))
+
+
+def test_a_pool_may_be_calibrated_as_a_whole() -> None:
+    class Sharper(Good):
+        def member_probabilities(self, observation: Observation) -> Tensor:
+            return self.predict(observation).weights.sqrt().div(2)[None]
+
+    check_model(Sharper())
 
 
 def test_a_model_that_takes_one_size_alone_names_it() -> None:

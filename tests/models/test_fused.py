@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor, nn
@@ -6,6 +8,8 @@ from benchnav.errors import ConfigError
 from benchnav.models import fused
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import EnsembleModel
+from benchnav.models.probabilities import class_probabilities
+from benchnav.models.slope_table import SoftModes
 
 from .support import NAMES, linear_table, make_terrain
 
@@ -21,6 +25,13 @@ class Linear(nn.Module):
         return torch.einsum("dc,bchw->bdhw", self.weight, rgb.float())
 
 
+class Certain(nn.Module):
+    """A classifier that is sure of the first class."""
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        return torch.tensor([0.0, -1e4, -torch.inf]).view(1, 3, 1, 1).expand(len(rgb), -1, *rgb.shape[-2:])
+
+
 def test_probabilities_of_members_are_averaged() -> None:
     observation = make_terrain(batch=3).observe()
     members = [Linear(seed) for seed in range(3)]
@@ -33,6 +44,52 @@ def test_probabilities_of_members_are_averaged() -> None:
     assert isinstance(ensemble, EnsembleModel)
 
 
+def test_the_average_is_calibrated_as_a_whole_and_the_members_are_not() -> None:
+    observation, members = make_terrain(batch=3).observe(), [Linear(seed) for seed in range(2)]
+    plain = FusedModel(members, linear_table(), NAMES)
+    pool = FusedModel(members, linear_table(), NAMES, pool_temperature=0.5)
+    squares = plain.predict(observation).weights ** 2
+    torch.testing.assert_close(
+        pool.predict(observation).weights, squares / squares.sum(1, keepdim=True), rtol=1e-4, atol=1e-6
+    )
+    assert torch.equal(pool.member_probabilities(observation), plain.member_probabilities(observation))
+
+
+SOFT = SoftModes(
+    weight=torch.tensor([0.2, 0.0, 0.05]),
+    mean=torch.tensor([0.1, 0.5, 0.3]),
+    std=torch.tensor([0.05, 1.0, 0.1]),
+)
+
+
+def test_a_class_with_soft_spots_has_a_component_more() -> None:
+    observation = make_terrain(batch=3).observe()
+    plain = FusedModel([Linear(0)], linear_table(), NAMES).predict(observation)
+    mixture = FusedModel([Linear(0)], replace(linear_table(), soft=SOFT), NAMES).predict(observation)
+    assert plain.group == (0, 1, 2)
+    assert mixture.group == (0, 1, 2, 0, 2)
+    torch.testing.assert_close(class_probabilities(mixture, 3), plain.weights)
+    torch.testing.assert_close(mixture.weights[:, 0], 0.8 * plain.weights[:, 0])
+    assert torch.equal(mixture.weights[:, 1], plain.weights[:, 1])
+    torch.testing.assert_close(mixture.weights[:, 3], 0.2 * plain.weights[:, 0])
+    torch.testing.assert_close(mixture.weights[:, 4], 0.05 * plain.weights[:, 2])
+    assert torch.equal(mixture.means[:, :3], plain.means)
+    assert torch.equal(mixture.stds[:, :3], plain.stds)
+    assert [float(mixture.means[0, k, 0, 0]) for k in (3, 4)] == pytest.approx([0.1, 0.3])
+    assert [float(mixture.stds[0, k, 0, 0]) for k in (3, 4)] == pytest.approx([0.05, 0.1])
+    assert mixture.means.is_contiguous()
+
+
+def test_the_class_that_is_read_alone_brings_its_soft_spots_along() -> None:
+    observation = make_terrain().observe()
+    first = FusedModel([Certain()], replace(linear_table(), soft=SOFT), NAMES).predict(observation)
+    own = replace(linear_table(), soft=SOFT).own(
+        torch.zeros(2, 16, 16, dtype=torch.int64), observation.slope_deg
+    )
+    torch.testing.assert_close(first.most_likely().cvar(0.9), own.cvar(0.9))
+    torch.testing.assert_close(first.mean(), own.mean())
+
+
 def test_members_are_chunked_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     observation = make_terrain(batch=5).observe()
     model = FusedModel([Linear(0), Linear(1)], linear_table(), NAMES)
@@ -42,12 +99,6 @@ def test_members_are_chunked_alike(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_zero_probabilities_leave_finite_distributions() -> None:
-    class Certain(nn.Module):
-        def forward(self, rgb: Tensor) -> Tensor:
-            return (
-                torch.tensor([0.0, -1e4, -torch.inf]).view(1, 3, 1, 1).expand(len(rgb), -1, *rgb.shape[-2:])
-            )
-
     terrain = make_terrain()
     mixture = FusedModel([Certain()], linear_table(), NAMES).predict(terrain.observe())
     assert torch.equal(mixture.weights[:, 1:], torch.zeros(2, 2, 16, 16))

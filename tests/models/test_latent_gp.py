@@ -1,3 +1,5 @@
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import gpytorch
@@ -11,14 +13,15 @@ from scipy.stats import norm
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
+from benchnav.models.cells import Cells, cell_nll
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.latent_gp import LatentGPs
-from benchnav.models.likelihood import expected_log_prob, sum_bins
-from benchnav.models.pixels import PixelTable, pixel_nll
+from benchnav.models.likelihood import expected_log_prob
+from benchnav.models.slope_sums import SlopeSums
 from benchnav.models.slope_table import SlopeTable, table_slopes
 from benchnav.models.training import fit_gps
 
-from .support import NOISE, latent, linear_table, make_table
+from .support import NOISE, latent, linear_table, make_cells, make_sums
 
 STEEPEST = 25.0
 SHIPPED = Path(__file__).parents[2] / "datasets" / "paper-v1-test.h5"
@@ -26,7 +29,7 @@ SHIPPED = Path(__file__).parents[2] / "datasets" / "paper-v1-test.h5"
 
 @pytest.fixture(scope="module")
 def model() -> LatentGPs:
-    return fit_gps(LatentGPConfig(), make_table(10_000))
+    return fit_gps(LatentGPConfig(), make_sums(10_000))
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +37,19 @@ def censored(model: LatentGPs) -> SlopeTable:
     return model.tabulate()
 
 
-def one_class(slope_deg: torch.Tensor, traversability: torch.Tensor) -> PixelTable:
-    return PixelTable(
-        slope_deg=slope_deg[None].float(),
-        traversability=traversability[None].float(),
-        count=torch.tensor([len(slope_deg)]),
+def one_class(slope_deg: torch.Tensor, traversability: torch.Tensor) -> SlopeSums:
+    return of_classes([slope_deg], [traversability])
+
+
+def of_classes(slopes: Sequence[torch.Tensor], values: Sequence[torch.Tensor]) -> SlopeSums:
+    """Sums of the cells of each class."""
+    counts = torch.tensor([len(slope) for slope in slopes])
+    cells = Cells(
+        class_id=torch.arange(len(slopes)).repeat_interleave(counts),
+        slope_deg=torch.cat(list(slopes)).float(),
+        traversability=torch.cat(list(values)).float(),
     )
+    return SlopeSums.of(cells, len(slopes))
 
 
 def latent_std(table: SlopeTable) -> torch.Tensor:
@@ -55,12 +65,10 @@ def expected(mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
 def test_expected_log_prob_agrees_with_monte_carlo() -> None:
     noise = torch.tensor([[0.01], [0.0225], [0.04]]).double()
     observed = torch.tensor([0.0, 0.4, 1.0]).double().expand(3, -1)
-    table = PixelTable(
-        slope_deg=torch.arange(3.0).expand(3, -1), traversability=observed, count=torch.full((3,), 3)
-    )
+    sums = of_classes([torch.arange(3.0)] * 3, observed.unbind())
     mean = torch.tensor([[0.1, 0.5, 0.8], [0.5, 0.5, 0.5], [-0.2, 1.1, 1.3]]).double()
     std = torch.tensor([[0.05, 0.1, 0.2], [0.3, 0.02, 0.1], [0.1, 0.2, 0.3]]).double()
-    bins = sum_bins(table, censored=True)
+    bins = sums.bins(censored=True)
     here = [0, 4, 8]  # the bins of 0°, 1° and 2°
     full_mean, full_std = torch.zeros(3, 9).double(), torch.ones(3, 9).double()
     full_mean[:, here], full_std[:, here] = mean, std
@@ -77,10 +85,10 @@ def test_expected_log_prob_agrees_with_monte_carlo() -> None:
 
 
 def test_bins_hold_the_sums_of_the_cells_that_are_there() -> None:
-    slope = torch.tensor([[0.1, 0.2, 0.3, 0.3, 0.3], [0.6, 0.0, 0.0, 0.0, 0.0]])
-    value = torch.tensor([[0.5, 0.0, 1.0, 0.25, 0.5], [1.0, 0.0, 0.0, 0.0, 0.0]])
-    table = PixelTable(slope_deg=slope, traversability=value, count=torch.tensor([5, 1]))
-    bins = sum_bins(table, censored=True)
+    slopes = [torch.tensor([0.1, 0.2, 0.3, 0.3, 0.3]), torch.tensor([0.6])]
+    values = [torch.tensor([0.5, 0.0, 1.0, 0.25, 0.5]), torch.tensor([1.0])]
+    sums = of_classes(slopes, values)
+    bins = sums.bins(censored=True)
     wanted = {
         "slope_deg": [[0.15, 0.3, 0.625], [0.125, 0.375, 0.6]],
         "zeros": [[1, 0, 0], [0, 0, 0]],
@@ -91,7 +99,7 @@ def test_bins_hold_the_sums_of_the_cells_that_are_there() -> None:
     }
     for name, values in wanted.items():
         np.testing.assert_allclose(bins[name], values, rtol=1e-6, err_msg=name)
-    plain = sum_bins(table, censored=False)
+    plain = sums.bins(censored=False)
     assert plain["inside"].tolist() == [[2, 3, 0], [0, 0, 1]]
     assert not bool((plain["zeros"] + plain["ones"]).any())
     np.testing.assert_allclose(plain["squares"], [[0.25, 1.3125, 0], [0, 0, 1]])
@@ -108,9 +116,9 @@ def test_latent_mean_and_noise_are_found(censored: SlopeTable) -> None:
 
 
 def test_the_bound_has_settled_at_the_end_of_training(model: LatentGPs) -> None:
-    table = make_table(10_000)
-    longer = fit_gps(LatentGPConfig(epochs=10), table)
-    bins = sum_bins(table, censored=True)
+    sums = make_sums(10_000)
+    longer = fit_gps(LatentGPConfig(epochs=10), sums)
+    bins = sums.bins(censored=True)
     with torch.no_grad():
         gain = longer.train().bound(bins) - model.train().bound(bins)
     model.eval()
@@ -119,12 +127,13 @@ def test_the_bound_has_settled_at_the_end_of_training(model: LatentGPs) -> None:
 
 
 def test_the_censored_likelihood_beats_the_plain_one_where_data_are_clipped(censored: SlopeTable) -> None:
-    plain = fit_gps(LatentGPConfig(likelihood="gaussian"), make_table(10_000)).tabulate()
-    fresh = make_table(20_000, 99)
+    plain = fit_gps(LatentGPConfig(likelihood="gaussian"), make_sums(10_000)).tabulate()
+    fresh = make_cells(20_000, 99)
 
     def nll(table: SlopeTable, c: int) -> float:
         own = SlopeTable(mean=table.mean[[c]], std=table.std[[c]], noise_std=table.noise_std[[c]])
-        return pixel_nll(one_class(fresh.slope_deg[c], fresh.traversability[c]), own)
+        here = fresh.select(fresh.class_id == c)
+        return cell_nll(replace(here, class_id=0 * here.class_id), own)
 
     gain = [nll(plain, c) - nll(censored, c) for c in range(3)]
     assert min(gain) > 0
@@ -230,7 +239,7 @@ def test_at_one_slope_the_censored_gp_is_tobins_maximum_likelihood(mean: float, 
 
 def test_beyond_its_slopes_the_gp_grows_unsure_and_not_hopeful() -> None:
     edge = 12.0
-    table = fit_gps(LatentGPConfig(), make_table(10_000, steepest_deg=edge)).tabulate()
+    table = fit_gps(LatentGPConfig(), make_sums(10_000, steepest_deg=edge)).tabulate()
     grid = table_slopes()
     spread, beyond = latent_std(table), grid >= edge
     assert bool((spread[:, grid < edge - 0.5] < 0.02).all())
@@ -250,30 +259,95 @@ def test_beyond_its_slopes_the_gp_grows_unsure_and_not_hopeful() -> None:
 
 
 def test_each_class_is_unsure_beyond_its_own_slopes() -> None:
-    full = make_table(6000)
-    count = full.count.clone()
-    slope, value = full.slope_deg.clone(), full.traversability.clone()
-    flat = slope[1] < 10
-    count[1] = int(flat.sum())
-    slope[1, : count[1]], value[1, : count[1]] = slope[1][flat], value[1][flat]
-    table = fit_gps(
-        LatentGPConfig(), PixelTable(slope_deg=slope, traversability=value, count=count)
-    ).tabulate()
+    full = make_cells(6000)
+    cut = full.select((full.class_id != 1) | (full.slope_deg < 10))
+    table = fit_gps(LatentGPConfig(), SlopeSums.of(cut, 3)).tabulate()
     at_20 = latent_std(table)[:, 200]
     assert float(at_20[1]) > 0.15
     assert float(at_20[[0, 2]].max()) < 0.03
 
 
 def test_a_class_never_seen_keeps_its_prior() -> None:
-    seen = make_table(500)
-    count = torch.tensor([500, 0, 500])
-    table = PixelTable(slope_deg=seen.slope_deg, traversability=seen.traversability, count=count)
-    result = fit_gps(LatentGPConfig(), table).tabulate()
+    seen = make_cells(500)
+    result = fit_gps(LatentGPConfig(), SlopeSums.of(seen.select(seen.class_id != 1), 3)).tabulate()
     grid = table_slopes()
     torch.testing.assert_close(result.mean[1].double(), 0.5 - 0.03 * grid, rtol=0, atol=1e-5)
     prior = (0.5**2 + (0.015 * grid) ** 2).sqrt()
     torch.testing.assert_close(latent_std(result)[1].double(), prior, rtol=1e-4, atol=0)
     assert bool((result.std[0, :200] < 0.3).all())
+
+
+@pytest.mark.parametrize(
+    ("change", "mean", "spread"),
+    [
+        ({}, (0.5, -0.4), (0.5, 0.6727)),
+        ({"prior_level": 0.8}, (0.8, -0.1), (0.5, 0.6727)),
+        ({"prior_fall": 0.01}, (0.5, 0.2), (0.5, 0.6727)),
+        ({"prior_fall_std": 0.04}, (0.5, -0.4), (0.5, 1.3)),
+        ({"prior_std": 0.4}, (0.5, -0.4), (0.4, 0.6021)),
+    ],
+)
+def test_the_prior_is_as_the_settings_say(
+    change: dict[str, float], mean: tuple[float, float], spread: tuple[float, float]
+) -> None:
+    empty = SlopeSums.of(make_cells(0), 3)
+    table = fit_gps(LatentGPConfig(epochs=1, epoch_steps=1, **change), empty).tabulate()  # type: ignore[arg-type]
+    at = [0, 300]  # 0° and 30°
+    assert table.mean[0, at].tolist() == pytest.approx(mean, abs=1e-4)
+    assert latent_std(table)[0, at].tolist() == pytest.approx(spread, abs=2e-3)
+    assert table.noise_std.tolist() == pytest.approx([0.2] * 3)
+
+
+def test_the_prior_of_the_noise_is_as_the_settings_say() -> None:
+    one = one_class(torch.tensor([10.0]), torch.tensor([0.7]))
+    found = {
+        name: float(fit_gps(LatentGPConfig(**change), one).tabulate().noise_std)  # type: ignore[arg-type]
+        for name, change in {
+            "default": {},
+            "louder": {"noise_std": 0.4},
+            "surer": {"noise_spread": 0.01},
+            "bounded": {"noise_std": 0.245, "noise_std_range": (0.24, 0.25)},
+        }.items()
+    }
+    assert found["louder"] > 1.5 * found["default"]
+    assert found["surer"] == pytest.approx(0.2, abs=0.001)
+    assert 0.24 <= found["bounded"] <= 0.25
+    assert found["default"] < 0.24
+
+
+def test_the_data_change_the_kernel_from_its_start_within_its_bounds() -> None:
+    settings = {
+        "length_deg": 3.5,
+        "length_range_deg": (3.0, 4.0),
+        "prior_std": 0.605,
+        "prior_std_range": (0.6, 0.61),
+    }
+    config = LatentGPConfig(**settings)  # type: ignore[arg-type]
+    sums = make_sums(2_000)
+    for model, limits in (
+        (LatentGPs(config, 3, sums.steepest_deg), {"length": (3.5, 3.5), "spread": (0.605, 0.605)}),
+        (fit_gps(config, sums), {"length": (3.0, 4.0), "spread": (0.6, 0.61)}),
+    ):
+        kernel = model.gp.matern
+        values = {"length": 10 * kernel.base_kernel.lengthscale, "spread": kernel.outputscale.sqrt()}
+        for name, (low, high) in limits.items():
+            assert float(values[name].min()) > low - 1e-6
+            assert float(values[name].max()) < high + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"prior_fall_std": 0.0}, "prior_fall_std"),
+        ({"prior_level": float("nan")}, "prior_level"),
+        ({"length_deg": 20.0}, "length_range_deg"),
+        ({"noise_std_range": (0.5, 0.1)}, "noise_std_range"),
+        ({"prior_std_range": (0.0, 1.0)}, "prior_std_range"),
+    ],
+)
+def test_priors_that_are_none_are_refused(change: dict[str, object], named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        LatentGPConfig(**change)  # type: ignore[arg-type]
 
 
 STEEP = torch.linspace(0, 20, 3000)
@@ -293,13 +367,9 @@ FEW = {
 
 @pytest.mark.parametrize("kind", ["censored", "gaussian"])
 def test_meagre_data_give_sane_functions(kind: str) -> None:
-    width = max(len(slope) for slope, _ in FEW.values())
-    rows = torch.zeros(2, len(FEW), width)
-    for c, (slope, value) in enumerate(FEW.values()):
-        rows[0, c, : len(slope)], rows[1, c, : len(value)] = torch.tensor(slope), torch.tensor(value)
-    count = torch.tensor([len(slope) for slope, _ in FEW.values()])
-    table = PixelTable(slope_deg=rows[0], traversability=rows[1], count=count)
-    result = fit_gps(LatentGPConfig(likelihood=kind), table).tabulate()  # type: ignore[arg-type]
+    slopes, values = zip(*FEW.values(), strict=True)
+    sums = of_classes([torch.tensor(slope) for slope in slopes], [torch.tensor(value) for value in values])
+    result = fit_gps(LatentGPConfig(likelihood=kind), sums).tabulate()  # type: ignore[arg-type]
     spread, grid = latent_std(result), table_slopes()
     for c, (slope, value) in enumerate(FEW.values()):
         steepest = max(slope)
@@ -316,30 +386,37 @@ def test_meagre_data_give_sane_functions(kind: str) -> None:
 
 
 def test_training_draws_nothing() -> None:
-    config, table = LatentGPConfig(epochs=1, epoch_steps=5), make_table(100)
+    config, sums = LatentGPConfig(epochs=1, epoch_steps=5), make_sums(100)
     before = torch.random.get_rng_state()
-    first, second = (fit_gps(config, table).tabulate() for _ in range(2))
+    first, second = (fit_gps(config, sums).tabulate() for _ in range(2))
     assert torch.equal(first.mean, second.mean)
     assert torch.equal(before, torch.random.get_rng_state())
 
 
 def test_the_trainer_counts_every_step_once() -> None:
     # Its count moves the progress bar.
-    model = fit_gps(LatentGPConfig(epochs=2, epoch_steps=5), make_table(50))
+    model = fit_gps(LatentGPConfig(epochs=2, epoch_steps=5), make_sums(50))
     assert model.trainer.global_step == 10
 
 
 def test_gps_that_know_each_class_own_reach_lay_their_points_there() -> None:
-    table = make_table(200)
+    cells = make_cells(200)
     model = LatentGPs(LatentGPConfig(inducing_points=3), 3, torch.tensor([20.0, 1.0, 90.0]))
     points = 10 * model.gp.variational_strategy.inducing_points[..., 0]
     assert points.tolist() == [[0, 10, 20], [0, 2.5, 5], [0, 45, 90]]
     assert model.steepest_deg == [20, 1, 90]
-    assert table.steepest_deg.tolist() == table.slope_deg.max(1).values.tolist()
+    steepest = SlopeSums.of(cells.select(cells.class_id > 0), 3).steepest_deg
+    assert steepest.tolist() == [0, *(float(cells.slope_deg[cells.class_id == c].max()) for c in (1, 2))]
 
 
 def test_rebuilt_gps_give_the_same_functions(model: LatentGPs) -> None:
-    config = {"epochs": 4, "epoch_steps": 10, "steepest_deg": model.steepest_deg}
+    # A setting of an earlier version that is no more changes nothing.
+    config = {
+        "epochs": 4,
+        "max_points": 10_000,
+        "steepest_deg": model.steepest_deg,
+        "noise_std_range": [0.01, 1.0],
+    }
     rebuilt = LatentGPs.from_tensors(config, 3, model.to_tensors())
     assert torch.equal(rebuilt.tabulate().mean, model.tabulate().mean)
     assert torch.equal(rebuilt.tabulate().std, model.tabulate().std)

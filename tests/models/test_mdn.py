@@ -16,7 +16,7 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models import mdn
-from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint
+from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
 from benchnav.models.data import MapData
@@ -342,6 +342,19 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
         fit_mdn(
             replace(SMALL, components=2), dataset, 3, FitOptions(folder=tmp_path, resume=True, trainer=CPU)
         )
+
+
+def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: TerrainDataset) -> None:
+    network, metrics = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU), True)
+    whole, before = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU))
+    for name, value in as_stored(whole.state_dict(), True).items():
+        assert torch.equal(value, network.state_dict()[name]), name
+    valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
+    assert mdn.measure_network(network, valid).items() <= metrics.items()
+    # Measured in the same way as in training, of which the rounding is all that changes it.
+    for name, value in mdn.measure_network(whole, valid).items():
+        assert value == pytest.approx(before[name], rel=1e-4), name
+        assert value != metrics[name]
 
 
 def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(

@@ -7,11 +7,17 @@ import pytest
 
 from benchnav.datagen.store import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.cli import main
+from benchnav.models.data import read_maps
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import load_model
+from benchnav.models.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.training import measure_classifier
 
 from .support import make_dataset
 
-QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5", "--gp.max_points", "100"]
+QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
 QUICK_CLASSIFIER = [
     "--classifier.max_epochs",
     "1",
@@ -57,7 +63,7 @@ def test_halves_are_trained_into_one_checkpoint(
     there = load_checkpoint("new/mine")
     assert set(there.parts) == {"classifier", "gp"}
     assert there.part("gp").seed == 7
-    assert there.part("gp").config["max_points"] == 100
+    assert there.part("gp").config["epoch_steps"] == 5
     assert 0 < there.part("classifier").metrics["valid_accuracy"] < 1
     assert there.part("gp").data_id == "tiny-v1"
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["mine", "mine.training"]
@@ -97,6 +103,7 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
         (["all", "--data", "DATA", "--out", "x", "--classifier.max_epochs", "0"], "max_epochs"),
         (["all", "--data", "DATA", "--out", "x", "--gp.likelihood", "cauchy"], "likelihood"),
         (["classifier", "--data", "DATA", "--out", "x", "--classifier.encoder", "resnet19"], "resnet19"),
+        (["gp", "--data", "DATA", "--out", "x", "--gp.max_points", "9"], "max_points"),
         (["gp", "--data", "TEST", "--out", "x"], "train and valid"),
         (["gp", "--data", "DATA", "--out", "."], "something else"),
     ],
@@ -177,3 +184,54 @@ def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
     message = refuses(monkeypatch, capfd, "evaluate", "oracle", "--data", dataset.path, "--out", "locked/new")
     assert f"could not use {tmp_path}/locked/new/quality.json: Permission denied" in message
     assert f"Choose another place with --out, or change the permissions of {tmp_path}." in message
+
+
+def members_of(folder: Path) -> list[TerrainClassifier]:
+    model = load_model(str(folder))
+    assert isinstance(model, FusedModel)
+    return [member for member in model.classifiers if isinstance(member, TerrainClassifier)]
+
+
+def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    folder, valid = tmp_path / "c", read_maps(dataset, "valid")
+    small = ["--classifier.encoder_depth", "3", "--classifier.decoder_channels", "[16, 16, 8]", "--seed", "4"]
+    command = ["all", "--data", dataset.path, "--out", folder, *QUICK_GP, *QUICK_CLASSIFIER, *small]
+    found = []
+    for members in (1, 2, 3):
+        assert call(monkeypatch, *command, "--members", members, "--resume") == 0
+        classifiers = members_of(folder)
+        assert len(classifiers) == members
+        found.append(load_checkpoint(folder).pool_temperature)
+        if members > 1:
+            assert found[-1] == fit_pool_temperature(classifiers, valid, 4)
+            assert f"pool of {members} classifiers: temperature {found[-1]:.3f}" in capfd.readouterr().out
+    assert found[0] == 1
+    assert len(set(found)) == 3
+    # A member alone is what its own seed alone would have given.
+    first = members_of(folder)[0]
+    assert first.config.decoder_channels == (16, 16, 8)
+    assert first.temperature == load_checkpoint(folder).part("classifier").config["temperature"]
+    assert call(monkeypatch, *command, "--members", 1, "--overwrite") == 0
+    assert load_checkpoint(folder).pool_temperature == 1
+    alone = members_of(folder)[0]
+    assert alone.temperature == first.temperature
+
+
+@pytest.mark.parametrize("half_precision", [True, False])
+def test_what_is_stored_is_what_was_measured_and_calibrated(
+    half_precision: bool, dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = ["--data", dataset.path, "--out", tmp_path / "c"]
+    small = ["--classifier.encoder_depth", "3", "--half_precision", str(half_precision).lower()]
+    assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER, *small) == 0
+    part, valid = load_checkpoint(tmp_path / "c").part("classifier"), read_maps(dataset, "valid")
+    assert part.half_precision == half_precision
+    plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, 10, part.tensors)
+    assert part.config["temperature"] == fit_temperature(*sample_logits(plain, valid))
+    for name, value in measure_classifier(plain, valid).items():
+        assert part.metrics[name] == pytest.approx(value, rel=0 if half_precision else 1e-3, abs=1e-12), name

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from benchnav.errors import DatasetError
+from benchnav.models.cells import cell_nll, hold_out
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.pixels import hold_out, pixel_nll
 from benchnav.models.slip_logs import read_slip_logs
+from benchnav.models.slope_sums import SlopeSums
 from benchnav.models.training import fit_gps
 
-from .support import make_table
+from .support import make_cells
 
 GOOD = "class,slope_deg,traversability,note\nsand,3.5,0.9,x\nrock,10,1,y\nsand,,0.5,\nsand,4,NaN,\nNA,0,0,\n"
 
@@ -49,11 +50,11 @@ def test_parquet_and_csv_give_the_same(tmp_path: Path, classes: list[str]) -> No
 
 def test_rows_are_put_under_the_ids_of_a_class_table(tmp_path: Path) -> None:
     logs = read_slip_logs(write(tmp_path, GOOD))
-    table = logs.pixels(("rock", "mud", "sand", "NA"))
-    assert table.count.tolist() == [1, 0, 1, 1]
-    assert table.slope_deg[:, 0].tolist() == [10, 0, 3.5, 0]
+    cells = logs.cells(("rock", "mud", "sand", "NA"))
+    assert cells.class_id.tolist() == [2, 0, 3]
+    assert cells.slope_deg.tolist() == [3.5, 10, 0]
     with pytest.raises(DatasetError, match=r"among rock, sands, NA .* got 'sand'\. Did you mean 'sands'\?"):
-        logs.pixels(("rock", "sands", "NA"))
+        logs.cells(("rock", "sands", "NA"))
 
 
 def test_integer_classes_are_indices_into_the_class_table(tmp_path: Path) -> None:
@@ -62,12 +63,12 @@ def test_integer_classes_are_indices_into_the_class_table(tmp_path: Path) -> Non
     )
     assert logs.by_id
     assert logs.class_names == tuple(str(i) for i in range(11))
-    table = logs.pixels(tuple("abcdefghijkl"))
-    assert table.count.tolist() == [1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0]
-    assert table.slope_deg[[3, 0, 10], 0].tolist() == [1, 2, 3]
-    assert logs.pixels(logs.class_names).count.tolist() == table.count.tolist()[:11]
+    cells = logs.cells(tuple("abcdefghijkl"))
+    assert cells.class_id.tolist() == [3, 0, 10]
+    assert cells.slope_deg.tolist() == [1, 2, 3]
+    assert logs.cells(logs.class_names).class_id.tolist() == [3, 0, 10]
     with pytest.raises(DatasetError, match=r"in 0–9 .* got 10"):
-        logs.pixels(tuple("abcdefghij"))
+        logs.cells(tuple("abcdefghij"))
 
 
 HEADER = "class,slope_deg,traversability\n"
@@ -110,20 +111,19 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_gps_learn_from_logs_and_report_a_held_out_nll(tmp_path: Path) -> None:
-    made = make_table(400)
+    made = make_cells(400)
     rows = pd.DataFrame(
         {
             "class": np.repeat(["a", "b", "c"], 400),
-            "slope_deg": made.slope_deg.flatten(),
-            "traversability": made.traversability.flatten(),
+            "slope_deg": made.slope_deg,
+            "traversability": made.traversability,
         }
     )
     rows.sample(frac=1, random_state=0).to_parquet(tmp_path / "log.parquet")
     logs = read_slip_logs(tmp_path / "log.parquet")
-    kept, held = hold_out(logs.pixels(logs.class_names), 0.25)
-    table = fit_gps(LatentGPConfig(), kept).tabulate()
-    fresh = pixel_nll(make_table(40_000, 5), table)
-    assert pixel_nll(held, table) == pytest.approx(fresh, abs=0.1)
-    assert fresh < pixel_nll(
-        make_table(40_000, 5), fit_gps(LatentGPConfig(epochs=1, epoch_steps=1), kept).tabulate()
-    )
+    kept, held = hold_out(logs.cells(logs.class_names), 0.25)
+    sums, fresh = SlopeSums.of(kept, 3), make_cells(40_000, 5)
+    table = fit_gps(LatentGPConfig(), sums).tabulate()
+    nll = cell_nll(fresh, table)
+    assert cell_nll(held, table) == pytest.approx(nll, abs=0.1)
+    assert nll < cell_nll(fresh, fit_gps(LatentGPConfig(epochs=1, epoch_steps=1), sums).tabulate())

@@ -2,8 +2,10 @@ import pytest
 import torch
 
 from benchnav.datagen.store import TerrainDataset
-from benchnav.models.data import MapData
-from benchnav.models.temperature import fit_temperature, sample_logits
+from benchnav.models.data import MapData, MapDataset
+from benchnav.models.probabilities import sharpen
+from benchnav.models.scores import ReliabilityCurve, calibration_error
+from benchnav.models.temperature import fit_pool_temperature, fit_temperature, sample_logits
 
 
 def draw(cells: int, temperature: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -58,3 +60,61 @@ def test_sampled_logits_stay_beside_their_class(
     other, _ = sample_logits(Colour(), maps, seed=1)
     assert torch.equal(logits, again)
     assert not torch.equal(logits, other)
+
+
+CLASSES, STRENGTH = 3, 2.5
+
+
+class Witness(torch.nn.Module):
+    """A classifier whose evidence is one channel of the image in three, its own errors in it."""
+
+    def __init__(self, channel: int, boldness: float, temperature: float = 1.0) -> None:
+        super().__init__()
+        self.channel, self.boldness, self.temperature = channel, boldness, temperature
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        # A channel holds the evidence for each of three classes in a third of the byte's levels each.
+        level = rgb[:, self.channel].long()
+        evidence = torch.stack([level % 6, level // 6 % 6, level // 36 % 6], 1).float() - 2.5
+        return self.boldness * evidence / self.temperature
+
+
+def witnessed(maps: int, seed: int) -> MapDataset:
+    """Maps of single cells' classes; each channel has noisy evidence of its own, in six steps a class."""
+    generator = torch.Generator().manual_seed(seed)
+    class_id = torch.randint(0, CLASSES, (maps, 16, 16), generator=generator)
+    shown = torch.nn.functional.one_hot(class_id, CLASSES).movedim(-1, 1).unsqueeze(1).float()
+    noise = torch.randn(maps, 3, CLASSES, 16, 16, generator=generator)
+    steps = (2 + STRENGTH * (shown - 0.2) + noise).round().clamp(0, 5).long()
+    rgb = steps[:, :, 0] + 6 * steps[:, :, 1] + 36 * steps[:, :, 2]
+    return MapDataset({"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)})
+
+
+def ece(probabilities: torch.Tensor, class_id: torch.Tensor) -> float:
+    curve = ReliabilityCurve()
+    curve.update(probabilities, class_id.long())
+    return calibration_error(curve.compute())
+
+
+def test_a_pool_that_is_calibrated_as_a_whole_is_right_as_often_as_it_says() -> None:
+    maps, fresh = witnessed(100, 0), witnessed(100, 1)
+    members = []
+    for channel, boldness in enumerate((0.5, 2.0, 6.0)):  # each miscalibrated in its own way
+        own = Witness(channel, boldness)
+        members.append(Witness(channel, boldness, fit_temperature(*sample_logits(own, maps))))
+    rgb, class_id = fresh.fields["rgb"], fresh.fields["class_id"]
+    alone = [member(rgb).softmax(1) for member in members]
+    assert max(ece(one, class_id) for one in alone) < 0.03
+    average = torch.stack(alone).mean(0)
+    temperature = fit_pool_temperature(members, maps)
+    assert temperature < 0.7
+    before, after = ece(average, class_id), ece(sharpen(average, temperature), class_id)
+    assert before > 0.1
+    assert after < 0.15 * before
+
+
+def test_of_one_classifier_the_pool_temperature_is_what_its_own_leaves_over() -> None:
+    maps = witnessed(50, 2)
+    own = fit_temperature(*sample_logits(Witness(0, 3.0), maps))
+    assert fit_pool_temperature([Witness(0, 3.0)], maps) == pytest.approx(own, rel=1e-3)
+    assert fit_pool_temperature([Witness(0, 3.0, own)], maps) == pytest.approx(1, rel=1e-3)
