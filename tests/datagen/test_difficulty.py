@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from benchnav.datagen import difficulty
+from benchnav.datagen import difficulty, latent
 from benchnav.datagen.store import TerrainDataset
 from benchnav.terrain import Grid
 from tests.datagen.small import SOFT, small_stakes, terrain_class
@@ -49,11 +50,10 @@ def test_the_figures_are_those_of_hand_made_maps() -> None:
     assert found.reference_times_s.tolist() == [5, 7]
 
 
-def test_lambda_stuck_is_the_recipe_s() -> None:
-    from dataclasses import replace
-
-    class_id = np.full((1, 8, 10), 2)  # E[λ] is 0.9 · 0.9 + 0.1 · 0.05
-    for threshold, stuck in ((0.8, 0.0), (0.82, 1.0)):
+def test_lambda_stuck_is_the_recipe_s_and_still_stuck() -> None:
+    class_id = np.full((1, 8, 10), 2)  # E[λ] is 0.9 · 0.9 + 0.1 · 0.05, but for clipping
+    exact = float(latent.expected_of(latent.truth(class_id, np.zeros(class_id.shape), CLASSES)).min())
+    for threshold, stuck in ((0.8, 0.0), (exact, 1.0), (0.82, 1.0)):
         found = difficulty.of_maps(maps_of(class_id, [1.0]), replace(RECIPE, stuck_threshold=threshold))
         assert (found.stuck, found.straight) == (stuck, 1 - stuck)
 

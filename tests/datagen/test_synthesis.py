@@ -1,5 +1,6 @@
 """What recipes of synthesis 2 make: the same ground at any size, soft spots, correlated luck."""
 
+import hashlib
 from dataclasses import replace
 
 import networkx
@@ -13,6 +14,7 @@ from benchnav.datagen import elevation, latent
 from benchnav.datagen.generate import generate, reference_time_s
 from benchnav.datagen.presets import blend
 from benchnav.datagen.scenario import Recipe, Split, load_recipe, recipe_from_dict
+from benchnav.datagen.schema import entry_digests
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
 from tests.datagen.small import SOFT, small_stakes, terrain_class
@@ -289,3 +291,15 @@ def test_the_presets_of_a_recipe_are_those_of_its_synthesis() -> None:
     first, second = (recipe_from_dict(tiny | {"synthesis": s}, "test") for s in (1, 2))
     assert first.scenarios["std"].relief_m == (1.4, 1.7)
     assert list(second.scenarios.values()) == [STAKES.scenarios[name] for name in ("std", "hs-050")]
+
+
+@pytest.mark.parametrize(
+    ("split", "digest"),
+    [
+        ("train", "3006351f4fe21ebfac16dc6753c1c67f1370cbdfc89539eb9a194091612b6a13"),
+        ("test/hg", "4b77b5694bb189749dd16df89722aebdf46063d4f970bbf22fd6db8065f00379"),
+    ],
+)
+def test_the_maps_of_stakes_v1_stay_as_models_were_trained_on(split: str, digest: str) -> None:
+    made = entry_digests(generate(STAKES, split, np.arange(2)))
+    assert hashlib.sha256(made.tobytes()).hexdigest() == digest
