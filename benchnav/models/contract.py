@@ -180,6 +180,7 @@ def _make_terrain(recipe: str, height: int, width: int, device: torch.device) ->
         made,
         height=height,
         width=width,
+        places=None,
         start_m=(0.0, 0.0),
         goal_m=((width - 0.5) * made.resolution_m, (height - 0.5) * made.resolution_m),
         scenarios={name: scenario},
