@@ -18,6 +18,7 @@ def create(
     jobs: int = 1,
     seed: int | None = None,
     splits: list[str] | None = None,
+    first: int = 0,
     overwrite: bool = False,
 ) -> None:
     """Make a dataset from a recipe.
@@ -29,6 +30,7 @@ def create(
         jobs: Worker processes. The result is the same for any number.
         seed: Root seed in place of the recipe's: a sibling, of id ID-seedN, with other maps of the same classes.
         splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
+        first: Only the first so many maps of each split; the same maps as in the whole. 0 makes all.
         overwrite: Replace a file that is there.
     """
     from rich.console import Console
@@ -52,6 +54,11 @@ def create(
         chosen = replace(
             chosen, splits={name: chosen.splits[name] for name in chosen.splits if name in splits}
         )
+    if first < 0:
+        raise ConfigError(f"Expected `first` ≥ 0, got {first}.")
+    if first:
+        kept = {name: replace(spec, maps=min(first, spec.maps)) for name, spec in chosen.splits.items()}
+        chosen = replace(chosen, splits=kept)
     path = Path(out or f"datasets/{chosen.id}.h5").expanduser()
     show_progress(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite), "maps")
     made = TerrainDataset(path)

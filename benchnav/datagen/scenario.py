@@ -151,7 +151,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
 
     Args:
         source: id or path.
-        overrides: changes such as `splits.train.maps=50` or `scenarios.hs.severity=0.5`, the value
+        overrides: changes such as `splits.train.maps=50` or `classes.dune_sand.soft.weight=0.2`, the value
             in YAML. What differs needs a name of its own, so `id=NAME` has to be among them.
 
     Raises:
@@ -189,10 +189,11 @@ def override(data: Any, overrides: Sequence[str]) -> Any:
 
     Args:
         data: a mapping as in a recipe file.
-        overrides: `key.key=value` each, the value in YAML.
+        overrides: `key.key=value` each, the value in YAML; an item of a list is named by its `name`, as in
+            `classes.dune_sand.soft.weight=0.2`.
 
     Raises:
-        ConfigError: one is not of that form, or leads through what is no mapping.
+        ConfigError: one is not of that form, or leads to nothing that could be set.
     """
     changed = deepcopy(data)
     for text in overrides:
@@ -202,7 +203,7 @@ def override(data: Any, overrides: Sequence[str]) -> Any:
         *parents, last = name.split(".")
         place = changed
         for parent in parents:
-            place = place.get(parent) if isinstance(place, dict) else None
+            place = _item(place, parent)
         if not isinstance(place, dict):
             raise ConfigError(f"Expected an override of something in the recipe, got {text!r}.")
         try:
@@ -210,6 +211,13 @@ def override(data: Any, overrides: Sequence[str]) -> Any:
         except yaml.YAMLError as error:
             raise ConfigError(f"Expected YAML after '=' in override {text!r}.") from error
     return changed
+
+
+def _item(place: Any, name: str) -> Any:
+    """What a mapping has under a name, or a list of mappings under that `name`; None where there is none."""
+    if isinstance(place, list):
+        place = {item["name"]: item for item in place if isinstance(item, dict) and "name" in item}
+    return place.get(name) if isinstance(place, dict) else None
 
 
 def shipped_recipes() -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchnav.datagen import cli
+from benchnav.datagen.latent import SoftSpots
 from benchnav.datagen.scenario import load_recipe, shipped_recipes
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import ConfigError
@@ -292,3 +293,30 @@ def test_bad_stakes_are_one_line(datagen: Call, capsys, change: str, expected: s
     assert expected in told[-1]
     assert len(told) == 1
     assert not list(Path().iterdir())
+
+
+def test_the_first_maps_of_each_split_are_those_of_the_whole(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "whole.h5") == 0
+    assert datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--first", "3", "--out", "few.h5") == 0
+    whole, few = TerrainDataset("whole.h5"), TerrainDataset("few.h5")
+    assert {name: split["maps"] for name, split in few.splits.items()} == {"test/std": 3, "valid": 3}
+    for split in few.splits:
+        for name, values in few.read(split).items():
+            np.testing.assert_array_equal(values, whole.read(split, range(3))[name])
+    assert few.id == "tiny-v1"
+    assert datagen("create", "tiny-v1", "--first", "-1", "--out", "x.h5") == 2
+    assert "`first` ≥ 0" in capsys.readouterr().err
+    assert datagen("create", "tiny-v1", "--splits", "[test/hs]", "--first", "9", "--out", "all.h5") == 0
+    assert TerrainDataset("all.h5").map_count("test/hs") == 4
+
+
+def test_an_override_names_an_item_of_a_list_by_its_name() -> None:
+    recipe = load_recipe("stakes-v1", ["id=deep", "classes.dune_sand.soft.weight=0.2", "classes.gravel.noise=0.3"])
+    by_name = {item.name: item for item in recipe.classes}
+    whole = {item.name: item for item in load_recipe("stakes-v1").classes}
+    assert by_name["dune_sand"].soft == SoftSpots(weight=0.2, mean=0.05, std=0.05)
+    assert by_name["gravel"].noise == 0.3
+    assert by_name["wet_clay"] == whole["wet_clay"]
+    for wrong in ("classes.dune.noise=1", "classes.3.noise=1", "occupancy.first=1"):
+        with pytest.raises(ConfigError, match="something in the recipe"):
+            load_recipe("stakes-v1", ["id=deep", wrong])

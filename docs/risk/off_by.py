@@ -1,0 +1,35 @@
+"""The shipped model with another weight of soft spots, for docs/risk.md."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from benchnav.mixture import TraversabilityMixture
+from benchnav.models.predictor import load_model
+from benchnav.terrain import Observation
+
+
+class OffBy:
+    """Takes soft spots for more or less of the ground than the shipped model does.
+
+    Args:
+        factor: of the weight of each class's soft spots within the class.
+    """
+
+    def __init__(self, factor: float = 1.0) -> None:
+        """Loads the shipped model."""
+        self.model: Any = load_model("stakes-v1")
+        self.factor = factor
+
+    def predict(self, observation: Observation) -> TraversabilityMixture:
+        """As the shipped model, with other weights."""
+        mixture: TraversabilityMixture = self.model.predict(observation)
+        assert mixture.group is not None
+        classes = len(self.model.class_names)
+        weights = mixture.weights.clone()
+        for k in range(classes, weights.shape[1]):  # soft spots stand behind the classes
+            more = (self.factor - 1) * mixture.weights[:, k]
+            weights[:, k] += more
+            weights[:, mixture.group[k]] -= more
+        return replace(mixture, weights=weights.clamp(min=torch.zeros(())))
