@@ -19,6 +19,7 @@ from statistics import median
 
 import gpytorch
 import torch
+from benchnav.models.pixels import PixelTable, read_pixels
 from gpytorch.distributions import MultivariateNormal
 from rich.console import Console
 from rich.table import Table
@@ -30,7 +31,6 @@ from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.pixels import PixelTable, read_pixels
 from benchnav.models.scores import coverage, crps, pit, tail_rate
 from benchnav.models.slope_table import SlopeTable
 from benchnav.models.training import fit_gps

@@ -174,8 +174,8 @@ class TraversabilityMixture:
 
     def to(self, device: torch.device | str) -> "TraversabilityMixture":
         """The mixture on a device."""
-        parameters = (values.to(device) for values in (self.weights, self.means, self.stds))
-        return TraversabilityMixture(*parameters, self.group)
+        weights, means, stds = (values.to(device) for values in (self.weights, self.means, self.stds))
+        return TraversabilityMixture(weights, means, stds, self.group)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1); log probability mass at 0 and at 1; −∞ elsewhere.

@@ -178,9 +178,11 @@ class Terrain:
 
     def to(self, device: torch.device | str) -> "Terrain":
         """The maps on a device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self)}
         movable = (Tensor, TraversabilityMixture)
-        return Terrain(**{n: v.to(device) if isinstance(v, movable) else v for n, v in moved.items()})
+        moved: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, value in moved.items():
+            moved[name] = value.to(device) if isinstance(value, movable) else value
+        return Terrain(**moved)
 
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""

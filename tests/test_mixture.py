@@ -21,7 +21,9 @@ def random_mixture(components: int = 4, cells: int = 6, seed: int = 0) -> Traver
     weights = torch.rand(shape, generator=generator, dtype=torch.float64)
     means = 1.4 * torch.rand(shape, generator=generator, dtype=torch.float64) - 0.2
     stds = 0.02 + 0.3 * torch.rand(shape, generator=generator, dtype=torch.float64)
-    return TraversabilityMixture(weights / weights.sum(1, keepdim=True), means, stds, tuple(range(components)))
+    return TraversabilityMixture(
+        weights / weights.sum(1, keepdim=True), means, stds, tuple(range(components))
+    )
 
 
 def single(mean: float, std: float, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
@@ -213,15 +215,21 @@ def test_most_likely_keeps_the_heaviest_class_where_each_has_one_component() -> 
 def test_most_likely_keeps_the_heaviest_class_whole() -> None:
     """Class 7 has two components that are together heavier than the heaviest one, which is of class 2."""
     mixture = random_mixture(components=4)
-    weights = torch.tensor([0.3, 0.4, 0.25, 0.05], dtype=torch.float64).view(1, 4, 1, 1).expand(2, 4, 1, 6).clone()
+    weights = (
+        torch.tensor([0.3, 0.4, 0.25, 0.05], dtype=torch.float64).view(1, 4, 1, 1).expand(2, 4, 1, 6).clone()
+    )
     weights[1, :, 0, 0] = torch.tensor([0.1, 0.85, 0.04, 0.01])
     of_classes = replace(mixture, weights=weights, group=(7, 2, 7, 3))
     kept = of_classes.most_likely()
     alone = TraversabilityMixture(
-        weights[:, [0, 2]] / weights[:, [0, 2]].sum(1, keepdim=True), mixture.means[:, [0, 2]], mixture.stds[:, [0, 2]]
+        weights[:, [0, 2]] / weights[:, [0, 2]].sum(1, keepdim=True),
+        mixture.means[:, [0, 2]],
+        mixture.stds[:, [0, 2]],
     )
     torch.testing.assert_close(kept.cvar(0.9)[0], alone.cvar(0.9)[0])
-    other = TraversabilityMixture(torch.ones(2, 1, 1, 6).double(), mixture.means[:, [1]], mixture.stds[:, [1]])
+    other = TraversabilityMixture(
+        torch.ones(2, 1, 1, 6).double(), mixture.means[:, [1]], mixture.stds[:, [1]]
+    )
     assert kept.mean()[1, 0, 0].item() == pytest.approx(other.mean()[1, 0, 0].item(), abs=1e-12)
     assert kept.mean()[1, 0, 1].item() == pytest.approx(alone.mean()[1, 0, 1].item(), abs=1e-12)
     torch.testing.assert_close(kept.weights.sum(1), torch.ones(2, 1, 6).double())
@@ -295,7 +303,9 @@ def test_normal_numbers_go_through_each_cells_quantile_function() -> None:
         assert (mixture.chance(1.0)[found == 1] >= 1 - share[found == 1] - 1e-12).all()
     alone = single(0.5, 0.3)
     for z in (-3.0, -1.0, 0.0, 0.4, 2.5):
-        both = TraversabilityMixture(*(t.expand(2, 1, 1) for t in (alone.weights / 2, alone.means, alone.stds)))
+        both = TraversabilityMixture(
+            *(t.expand(2, 1, 1) for t in (alone.weights / 2, alone.means, alone.stds))
+        )
         at = torch.full((1, 1), z, dtype=torch.float64)
         assert alone.from_normal(at).item() == pytest.approx(min(max(0.5 + 0.3 * z, 0), 1))
         assert both.from_normal(at).item() == pytest.approx(alone.from_normal(at).item(), abs=1e-8)

@@ -1,9 +1,9 @@
 """What a model is, and how it is found by name or by checkpoint.
 
 A model sees an `Observation` and gives a `TraversabilityMixture`; `oracle`, `ideal` and `clairvoyant`
-alone are given the Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what stands at a name is
-either called with its options and makes a model, or is a family, with `from_checkpoint`, for checkpoints
-that bear its name. The package's own models are in the same registry. Source: paper III-B. Letters in
+alone are given the Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what
+stands at a name is either called with its options and makes a model, or is a family, with
+`from_checkpoint`, for checkpoints that bear its name. The package's own models are in the same registry. Source: paper III-B. Letters in
 shapes: M members, B maps, H×W cells, C classes, K components.
 """
 
@@ -254,7 +254,8 @@ def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
     """
     if isinstance(model, PRIVILEGED):
         return model.predict_terrain(terrain)
-    mixture: Any = model.predict(terrain.observe())
+    own: Any = model
+    mixture: Any = own.predict(terrain.observe())
     shape = (len(terrain), *terrain.grid.shape)
     if not isinstance(mixture, TraversabilityMixture) or _cell_shape(mixture.weights) != shape:
         got = (

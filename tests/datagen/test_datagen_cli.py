@@ -297,7 +297,9 @@ def test_bad_stakes_are_one_line(datagen: Call, capsys, change: str, expected: s
 
 def test_the_first_maps_of_each_split_are_those_of_the_whole(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
     assert datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "whole.h5") == 0
-    assert datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--first", "3", "--out", "few.h5") == 0
+    assert (
+        datagen("create", "tiny-v1", "--splits", "[test/std,valid]", "--first", "3", "--out", "few.h5") == 0
+    )
     whole, few = TerrainDataset("whole.h5"), TerrainDataset("few.h5")
     assert {name: split["maps"] for name, split in few.splits.items()} == {"test/std": 3, "valid": 3}
     for split in few.splits:
@@ -311,7 +313,9 @@ def test_the_first_maps_of_each_split_are_those_of_the_whole(datagen: Call, caps
 
 
 def test_an_override_names_an_item_of_a_list_by_its_name() -> None:
-    recipe = load_recipe("stakes-v1", ["id=deep", "classes.dune_sand.soft.weight=0.2", "classes.gravel.noise=0.3"])
+    recipe = load_recipe(
+        "stakes-v1", ["id=deep", "classes.dune_sand.soft.weight=0.2", "classes.gravel.noise=0.3"]
+    )
     by_name = {item.name: item for item in recipe.classes}
     whole = {item.name: item for item in load_recipe("stakes-v1").classes}
     assert by_name["dune_sand"].soft == SoftSpots(weight=0.2, mean=0.05, std=0.05)

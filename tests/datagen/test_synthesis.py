@@ -161,8 +161,8 @@ def test_the_ladder_of_stakes_climbs_from_std_in_equal_steps() -> None:
             assert rung == blend(STAKES.scenarios["std"], STAKES.scenarios[preset], severity)
     assert STAKES.scenarios["std"].relief_m != load_recipe("paper-v1").scenarios["std"].relief_m
     assert STAKES.splits == {
-        "train": Split(scenario="std", maps=1000),
-        "valid": Split(scenario="std", maps=250),
+        "train": Split(scenario="std", maps=1000, solvable=True),
+        "valid": Split(scenario="std", maps=250, solvable=True),
     } | {f"test/{name}": Split(scenario=name, maps=200, solvable=True) for name in STAKES.scenarios}
 
 

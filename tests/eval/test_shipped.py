@@ -58,9 +58,7 @@ def drive_straight(instance: int) -> tuple[float, float, float]:
     direction, place, met = (goal - start) / np.linalg.norm(goal - start), start, []
     while np.linalg.norm(goal - place) >= 1:
         column, row = (place // 0.5).astype(int)
-        mean, std = (
-            float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds)
-        )
+        mean, std = (float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds))
         met.append(float(np.clip(mean + std * luck[len(met)], 0, 1)))
         place = place + 0.1 * met[-1] * direction
     return 0.1 * len(met), 0.1 * sum(met), float(np.mean(met))

@@ -140,7 +140,11 @@ def test_the_simulation(robot: str, noise: str, monkeypatch: pytest.MonkeyPatch)
         expect(met, BATCH)
     expect(simulation.unhindered(now, gpu(BATCH, 2)), *problem.start.shape)
     now = end(now, now.running, Outcome.PLANNER_ERROR)
-    expect(tell_standstill(now.outcome, now.step, gpu(BATCH, 21, 2), gpu(BATCH, 20), 0.1), BATCH, dtype=torch.int64)
+    expect(
+        tell_standstill(now.outcome, now.step, gpu(BATCH, 21, 2), gpu(BATCH, 20), 0.1),
+        BATCH,
+        dtype=torch.int64,
+    )
 
 
 def step_of(problem: Problem) -> Step:

@@ -50,9 +50,7 @@ def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:
         bool, shape [B].
     """
     found = []
-    cells = zip(
-        ground.cpu().numpy(), _cells(grid, places.start_m), _cells(grid, places.goal_m), strict=True
-    )
+    cells = zip(ground.cpu().numpy(), _cells(grid, places.start_m), _cells(grid, places.goal_m), strict=True)
     for here, start, goal in cells:
         parts, _ = label(here)
         found.append(bool(parts[start] > 0 and parts[start] == parts[goal]))

@@ -63,7 +63,7 @@ def _changed_world(preset: World, given: dict[str, Any]) -> World:
 def _changed(value: Any, changes: dict[str, Any], where: str) -> Any:
     """Replaces fields of a dataclass by what is given, of dataclasses in it likewise."""
     known = {f.name: getattr(value, f.name) for f in fields(value)}
-    made = {}
+    made: dict[str, Any] = {}
     for name, change in changes.items():
         if name not in known:
             raise ConfigError(

@@ -18,7 +18,6 @@ from benchnav import rng
 from benchnav.datagen.store import TerrainDataset
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
-from benchnav.mixture import TraversabilityMixture
 from tests import factories
 
 MAPS, SEEDS, REALISATIONS = 25, (3, 4), 2

@@ -109,9 +109,7 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_instanc
         rows = list(block)
         np.testing.assert_allclose(note["start"][:, :2], places["start_m"][rows])
         np.testing.assert_allclose(note["goal_m"], places["goal_m"][rows])
-        np.testing.assert_allclose(
-            note["time_budget_s"], RATIO * places["reference_time_s"][rows], rtol=1e-5
-        )
+        np.testing.assert_allclose(note["time_budget_s"], RATIO * places["reference_time_s"][rows], rtol=1e-5)
         # Free by the mean, whatever the risk setting; motion at no less than 0.05.
         told = {name: getattr(truth.select(torch.tensor(rows)), name)() for name in ("mean",)}
         torch.testing.assert_close(note["motion_map"], note["risk_map"].clamp(min=0.05))
@@ -120,8 +118,7 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_instanc
         fitting = [
             key
             for key, known in fields.items()
-            if key[3] == block
-            and np.allclose(felt, [known[b][at] for b, at in enumerate(starts)], atol=1e-5)
+            if key[3] == block and np.allclose(felt, [known[b][at] for b, at in enumerate(starts)], atol=1e-5)
         ]
         assert len(fitting) == 1
         assert torch.equal(note["felt"], note["felt"][:1].expand_as(note["felt"]))
@@ -150,7 +147,9 @@ def test_rows_tell_what_was_drawn_again_and_the_clairvoyant_runs_once(
         ("oracle", "mean"), ("oracle", "cvar:0.5"), ("clairvoyant", "–"),
     }  # fmt: skip
     assert rows["redrawn"].max() > 0
-    for row in rows[rows["world"].str.contains("correlation_m=2")].sample(20, random_state=1).to_dict("records"):
+    for row in (
+        rows[rows["world"].str.contains("correlation_m=2")].sample(20, random_state=1).to_dict("records")
+    ):
         told = field(dataset, row["instance"], row["seed"], row["realisation"], 2.0)
         assert row["redrawn"] == told[1]
         assert row["total_time_s"] == pytest.approx(RATIO * row["reference_time_s"], rel=1e-4)

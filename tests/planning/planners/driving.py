@@ -50,7 +50,9 @@ def drive(planner: Any, problem: Problem, truth: Tensor | None = None, time_budg
     terrain = replace(factories.terrain(ground, 0.05), grid=problem.grid)
     world = World(time_budget_s=time_budget_s)
     luck = rng.stream_key(0, "luck")
-    simulation = Simulation(terrain, problem.task, world, factories.places(problem.goal_m), luck, range(len(problem)))
+    simulation = Simulation(
+        terrain, problem.task, world, factories.places(problem.goal_m), luck, range(len(problem))
+    )
     now = simulation.init(problem.start)
     plan_state = planner.init(problem, generator())
     states, actions = [now.state], []

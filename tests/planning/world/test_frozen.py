@@ -45,9 +45,9 @@ def test_marginals_are_each_cells_own_distribution() -> None:
     draws = [draw_frozen(terrain, FREE, across(1), KEY, [i])[0][0] for i in range(2000)]
     field = torch.stack(draws).double().numpy()
     for row in (3, 12):
-        mixture = TraversabilityMixture(
-            *(t[:, :, row : row + 1, :1].double() for t in (terrain.truth.weights, terrain.truth.means, terrain.truth.stds))
-        )  # fmt: skip
+        truth = terrain.truth
+        cell = (t[:, :, row : row + 1, :1].double() for t in (truth.weights, truth.means, truth.stds))
+        mixture = TraversabilityMixture(*cell)
         drawn = field[:, row, 5]
         assert (drawn == 0).mean() == pytest.approx(float(mixture.cdf(0.0)), abs=0.01)
         inside = drawn[(drawn > 0) & (drawn < 1)]

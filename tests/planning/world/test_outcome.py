@@ -64,7 +64,9 @@ def test_a_robot_that_spins_in_place_is_stalled() -> None:
     ground = torch.stack([torch.full((16, 16), value) for value in (0.9, 0.0)])
     world = World(time_budget_s=12.0)
     goal = torch.tensor([[90.0, 90.0]]).expand(2, 2)
-    simulation = Simulation(factories.terrain(ground, 0.0), factories.task(), world, factories.places(goal), 0, range(2))
+    simulation = Simulation(
+        factories.terrain(ground, 0.0), factories.task(), world, factories.places(goal), 0, range(2)
+    )
     now = simulation.init(torch.tensor([[4.0, 4.0, 0.0]] * 2))
     action = torch.tensor([[0.0, 1.0], [1.0, 0.0]])
     states, driven = [now.state], []

@@ -29,7 +29,12 @@ def simulation(
     goal = torch.tensor(goals).expand(len(mean), 2)
     world = World(noise=noise, time_budget_s=time_budget_s, immobile=immobile)
     return Simulation(
-        factories.terrain(mean, std), factories.task(**task), world, factories.places(goal), KEY, range(len(mean))
+        factories.terrain(mean, std),
+        factories.task(**task),
+        world,
+        factories.places(goal),
+        KEY,
+        range(len(mean)),
     )
 
 
@@ -135,7 +140,9 @@ def test_an_ended_episode_stands_still() -> None:
 
 def test_an_outcome_that_the_simulation_cannot_see_ends_only_running_episodes() -> None:
     outcome = torch.tensor([Outcome.SUCCESS, Outcome.RUNNING, Outcome.RUNNING])
-    now = SimulationState(torch.zeros(3, 3), outcome, torch.tensor([4, 5, 6]), torch.zeros(3, dtype=torch.int64))
+    now = SimulationState(
+        torch.zeros(3, 3), outcome, torch.tensor([4, 5, 6]), torch.zeros(3, dtype=torch.int64)
+    )
     ended = end(now, torch.tensor([True, True, False]), Outcome.PLANNER_ERROR)
     assert ended.outcome.tolist() == [Outcome.SUCCESS, Outcome.PLANNER_ERROR, Outcome.RUNNING]
     assert ended.running.tolist() == [False, False, True]
@@ -226,9 +233,13 @@ def test_each_episode_has_its_own_time_budget() -> None:
 
 def test_some_episodes_are_exchanged_with_their_time_budgets() -> None:
     def sim(ratio: float) -> Simulation:
-        places = replace(factories.places(torch.full((2, 2), 90.0)), reference_time_s=torch.tensor([0.4, 0.8]))
+        places = replace(
+            factories.places(torch.full((2, 2), 90.0)), reference_time_s=torch.tensor([0.4, 0.8])
+        )
         world = World(time_budget_s=None, time_budget_ratio=ratio)
-        return Simulation(factories.terrain(even(1.0, 1.0), 0.0), factories.task(), world, places, KEY, range(2))
+        return Simulation(
+            factories.terrain(even(1.0, 1.0), 0.0), factories.task(), world, places, KEY, range(2)
+        )
 
     mixed = sim(2.0).exchange(torch.tensor([1, 0]), sim(4.0))
     assert mixed.steps.tolist() == [32, 16]
