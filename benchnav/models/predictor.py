@@ -3,8 +3,8 @@
 A model sees an `Observation` and gives a `TraversabilityMixture`; `oracle`, `ideal` and `clairvoyant`
 alone are given the Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what
 stands at a name is either called with its options and makes a model, or is a family, with
-`from_checkpoint`, for checkpoints that bear its name. The package's own models are in the same registry. Source: paper III-B. Letters in
-shapes: M members, B maps, H×W cells, C classes, K components.
+`from_checkpoint`, for checkpoints that bear its name. The package's own models are in the same registry.
+Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes, K components.
 """
 
 import hashlib
