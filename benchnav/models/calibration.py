@@ -5,7 +5,7 @@ themselves stand in `scores` and `uncertainty`. Letters in shapes: B maps, H×W 
 cells of all maps.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +18,7 @@ from torchmetrics.classification import (
 )
 
 from benchnav import rng
+from benchnav.datagen.latent import twins
 from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
@@ -36,6 +37,7 @@ from benchnav.models.scores import (
     tail_rate,
 )
 from benchnav.models.slope_table import SlopeTable
+from benchnav.models.twins import TwinQuality, TwinTally
 from benchnav.models.uncertainty import ErrorRanking, mutual_information, predictive_entropy
 from benchnav.terrain import Terrain
 
@@ -75,6 +77,7 @@ class ClassQuality:
         confusion: cells by true class (row) and most likely class (column), [C][C].
         reliability: the curve that the ECE sums up.
         slope_cells: cells by true class and whole degree of slope, [C][90].
+        twins: with classes that look alike merged; None where no two do.
     """
 
     accuracy: float
@@ -88,6 +91,7 @@ class ClassQuality:
     confusion: tuple[tuple[int, ...], ...]
     reliability: Reliability
     slope_cells: tuple[tuple[int, ...], ...]
+    twins: TwinQuality | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,9 +178,11 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
+    alike = twins(dataset.recipe.classes)
     for split in choose_splits(model, dataset, splits):
         chunks = read_chunks(dataset, split)
-        yield split, measure(model, chunks, rng.generator(rng.stream_key(seed, "models", "pit", split)))
+        generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
+        yield split, measure(model, chunks, generator, alike)
 
 
 def read_chunks(dataset: TerrainDataset, split: str) -> Iterator[Terrain]:
@@ -187,13 +193,19 @@ def read_chunks(dataset: TerrainDataset, split: str) -> Iterator[Terrain]:
         yield dataset.terrain(split, range(start, min(start + step, count)))
 
 
-def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generator) -> Quality:
+def measure(
+    model: AnyModel,
+    chunks: Iterable[Terrain],
+    generator: torch.Generator,
+    alike: Sequence[tuple[int, ...]] = (),
+) -> Quality:
     """Measures a model on some maps.
 
     Args:
         model: any model.
         chunks: the maps, at least one, a few at a time.
         generator: of the draws within atoms, on the CPU.
+        alike: of each class those that look like it, itself among them; empty where none do.
     """
     maps, cells, sums = 0, 0, torch.zeros(6, dtype=torch.float64)
     histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
@@ -205,7 +217,7 @@ def measure(model: AnyModel, chunks: Iterable[Terrain], generator: torch.Generat
         histogram += pit_counts(transformed)
         maps, cells = maps + len(terrain), cells + transformed.numel()
         if isinstance(model, ClassModel):
-            classes = classes or [_ClassTally(model, terrain)]
+            classes = classes or [_ClassTally(model, terrain, alike)]
             classes[0].add(class_probabilities(mixture, len(model.class_names)), terrain)
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
@@ -257,7 +269,7 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, fl
 class _ClassTally:
     """Counts of a model's class probabilities over maps."""
 
-    def __init__(self, model: ClassModel, first: Terrain) -> None:
+    def __init__(self, model: ClassModel, first: Terrain, alike: Sequence[tuple[int, ...]]) -> None:
         count, device = len(model.class_names), first.rgb.device
         self.members: list[EnsembleModel] = []
         if isinstance(model, EnsembleModel):
@@ -275,6 +287,7 @@ class _ClassTally:
         self.uncertainty = [0.0 for _ in self.rankings]
         self.cells = 0
         self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
+        self.twins = TwinTally(alike, device) if any(len(own) > 1 for own in alike) else None
 
     def add(self, probabilities: Tensor, terrain: Terrain) -> None:
         """Adds maps: class probabilities [B, C, H, W] and the truth."""
@@ -293,6 +306,8 @@ class _ClassTally:
             (90 * terrain.class_id + degree).flatten(), minlength=self.slope_cells.numel()
         )
         self.slope_cells += counted.view_as(self.slope_cells)
+        if self.twins is not None:
+            self.twins.add(probabilities, terrain.class_id)
 
     def quality(self) -> ClassQuality:
         by_class, curve = self.by_class.compute(), self.reliability.compute().cpu()
@@ -315,6 +330,7 @@ class _ClassTally:
                 accuracy=tuple(curve[2].tolist()),
             ),
             slope_cells=tuple(tuple(row) for row in self.slope_cells.tolist()),
+            twins=None if self.twins is None else self.twins.quality(),
         )
 
 

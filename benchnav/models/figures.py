@@ -36,6 +36,7 @@ _COLOURS = (_BLUE, _ORANGE, _GREEN, _PINK, _SKY, "#E69F00", "black")
 _MARKERS = "os^Dv<P"
 _MOST_NUMBERED = 16  # classes; among more, numbers would not fit their cells
 _RARE = 1e-3
+_NO_SOFT = (0.0, 0.0, 1.0)  # weight, mean and standard deviation of no second mode
 _NEAR = 0.01  # to the ideal; finer differences fill no panel
 
 # Title, the quantity of ClassQuality or TraversabilityQuality, and its ideal where that is not an end.
@@ -281,6 +282,7 @@ def latent_figure(
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     slopes = table_slopes().numpy()
     shown = slopes <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))
+    soft = _soft_modes(table)
     means, stds = (values.double().cpu().numpy() for values in (table.mean, table.std))
     noise = table.noise_std.double().cpu().numpy()
     x = slopes[shown]
@@ -290,10 +292,14 @@ def latent_figure(
         panel.fill_between(x, mean - 2 * std, mean + 2 * std, color=_SKY, alpha=0.3, lw=0)
         panel.fill_between(x, mean - 2 * latent, mean + 2 * latent, color=_BLUE, alpha=0.45, lw=0)
         panel.plot(x, mean, color=_BLUE, lw=1.1)
-        panel.plot(x, expected_traversability(mean, std), color=_ORANGE, lw=1.1)
+        panel.plot(x, _with_soft(expected_traversability(mean, std), *soft[number]), color=_ORANGE, lw=1.1)
         true = latent_mean(np.full(len(x), number), x, tuple(classes))
         panel.plot(x, true, color="black", lw=0.9, ls="--")
-        panel.plot(x, expected_traversability(true, np.full_like(x, one.noise)), color="black", lw=1, ls=":")
+        firm = expected_traversability(true, np.full_like(x, one.noise))
+        true_soft = (one.soft.weight, one.soft.mean, one.soft.std) if one.soft else _NO_SOFT
+        panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":")
+        if soft[number][0]:
+            panel.axhline(soft[number][1], color=_BLUE, lw=0.9, ls="-.")
         for share, shade in ((_RARE, 0.12), (0.0, 0.25)):
             panel.axvspan(_steeper_than(slope_cells[number], share), 90, color="0.4", alpha=shade, lw=0)
         panel.set_title(one.name.replace("_", " "), size=_TITLE, parse_math=False)
@@ -314,11 +320,30 @@ def latent_figure(
             Line2D([], [], color="black", lw=0.9, ls="--", label="true latent function"),
             Line2D([], [], color=_ORANGE, lw=1.1, label="predicted E[λ]"),
             Line2D([], [], color="black", lw=1, ls=":", label="true E[λ]"),
+            *(
+                [Line2D([], [], color=_BLUE, lw=0.9, ls="-.", label="mean of soft spots")]
+                if table.soft
+                else []
+            ),
             Patch(facecolor="0.4", alpha=0.12, label="steeper: 1 cell in 1000"),
             Patch(facecolor="0.4", alpha=0.35, label="steeper: no cell of the class"),
         ],
     )
     return figure
+
+
+def _soft_modes(table: SlopeTable) -> list[tuple[float, float, float]]:
+    """Weight, mean and standard deviation of each class's second mode as it was found."""
+    if table.soft is None:
+        return [_NO_SOFT] * len(table.mean)
+    found = (values.double().tolist() for values in (table.soft.weight, table.soft.mean, table.soft.std))
+    return list(zip(*found, strict=True))
+
+
+def _with_soft(expected: np.ndarray, weight: float, mean: float, std: float) -> np.ndarray:
+    """E[λ] of ground with soft spots, from that of its firm part."""
+    soft = expected_traversability(np.array([mean]), np.array([std]))
+    return (1 - weight) * expected + weight * soft
 
 
 def save_figure(figure: Figure, path: Path) -> None:

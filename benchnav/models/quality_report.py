@@ -24,6 +24,10 @@ Ladders = dict[str, list[tuple[float, str]]]
 HEADINGS = {
     "accuracy": "accuracy\n",
     "miou": "mIoU\n",
+    "twin_accuracy": "accuracy\ntwins=1",
+    "twin_miou": "mIoU\ntwins=1",
+    "twin_share_error": "twins\n|s−½|",
+    "twin_share_ece": "ECE\ntwins",
     "ece": "ECE\n",
     "brier": "Brier\n",
     "entropy": "entropy\n[nats]",
@@ -37,7 +41,13 @@ HEADINGS = {
     "coverage": "in 90 %\n(0.9)",
     "tail_rate": "< VaR\n(0.1)",
 }
-_FILES_ONLY = ("entropy", "mutual_information")  # for which the terminal is too narrow
+TWINS = ("twin_accuracy", "twin_miou", "twin_share_error", "twin_share_ece")  # where classes look alike
+_FILES_ONLY = (
+    "entropy",
+    "mutual_information",
+    "twin_miou",
+    "twin_share_error",
+)  # for which the terminal is too narrow
 
 _RUNG = re.compile(r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))")
 
@@ -95,7 +105,7 @@ def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> 
     splits = {
         split: {
             "maps": quality.maps,
-            **{key: value for item in quality.classes for key, value in asdict(item).items()},
+            **_class_numbers(quality),
             **asdict(quality.traversability),
         }
         for split, quality in qualities.items()
@@ -117,7 +127,8 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
         for severity, split in ladder:
             rungs[split] = (scenario if severity else "", severity)
     text = io.StringIO()
-    writer = csv.DictWriter(text, ["split", "scenario", "severity", "maps", *HEADINGS], lineterminator="\n")
+    columns = [name for name in HEADINGS if name not in TWINS or any(map(_has_twins, qualities.values()))]
+    writer = csv.DictWriter(text, ["split", "scenario", "severity", "maps", *columns], lineterminator="\n")
     writer.writeheader()
     for split, quality in qualities.items():
         scenario, severity = rungs.get(split, ("", math.nan))
@@ -152,9 +163,21 @@ def quality_markdown(
 
 def numbers(quality: Quality) -> dict[str, float]:
     """The single numbers of a split's quality by name, in the order of `HEADINGS`."""
-    values = {key: value for item in quality.classes for key, value in vars(item).items()}
-    values |= vars(quality.traversability)
+    values = {**_class_numbers(quality), **vars(quality.traversability)}
     return {name: float(values[name]) for name in HEADINGS if name in values}
+
+
+def _class_numbers(quality: Quality) -> dict[str, Any]:
+    """Everything of a split's classes, by name; what is of look-alikes only where there are any."""
+    found: dict[str, Any] = {}
+    for item in quality.classes:
+        found |= asdict(item)
+        found |= found.pop("twins") or {}
+    return found
+
+
+def _has_twins(quality: Quality) -> bool:
+    return any(item.twins is not None for item in quality.classes)
 
 
 def _shown(rows: Mapping[str, Mapping[str, float]]) -> list[str]:

@@ -113,8 +113,7 @@ def open_target(
             name for name in checkpoint.parts if name in parts or (is_member(name) and CLASSIFIER in parts)
         }
         kept = {name: part for name, part in checkpoint.parts.items() if name not in dropped}
-        pooled = 1.0 if any(map(is_member, dropped)) else checkpoint.pool_temperature
-        checkpoint = replace(checkpoint, parts=kept, pool_temperature=pooled)
+        checkpoint = replace(checkpoint, parts=kept)
     elif trained and not options.resume and is_first_process():
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "

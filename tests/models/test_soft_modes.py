@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -83,6 +85,17 @@ def test_a_class_without_a_second_mode_keeps_one(count: int, seeds: int) -> None
 def test_a_main_mode_that_is_clipped_is_not_taken_for_two(fall: float, flat: float) -> None:
     # Steep ground on which most of λ is 0, and firm ground on which half of it is 1.
     assert find(draw(200_000, 0.0, steep_deg=15.0, fall=fall, flat=flat)) is None
+
+
+def test_tails_a_little_heavier_than_those_of_a_normal_distribution_are_no_second_mode() -> None:
+    count, generator = 200_000, torch.Generator().manual_seed(0)
+    plain = draw(count, 0.0)
+    freedom = 25
+    spread = (torch.randn(freedom, count, generator=generator).square().mean(0)) ** -0.5  # Student's t
+    noise = NOISE * spread * torch.randn(count, generator=generator)
+    value = (firm(plain.slope_deg) + noise).clamp(0, 1)
+    # BIC alone would keep one, of a few per cent of the cells and nearly as wide as λ's range.
+    assert find(replace(plain, traversability=value)) is None
 
 
 def test_a_mode_of_less_than_a_hundredth_is_left_out() -> None:
