@@ -65,7 +65,7 @@ def _draw(
     for row in rows.to_dict("records"):
         setting = (row["planner"], row["model"], row["risk"])
         rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
-        blind = row["model"] == NOT_USED
+        blind = row["model"] == NOT_USED  # The clairvoyant has a model, and no risk.
         colour = "0.45" if blind else palette(planners.index(row["planner"]) % 10)
         place = settings[setting]
         panel.plot([low, high], [place, place], color=colour, lw=1.4, solid_capstyle="butt")
@@ -81,5 +81,7 @@ def _draw(
 
 def _name(setting: tuple[str, str, str], several_models: bool) -> str:
     planner, model, risk = setting
-    words = [display_name(planner), model if several_models else NOT_USED, risk]
+    # A model without a risk setting knows λ itself: nothing else would tell it from a blind planner.
+    named = several_models or risk == NOT_USED
+    words = [display_name(planner), model if named else NOT_USED, risk]
     return ", ".join(word for word in words if word != NOT_USED)
