@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from benchnav.eval.report.drawn_plan import STYLES, LayerStyle
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, display_name
+from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, trial_name
 from benchnav.eval.report.ground import HOLDING, SOFT, field_colours, hatching, immobilised_at, outline
 from benchnav.eval.report.snapshot import Snapshot
 from benchnav.eval.report.tables import NOT_USED
@@ -74,7 +74,7 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
             _draw_marks(panel, snapshot, snapshot.track[snapshot.now])
         if snapshot.field is not None:
             _draw_field(last[0], snapshot, snapshot.field)
-        above.set_title(_title(snapshot, _told(snapshots)), fontsize=9)
+        above.set_title(_title(snapshot, _several(snapshots)), fontsize=9)
     figure.legend(
         handles=_legend(snapshots), loc="outside lower center", ncols=4 if across > 1 else 2, frameon=False
     )
@@ -82,16 +82,14 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
     return figure
 
 
-def _title(snapshot: Snapshot, told: Sequence[str]) -> str:
+def _title(snapshot: Snapshot, several: Sequence[str]) -> str:
     about = snapshot.about
-    names = [display_name(about["planner"]), *(about[name] for name in told), about["risk"]]
-    names.append(f"{about['scenario']} {about['instance']}")
-    heading = ", ".join(name for name in names if name != NOT_USED)
+    heading = f"{trial_name(about, several)}, {about['scenario']} {about['instance']}"
     return f"{heading}\nt = {snapshot.time_s:g} s; outcome: {about['outcome'].replace('_', ' ')}"
 
 
-def _told(snapshots: Sequence[Snapshot]) -> list[str]:
-    """Labels that titles need beside planner and risk to tell the panels apart."""
+def _several(snapshots: Sequence[Snapshot]) -> list[str]:
+    """Labels beside planner and risk that differ among snapshots."""
     values = {name: {snapshot.about[name] for snapshot in snapshots} for name in ("model", "world")}
     return [name for name, labels in values.items() if len(labels - {NOT_USED}) > 1]
 
