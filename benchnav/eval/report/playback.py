@@ -75,7 +75,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 
     stream = rr.RecordingStream(APPLICATION, recording_id=_plain(path.stem))
     with replacing(path) as partial:
-        stream.save(partial, default_blueprint=_blueprint(recording))
+        stream.save(partial, default_blueprint=arrange(recording))
         try:
             stream.send_recording_name(recording.title)
             _log_terrain(stream, recording)
@@ -113,7 +113,8 @@ def read_path(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return when[order], np.asarray(positions, dtype=np.float32)[order]
 
 
-def _blueprint(recording: Recording):  # type: ignore[no-untyped-def]
+def arrange(recording: Recording):  # type: ignore[no-untyped-def]
+    """Arranges the views of a recording, as a blueprint of Rerun's."""
     import rerun.blueprint as rrb
 
     layers = {"Colour": ["/map/colour", "/map/soft/**"], "Traversability the planner is given": ["/map/risk"]}
