@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,13 +11,15 @@ from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.report.drawn_plan import DrawnPlan, drawing_interval, drawn_plan
 from benchnav.eval.report.playback import playback_path, write_playback
 from benchnav.eval.report.recording import Recording
-from benchnav.eval.run.episode import build, one_thread, simulate
+from benchnav.eval.run.episode import build, one_thread, read_block, simulate
 from benchnav.eval.run.folder import STEPS, open_run, read_table
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.unit import Unit, units
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.simulation import Simulation
+from benchnav.terrain import Terrain
 
 
 class Recorder:
@@ -25,11 +28,13 @@ class Recorder:
     Args:
         unit: what is run.
         problem: the unit's.
+        simulation: the unit's; of it the λ that stays what it is.
+        terrain: the unit's true maps; of them the soft ground.
     """
 
-    def __init__(self, unit: Unit, problem: Problem) -> None:
+    def __init__(self, unit: Unit, problem: Problem, simulation: Simulation, terrain: Terrain) -> None:
         """Begins with nothing."""
-        self.unit, self.problem = unit, problem
+        self.unit, self.problem, self.simulation, self.terrain = unit, problem, simulation, terrain
         self.every = drawing_interval(problem.dt_s)
         self._plans: list[list[DrawnPlan]] = [[] for _ in range(unit.recorded)]
 
@@ -61,6 +66,7 @@ class Recorder:
             elevation_m=problem.elevation_m[member].cpu().numpy(),
             predicted=problem.risk_map[member].cpu().numpy(),
             free=problem.free[member].cpu().numpy(),
+            **self._ground(member),
             goal_m=problem.goal_m[member].cpu().numpy(),
             dt_s=problem.dt_s,
             action_names=problem.robot.action_names,
@@ -69,6 +75,18 @@ class Recorder:
             traversability=episodes.traversability[member, :steps].cpu().numpy(),
             plans=self._plans[member],
         )
+
+    def _ground(self, member: int) -> dict[str, Any]:
+        """What the ground is like, of which planners are told nothing."""
+        soft = (self.terrain.truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy()
+        ground = {"field": None, "soft": soft, "holding": np.zeros_like(soft)}
+        immobile = self.unit.trial.world.immobile
+        if self.simulation.field is not None:
+            field = self.simulation.field[member].cpu()
+            ground["field"] = field.numpy()
+            if immobile is not None:
+                ground["holding"] = (field < immobile.below).numpy()
+        return ground
 
 
 def record_episode(
@@ -96,8 +114,9 @@ def record_episode(
     known = known[(known["trial"] == unit.trial.id) & (known["seed"] == unit.seed)]
     known = known[(known["realisation"] == realisation) & (known["instance"] == instance)]
     with one_thread():
-        problem, simulation = build(unit, open_run(folder).about["run_id"])
-        recorder = Recorder(unit, problem)
+        run_id = open_run(folder).about["run_id"]
+        problem, simulation = build(unit, run_id)
+        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id).terrain)
         episodes, _ = simulate(unit, problem, simulation, recorder.watch, recorder.every)
     track = episodes.states[member, : int(episodes.steps[member]) + 1, :2].numpy()
     if not np.array_equal(known[["x_m", "y_m"]].to_numpy(np.float32), track):

@@ -105,7 +105,7 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
             rows = error_rows(unit, time_budgets(unit, run_id), str(error))
             write_unit(folder, unit, rows, [], about)
             return
-        recorder = Recorder(unit, problem)
+        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id).terrain)
         watch = recorder.watch if unit.recorded else None
         episodes, compiled = simulate(unit, problem, simulation, watch, recorder.every, planner_limit_s)
         recorder.write(episodes, folder)

@@ -1,11 +1,12 @@
 """Recordings of episodes for the Rerun viewer.
 
-A recording holds the terrain as a mesh, colour and risk maps, the robot at every step, the path
-driven so far coloured by the λ met, what the planner was thinking, and time series; and a blueprint
-that arranges them.
+A recording holds the terrain as a mesh, colour and risk maps, λ as it was where it stayed so, the robot
+at every step, the path driven so far coloured by the λ met, what the planner was thinking, where the robot
+was immobilised, and time series; and a blueprint that arranges them.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -13,6 +14,7 @@ import numpy as np
 
 from benchnav.eval.report.drawn_plan import STYLES, DrawnPlan, drawing_interval
 from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
+from benchnav.eval.report.ground import SOFT, field_colours, hatching, immobilised_at, outline
 from benchnav.eval.report.recording import Recording, take_snapshot
 from benchnav.files import replacing
 from benchnav.terrain import Grid
@@ -22,6 +24,13 @@ TIMELINE = "time"
 
 _LIFT_M = 0.12
 _RADIUS_M, _RADIUS_PIXELS = 0.02, 0.06
+# What keeps long episodes of planners with many thoughts within 3 MB: plans drawn until a new piece of the
+# driven path is begun, and points of a layer of a plan.
+_PIECE, _MOST_POINTS = 20, 256
+# An X in one stroke, and its half width.
+_CROSS = np.array([(-1, -1), (1, 1), (0, 0), (-1, 1), (1, -1)], dtype=np.float32)
+_CROSS_M = 1.0
+_MARK, _EDGE, _HELD = (255, 255, 255), (0, 0, 0), "immobilised"
 
 
 def playback_path(folder: Path, stem: str, suffix: str = ".rrd") -> Path:
@@ -66,7 +75,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 
     stream = rr.RecordingStream(APPLICATION, recording_id=_plain(path.stem))
     with replacing(path) as partial:
-        stream.save(partial, default_blueprint=_blueprint(recording))
+        stream.save(partial, default_blueprint=arrange(recording))
         try:
             stream.send_recording_name(recording.title)
             _log_terrain(stream, recording)
@@ -74,6 +83,7 @@ def write_recording(recording: Recording, path: Path) -> None:
             _log_driven(stream, recording)
             for plan in recording.own_plans:
                 _log_plan(stream, recording, plan)
+            _log_immobilised(stream, recording)
             stream.flush()
         finally:
             stream.disconnect()
@@ -103,12 +113,16 @@ def read_path(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return when[order], np.asarray(positions, dtype=np.float32)[order]
 
 
-def _blueprint(recording: Recording):  # type: ignore[no-untyped-def]
+def arrange(recording: Recording):  # type: ignore[no-untyped-def]
+    """Arranges the views of a recording, as a blueprint of Rerun's."""
     import rerun.blueprint as rrb
 
+    layers = {"Colour": ["/map/colour", "/map/soft/**"], "Traversability the planner is given": ["/map/risk"]}
+    if recording.field is not None:
+        layers["Traversability as it is"] = ["/map/field"]
     flat = [
-        rrb.Spatial2DView(name=name, origin="/map", contents=[f"/map/{layer}", "/map/overlay/**"])
-        for layer, name in (("colour", "Colour"), ("risk", "Traversability the planner is given"))
+        rrb.Spatial2DView(name=name, origin="/map", contents=[*shown, "/map/overlay/**"])
+        for name, shown in layers.items()
     ]
     series = [
         rrb.TimeSeriesView(
@@ -125,7 +139,7 @@ def _blueprint(recording: Recording):  # type: ignore[no-untyped-def]
                 row_shares=[3, 1],
             ),
             rrb.Vertical(*flat),
-            column_shares=[2, 1],
+            column_shares=[len(flat), 1],
         ),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
         rrb.SelectionPanel(state="hidden"),
@@ -163,6 +177,14 @@ def _log_terrain(stream, recording: Recording) -> None:  # type: ignore[no-untyp
     shades = matplotlib.colormaps[TRAVERSABILITY_COLOURS](recording.predicted[::-1])[..., :3]
     shades[~recording.free[::-1]] = 0.25
     stream.log("map/risk", rr.Image(np.round(255 * shades).astype(np.uint8)), static=True)
+    if recording.field is not None:
+        field = field_colours(recording.field, recording.holding)
+        stream.log("map/field", rr.Image(field[::-1]), static=True)
+    if recording.soft.any():
+        for name, lines in (("outline", outline), ("hatching", hatching)):
+            drawn = lines(recording.soft, grid.resolution_m)
+            flat = _flat(grid, drawn.reshape(-1, 2)).reshape(-1, 2, 2)
+            stream.log(f"map/soft/{name}", rr.LineStrips2D(flat, colors=[SOFT], radii=0.06), static=True)
     for name, position, colour in (
         ("start", recording.states[0, :2], (230, 30, 30)),
         ("goal", recording.goal_m, (255, 0, 255)),
@@ -218,15 +240,19 @@ def _log_driven(stream, recording: Recording) -> None:  # type: ignore[no-untype
     shades = matplotlib.colormaps[TRAVERSABILITY_COLOURS](recording.traversability)[:, :3]
     colours = np.round(255 * shades).astype(np.uint8)
     count, every = len(recording.traversability), drawing_interval(recording.dt_s)
-    for step in [*range(every, count, every), count]:
-        stream.set_time(TIMELINE, duration=step * recording.dt_s)
-        for name, points, kind in (
-            ("world", lifted, rr.LineStrips3D),
-            ("map/overlay", flat, rr.LineStrips2D),
-        ):
-            segments = np.stack((points[:step], points[1 : step + 1]), axis=1)
-            radius = 0.08 if name == "world" else 0.25
-            stream.log(f"{name}/driven", kind(segments, colors=colours[:step], radii=radius))
+    # Piece by piece, since each time all of a piece is logged.
+    for piece, first in enumerate(range(0, count, _PIECE * every)):
+        last = min(first + _PIECE * every, count)
+        for step in [*range(first + every, last, every), last]:
+            stream.set_time(TIMELINE, duration=step * recording.dt_s)
+            for name, points, kind, radius in (
+                ("world", lifted, rr.LineStrips3D, 0.08),
+                ("map/overlay", flat, rr.LineStrips2D, 0.25),
+            ):
+                segments = np.stack((points[first:step], points[first + 1 : step + 1]), axis=1)
+                stream.log(
+                    f"{name}/driven/{piece:03}", kind(segments, colors=colours[first:step], radii=radius)
+                )
 
 
 def _log_plan(stream, recording: Recording, plan: DrawnPlan) -> None:  # type: ignore[no-untyped-def]
@@ -234,13 +260,42 @@ def _log_plan(stream, recording: Recording, plan: DrawnPlan) -> None:  # type: i
 
     stream.set_time(TIMELINE, duration=plan.step * recording.dt_s)
     for name, style in STYLES.items():
-        lines, colours = plan.lines.get(name, ()), [style.colour]
+        lines, colours = _thinned(plan.lines.get(name, ())), [style.colour]
         lifted = [_lift(recording, line) for line in lines]
         flat = [_flat(recording.grid, line) for line in lines]
         thick, thick_flat = _RADIUS_M * style.width, _RADIUS_PIXELS * style.width
         # A layer without lines is logged too: it wipes out the earlier plan's.
         stream.log(f"world/plan/{name}", rr.LineStrips3D(lifted, colors=colours, radii=thick))
         stream.log(f"map/overlay/plan/{name}", rr.LineStrips2D(flat, colors=colours, radii=thick_flat))
+
+
+def _thinned(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Leaves out points within lines, alike in all of them, where a layer has too many."""
+    points = sum(len(line) for line in lines)
+    every = -(-points // _MOST_POINTS)
+    return [np.concatenate((line[:-1:every], line[-1:])) for line in lines]
+
+
+def _log_immobilised(stream, recording: Recording) -> None:  # type: ignore[no-untyped-def]
+    """Marks where the robot was held, from that moment on."""
+    import rerun as rr
+
+    place = immobilised_at(recording.about, recording.states[:, :2])
+    if place is None:
+        return
+    stream.set_time(TIMELINE, duration=len(recording.traversability) * recording.dt_s)
+    cross = place + _CROSS_M * _CROSS
+    flat, lifted = _flat(recording.grid, cross), _lift(recording, cross)
+    lifted[:, 2] += 0.3
+    for name, mark in (
+        ("world/immobilised", rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12, labels=[_HELD])),
+        ("map/overlay/immobilised/edge", rr.LineStrips2D([flat], colors=[_EDGE], radii=0.55, draw_order=40)),
+        (
+            "map/overlay/immobilised/cross",
+            rr.LineStrips2D([flat], colors=[_MARK], radii=0.3, draw_order=41, labels=[_HELD]),
+        ),
+    ):
+        stream.log(name, mark)
 
 
 def _cells(grid: Grid, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

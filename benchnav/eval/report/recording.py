@@ -24,6 +24,9 @@ class Recording:
         elevation_m: shape [H, W].
         predicted: λ̂, the map the planner was given, shape [H, W].
         free: S_free, bool, shape [H, W].
+        field: λ as it was through the episode, shape [H, W]; None where it was resampled.
+        soft: ground with soft spots that do not show, bool, shape [H, W].
+        holding: cells of the field that hold a robot for good, bool, shape [H, W].
         goal_m: (x, y).
         dt_s: time step.
         action_names: what each action is, with its unit, A of them.
@@ -39,6 +42,9 @@ class Recording:
     elevation_m: np.ndarray
     predicted: np.ndarray
     free: np.ndarray
+    field: np.ndarray | None
+    soft: np.ndarray
+    holding: np.ndarray
     goal_m: np.ndarray
     dt_s: float
     action_names: tuple[str, ...]
@@ -74,6 +80,9 @@ def take_snapshot(recording: Recording, time_s: float = SNAPSHOT_S) -> Snapshot:
         rgb=recording.rgb,
         predicted=recording.predicted,
         free=recording.free,
+        field=recording.field,
+        soft=recording.soft,
+        holding=recording.holding,
         extent_m=np.array(recording.grid.extent_m),
         goal_m=recording.goal_m,
         dt_s=recording.dt_s,

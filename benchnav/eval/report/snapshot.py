@@ -21,6 +21,7 @@ from benchnav.files import replacing
 SNAPSHOT_S = 15.0
 
 _ARRAYS = ("rgb", "predicted", "free", "extent_m", "goal_m", "track", "traversability")
+_GROUND = ("field", "soft", "holding")
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 _POINTS, _SIZES = "points_", "sizes_"
 
@@ -34,6 +35,9 @@ class Snapshot:
         rgb: uint8, shape [3, H, W].
         predicted: λ̂, the map the planner was given, shape [H, W].
         free: S_free, bool, shape [H, W].
+        field: λ as it was through the episode, shape [H, W]; None where it was resampled.
+        soft: ground with soft spots that do not show, bool, shape [H, W].
+        holding: cells of the field that hold a robot for good, bool, shape [H, W].
         extent_m: size of the map along x and y, shape [2].
         goal_m: (x, y).
         dt_s: time step.
@@ -46,6 +50,9 @@ class Snapshot:
     rgb: np.ndarray
     predicted: np.ndarray
     free: np.ndarray
+    field: np.ndarray | None
+    soft: np.ndarray
+    holding: np.ndarray
     extent_m: np.ndarray
     goal_m: np.ndarray
     dt_s: float
@@ -69,7 +76,9 @@ class Snapshot:
         Args:
             path: an `.npz` file.
         """
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        arrays = {name: getattr(self, name) for name in (*_ARRAYS, *_GROUND)}
+        if self.field is None:
+            del arrays["field"]
         for name, lines in self.plan.lines.items():
             arrays[_POINTS + name] = np.concatenate([np.empty((0, 2), np.float32), *lines])
             arrays[_SIZES + name] = np.array([len(line) for line in lines], dtype=np.int64)
@@ -80,7 +89,7 @@ class Snapshot:
 
     @classmethod
     def load(cls, path: Path) -> "Snapshot":
-        """Reads what `save` wrote.
+        """Reads what `save` wrote; of the ground, earlier versions wrote nothing, which reads as none.
 
         Raises:
             ConfigError: the file is damaged.
@@ -89,13 +98,16 @@ class Snapshot:
             with np.load(path, allow_pickle=False) as stored:
                 scalars = json.loads(str(stored["scalars"]))
                 arrays = {name: stored[name] for name in _ARRAYS}
+                ground = {name: stored[name] for name in _GROUND if name in stored}
                 lines = {
                     name: _cut(stored[_POINTS + name], stored[_SIZES + name]) for name in scalars["layers"]
                 }
         except _DAMAGE as error:
             raise ConfigError(f"{path} is damaged: {error}. Remove it, or run the suite again.") from error
         plan = DrawnPlan(step=scalars["step"], lines=lines)
-        return cls(about=scalars["about"], dt_s=scalars["dt_s"], plan=plan, **arrays)
+        none = np.zeros_like(arrays["free"])
+        ground = {"field": None, "soft": none, "holding": none} | ground
+        return cls(about=scalars["about"], dt_s=scalars["dt_s"], plan=plan, **arrays, **ground)
 
 
 def _cut(points: np.ndarray, sizes: np.ndarray) -> list[np.ndarray]:

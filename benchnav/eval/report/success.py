@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.figures import display_name
+from benchnav.eval.report.figures import trial_name
 from benchnav.eval.report.tables import NOT_USED
 
 _PANEL = ("data", "scenario", "world", "robot", "objective")
@@ -43,7 +43,11 @@ def success_figure(summary: pd.DataFrame) -> Figure:
     for panel in axes[max(len(panels) - across, 0) : len(panels)]:
         panel.tick_params(labelbottom=True)
     places = list(settings.values())
-    names = [_name(setting, several_models=models > 1) for setting in settings]
+    several = ["model"] if models > 1 else []
+    names = [
+        trial_name(dict(zip(("planner", "model", "risk"), setting, strict=True)), several)
+        for setting in settings
+    ]
     axes[0].set_yticks(places, names)
     axes[0].set_ylim(max(places) + 0.7, min(places) - 0.7)
     axes[0].set_xlim(-3, 103)
@@ -65,7 +69,7 @@ def _draw(
     for row in rows.to_dict("records"):
         setting = (row["planner"], row["model"], row["risk"])
         rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
-        blind = row["model"] == NOT_USED
+        blind = row["model"] == NOT_USED  # The clairvoyant has a model, and no risk.
         colour = "0.45" if blind else palette(planners.index(row["planner"]) % 10)
         place = settings[setting]
         panel.plot([low, high], [place, place], color=colour, lw=1.4, solid_capstyle="butt")
@@ -77,9 +81,3 @@ def _draw(
     panel.set_axisbelow(True)
     panel.set_xticks(np.arange(0, 101, 25))
     panel.tick_params(axis="y", length=0, labelsize=8)
-
-
-def _name(setting: tuple[str, str, str], several_models: bool) -> str:
-    planner, model, risk = setting
-    words = [display_name(planner), model if several_models else NOT_USED, risk]
-    return ", ".join(word for word in words if word != NOT_USED)

@@ -13,7 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from benchnav.eval.report.drawn_plan import STYLES, LayerStyle
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, display_name
+from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, trial_name
+from benchnav.eval.report.ground import HOLDING, SOFT, field_colours, hatching, immobilised_at, outline
 from benchnav.eval.report.snapshot import Snapshot
 from benchnav.eval.report.tables import NOT_USED
 
@@ -21,6 +22,9 @@ MOST_PANELS = 8
 _PANELS_A_LINE = 4
 _LINE_WIDTH = 0.6
 _CLOSED = "0.25"
+_MARKS = {"start": ("o", "red", 8.0), "goal": ("X", "magenta", 10.0), "robot": ("o", "black", 7.0)}
+_IMMOBILISED: dict[str, Any] = {"marker": "X", "color": "black", "mec": "white", "ms": 13.0, "ls": "none"}
+_SOFT_WIDTH = 0.5
 _MAP = ("data", "scenario", "instance", "seed", "realisation")
 
 
@@ -45,11 +49,14 @@ def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapsho
 def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
     """Draws snapshots side by side: the terrain above with what was planned, the map planned on below.
 
+    Where λ stayed what it was through an episode, a third row shows it, with the whole driven path.
+
     Args:
         snapshots: at least one.
     """
     across = min(len(snapshots), _PANELS_A_LINE)
-    down = 2 * -(-len(snapshots) // across)
+    layers = 2 if all(snapshot.field is None for snapshot in snapshots) else 3
+    down = layers * -(-len(snapshots) // across)
     tallest = max(float(snapshot.extent_m[1] / snapshot.extent_m[0]) for snapshot in snapshots)
     size = (3.5 * across + 1.0, (3.2 * min(max(tallest, 0.3), 3.0) + 0.7) * down + 0.7)
     figure = Figure(figsize=size, layout="compressed")
@@ -57,12 +64,17 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
     for panel in panels.flat:
         panel.set_visible(False)
     for place, snapshot in enumerate(snapshots):
-        above, below = panels[2 * (place // across) : 2 * (place // across) + 2, place % across]
+        first = layers * (place // across)
+        above, below, *last = panels[first : first + layers, place % across]
         _draw_terrain(above, snapshot)
         _draw_predicted(below, snapshot)
         for panel in (above, below):
-            lines = _draw_episode(panel, snapshot)
-        above.set_title(_title(snapshot), fontsize=9)
+            _draw_plan(panel, snapshot)
+            lines = _draw_driven(panel, snapshot)
+            _draw_marks(panel, snapshot, snapshot.track[snapshot.now])
+        if snapshot.field is not None:
+            _draw_field(last[0], snapshot, snapshot.field)
+        above.set_title(_title(snapshot, _several(snapshots)), fontsize=9)
     figure.legend(
         handles=_legend(snapshots), loc="outside lower center", ncols=4 if across > 1 else 2, frameon=False
     )
@@ -70,15 +82,25 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
     return figure
 
 
-def _title(snapshot: Snapshot) -> str:
+def _title(snapshot: Snapshot, several: Sequence[str]) -> str:
     about = snapshot.about
-    names = [display_name(about["planner"]), about["risk"], f"{about['scenario']} {about['instance']}"]
-    heading = ", ".join(name for name in names if name != NOT_USED)
+    heading = f"{trial_name(about, several)}, {about['scenario']} {about['instance']}"
     return f"{heading}\nt = {snapshot.time_s:g} s; outcome: {about['outcome'].replace('_', ' ')}"
+
+
+def _several(snapshots: Sequence[Snapshot]) -> list[str]:
+    """Labels beside planner and risk that differ among snapshots."""
+    values = {name: {snapshot.about[name] for snapshot in snapshots} for name in ("model", "world")}
+    return [name for name, labels in values.items() if len(labels - {NOT_USED}) > 1]
 
 
 def _draw_terrain(panel: Axes, snapshot: Snapshot) -> None:
     panel.imshow(np.moveaxis(snapshot.rgb, 0, -1), origin="lower", extent=_extent(snapshot))
+    if snapshot.field is not None:
+        resolution_m = float(snapshot.extent_m[0]) / snapshot.soft.shape[1]
+        for lines in (outline, hatching):
+            drawn = list(lines(snapshot.soft, resolution_m))
+            panel.add_collection(LineCollection(drawn, colors=[_unit(SOFT)], linewidths=_SOFT_WIDTH))
 
 
 def _draw_predicted(panel: Axes, snapshot: Snapshot) -> None:
@@ -94,10 +116,13 @@ def _extent(snapshot: Snapshot) -> tuple[float, float, float, float]:
     return 0, float(snapshot.extent_m[0]), 0, float(snapshot.extent_m[1])
 
 
-def _draw_episode(panel: Axes, snapshot: Snapshot) -> LineCollection:
-    panel.set_visible(True)
+def _draw_plan(panel: Axes, snapshot: Snapshot) -> None:
     for name, style in STYLES.items():
         panel.add_collection(LineCollection(list(snapshot.plan.lines.get(name, ())), **_looks(style)))
+
+
+def _draw_driven(panel: Axes, snapshot: Snapshot) -> LineCollection:
+    """Draws the path driven by that moment, coloured by the λ met."""
     driven = snapshot.track[: snapshot.now + 1]
     segments = np.stack((driven[:-1], driven[1:]), axis=1)
     lines = LineCollection(list(segments), cmap=TRAVERSABILITY_COLOURS, linewidths=3, capstyle="round")
@@ -107,21 +132,33 @@ def _draw_episode(panel: Axes, snapshot: Snapshot) -> LineCollection:
     panel.plot(*driven.T, color="white", lw=4.6, solid_capstyle="round")
     panel.add_collection(lines)
     lines.set_zorder(2.5)
-    for marker, colour, size, place in _marks(snapshot):
+    return lines
+
+
+def _draw_field(panel: Axes, snapshot: Snapshot, field: np.ndarray) -> None:
+    """Draws λ as it was, and the whole driven path over it."""
+    panel.imshow(field_colours(field, snapshot.holding), origin="lower", extent=_extent(snapshot))
+    # In one colour, since the λ met is that of the map.
+    for colour, width in (("white", 4.0), ("black", 2.2)):
+        panel.plot(*snapshot.track.T, color=colour, lw=width, solid_capstyle="round")
+    _draw_marks(panel, snapshot, snapshot.track[-1])
+    held = immobilised_at(snapshot.about, snapshot.track)
+    if held is not None:
+        panel.plot(*held, **_IMMOBILISED, zorder=3.5)
+    end_s = len(snapshot.traversability) * snapshot.dt_s
+    panel.set_title(f"driven to the end ({end_s:g} s), on λ as it was", fontsize=9)
+
+
+def _draw_marks(panel: Axes, snapshot: Snapshot, robot: np.ndarray) -> None:
+    """Draws start, goal and robot, and the axes of the map."""
+    panel.set_visible(True)
+    places = (snapshot.track[0], snapshot.goal_m, robot)
+    for (marker, colour, size), place in zip(_MARKS.values(), places, strict=True):
         panel.plot(*place, marker, color=colour, mec="white", ms=size, zorder=3)
     panel.set(xlim=(0, snapshot.extent_m[0]), ylim=(0, snapshot.extent_m[1]), aspect="equal")
     panel.tick_params(labelsize=8)
     panel.set_xlabel("x [m]", fontsize=8)
     panel.set_ylabel("y [m]", fontsize=8)
-    return lines
-
-
-def _marks(snapshot: Snapshot) -> list[tuple[str, str, float, np.ndarray]]:
-    places = (snapshot.track[0], snapshot.goal_m, snapshot.track[snapshot.now])
-    return [(*look, place) for look, place in zip(_MARKS.values(), places, strict=True)]
-
-
-_MARKS = {"start": ("o", "red", 8.0), "goal": ("X", "magenta", 10.0), "robot": ("o", "black", 7.0)}
 
 
 def _looks(style: LayerStyle) -> dict[str, Any]:
@@ -147,4 +184,22 @@ def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
         for name, style in STYLES.items()
         if name in drawn
     ]  # fmt: skip
-    return [*marks, Patch(color=_CLOSED, label="not free"), *lines]
+    return [*marks, *_ground_legend(snapshots), *lines]
+
+
+def _ground_legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
+    """Names what is drawn of the ground."""
+    known = [snapshot for snapshot in snapshots if snapshot.field is not None]
+    entries: list[Artist] = [Patch(color=_CLOSED, label="not free")]
+    if any(snapshot.soft.any() for snapshot in known):
+        entries.append(Patch(fc="0.45", ec=_unit(SOFT), hatch="////", label="soft ground"))
+    if any(snapshot.holding.any() for snapshot in known):
+        entries.append(Patch(color=_unit(HOLDING), label="holds a robot"))
+    if any(immobilised_at(snapshot.about, snapshot.track) is not None for snapshot in known):
+        entries.append(Line2D([], [], **_IMMOBILISED, label="immobilised"))
+    return entries
+
+
+def _unit(colour: tuple[int, int, int]) -> tuple[float, float, float]:
+    red, green, blue = colour
+    return red / 255, green / 255, blue / 255

@@ -26,6 +26,7 @@ _LEGEND = (
 )
 _SUCCESS = "Success rates with their 95 % intervals; grey: planners that look at nothing predicted."
 _TRAJECTORIES = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
+_TO_THE_END = "Below, the whole driven path on λ as it was."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +104,10 @@ def _trajectories(folder: Path, summary: pd.DataFrame) -> dict[str, str]:
     if not chosen:
         return {}
     save(trajectory_figure(chosen), folder / "figures" / "trajectories.png")
-    return {"trajectories": f"{_TRAJECTORIES} {len(chosen)} of {len(recorded)} recorded episodes."}
+    words = [_TRAJECTORIES, f"{len(chosen)} of {len(recorded)} recorded episodes."]
+    if any(snapshot.field is not None for snapshot in chosen):
+        words.insert(1, _TO_THE_END)
+    return {"trajectories": " ".join(words)}
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:

@@ -73,13 +73,23 @@ def recording(
         "about": {"trial": "t", **labels, "seed": "0", "realisation": "0", "instance": "4", "outcome": "success"},
         "grid": grid, "rgb": (255 * generator.random((3, 40, 60))).astype(np.uint8),
         "elevation_m": generator.random((40, 60)).astype(np.float32), "predicted": predicted,
-        "free": predicted > 0.3, "goal_m": np.array([24.0, 15.0], np.float32), "dt_s": dt_s,
+        "free": predicted > 0.3, "field": None, "soft": np.zeros((40, 60), bool),
+        "holding": np.zeros((40, 60), bool), "goal_m": np.array([24.0, 15.0], np.float32), "dt_s": dt_s,
         "action_names": ("speed_mps", "steering_rad"),
         "states": states, "actions": generator.random((steps, 2)).astype(np.float32),
         "traversability": generator.random(steps).astype(np.float32),
         "plans": [plan(step, states[min(step, steps)]) for step in range(0, max(steps, 1), 5)],
     }  # fmt: skip
     return Recording(**(made | changes))
+
+
+def held_recording(steps: int = 80, **changes: Any) -> Recording:
+    """An episode on λ that stays, of a robot that was immobilised; no map of it is like another's mirror."""
+    generator = np.random.default_rng(4)
+    field = generator.random((40, 60)).astype(np.float32)
+    about = {"trial": "t", **trial(world="stakes"), "seed": "0", "realisation": "0", "instance": "4"}
+    ground = {"field": field, "soft": generator.random((40, 60)) < 0.2, "holding": field < 0.15}
+    return recording(steps, **({"about": about | {"outcome": "immobilised"}} | ground | changes))
 
 
 def plan(step: int, state: np.ndarray) -> Any:

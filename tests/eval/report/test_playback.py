@@ -9,7 +9,16 @@ import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
-from benchnav.eval.report.playback import playback_path, read_path, write_playback, write_recording
+from benchnav.eval.report.drawn_plan import DrawnPlan
+from benchnav.eval.report.ground import HOLDING, field_colours, hatching, outline
+from benchnav.eval.report.playback import (
+    arrange,
+    playback_path,
+    read_path,
+    write_playback,
+    write_recording,
+)
+from benchnav.eval.report.recording import Recording
 from benchnav.eval.report.snapshot import Snapshot
 from tests.eval.report import made
 
@@ -70,6 +79,117 @@ def test_plans_are_shown_when_they_were_made(tmp_path: Path) -> None:
     for plan, shown in zip(recording.plans, strips, strict=True):
         assert len(shown) == 3  # type: ignore[arg-type]
         np.testing.assert_allclose(np.array(shown)[..., :2], np.array(plan.lines["samples"]), rtol=1e-6)
+
+
+def chunks(path: Path) -> dict[str, list[pa.RecordBatch]]:
+    """What is logged, by entity."""
+    found: dict[str, list[pa.RecordBatch]] = {}
+    for chunk in RrdReader(path).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return found
+
+
+def static(path: Path, entity: str, name: str) -> np.ndarray:
+    """The value of a component that is logged once for all times."""
+    (batch,) = chunks(path)[entity]
+    assert "time" not in batch.schema.names
+    (value,) = batch.column(next(n for n in batch.schema.names if n.endswith(name))).to_pylist()
+    return np.array(value)
+
+
+def image(path: Path, entity: str) -> np.ndarray:
+    """An image as the map has it: its first row is at the bottom."""
+    return static(path, entity, "buffer").astype(np.uint8).reshape(40, 60, 3)[::-1]
+
+
+def test_λ_as_it_was_is_shown_where_it_stayed(tmp_path: Path) -> None:
+    recording = made.held_recording()
+    write_recording(recording, tmp_path / "a.rrd")
+    verify(tmp_path / "a.rrd")
+    assert recording.field is not None
+    shown = image(tmp_path / "a.rrd", "/map/field")
+    np.testing.assert_array_equal(shown, field_colours(recording.field, recording.holding))
+    np.testing.assert_array_equal((shown == HOLDING).all(axis=-1), recording.holding)
+    write_recording(made.recording(10), tmp_path / "b.rrd")
+    assert not [e for e in chunks(tmp_path / "b.rrd") if e.startswith(("/map/field", "/map/soft"))]
+
+
+def views(recording: Recording) -> list[tuple[str, list[str]]]:
+    """Names and contents of the flat views."""
+    found = []
+    queue: list[object] = [arrange(recording).root_container]
+    while queue:
+        part = queue.pop(0)
+        queue += getattr(part, "contents", []) if hasattr(part, "row_shares") else []
+        if type(part).__name__ == "Spatial2DView":
+            found.append((part.name, part.contents))  # type: ignore[attr-defined]
+    return found
+
+
+def test_each_flat_view_shows_its_own_layer_under_what_is_driven_and_planned() -> None:
+    colour = ("Colour", ["/map/colour", "/map/soft/**", "/map/overlay/**"])
+    given = ("Traversability the planner is given", ["/map/risk", "/map/overlay/**"])
+    as_it_is = ("Traversability as it is", ["/map/field", "/map/overlay/**"])
+    assert views(made.recording(10)) == [colour, given]
+    assert views(made.held_recording()) == [colour, given, as_it_is]
+
+
+def test_soft_ground_is_marked_where_it_is(tmp_path: Path) -> None:
+    recording = made.held_recording(field=None)
+    write_recording(recording, tmp_path / "a.rrd")
+    for name, lines in (("outline", outline), ("hatching", hatching)):
+        shown = static(tmp_path / "a.rrd", f"/map/soft/{name}", "strips")
+        expected = lines(recording.soft, 0.5)
+        np.testing.assert_allclose(shown[..., 0] * 0.5, expected[..., 0], atol=1e-5)
+        np.testing.assert_allclose((40 - shown[..., 1]) * 0.5, expected[..., 1], atol=1e-5)
+
+
+def test_an_immobilised_robot_is_marked_from_that_moment_on(tmp_path: Path) -> None:
+    recording = made.held_recording(43)
+    write_recording(recording, tmp_path / "a.rrd")
+    x, y = recording.states[-1, :2]
+    flat = (x / 0.5, 40 - y / 0.5)
+    for entity, place, size in (
+        ("/world/immobilised", (x, y), 2),
+        ("/map/overlay/immobilised/cross", flat, 4),
+    ):
+        times, ((cross,),) = column(tmp_path / "a.rrd", entity, "strips")  # type: ignore[misc]
+        np.testing.assert_allclose(times, [4.3], atol=1e-6)
+        np.testing.assert_allclose(np.mean(np.array(cross)[:, :2], axis=0), place, atol=1e-4)
+        np.testing.assert_allclose(np.ptp(np.array(cross)[:, :2], axis=0), size, atol=1e-4)
+        assert column(tmp_path / "a.rrd", entity, "labels")[1] == [["immobilised"]]
+    write_recording(made.held_recording(43, about=made.recording().about), tmp_path / "b.rrd")
+    assert not [entity for entity in chunks(tmp_path / "b.rrd") if "immobilised" in entity]
+
+
+def test_the_driven_path_grows_to_the_end_and_stays(tmp_path: Path) -> None:
+    recording = made.recording(237)
+    write_recording(recording, tmp_path / "a.rrd")
+    pieces = sorted(entity for entity in chunks(tmp_path / "a.rrd") if "/overlay/driven/" in entity)
+    assert len(pieces) > 1
+    for time_s in (0.4, 0.5, 9.99, 10.0, 10.5, 23.7):
+        shown: list[object] = []
+        for entity in pieces:
+            times, strips = column(tmp_path / "a.rrd", entity, "strips")
+            known = [strip for when, strip in zip(times, strips, strict=True) if when < time_s + 1e-6]
+            shown += known[-1] if known else []  # type: ignore[arg-type]
+        # A plan is drawn twice a second, and with it what was driven by then.
+        steps = 237 if time_s == 23.7 else 5 * int(time_s / 0.5 + 1e-6)
+        assert len(shown) == steps
+        if steps:
+            ends = np.array(shown)[:, 1]
+            np.testing.assert_allclose(ends[:, 0] * 0.5, recording.states[1 : steps + 1, 0], rtol=1e-5)
+
+
+def test_a_long_recording_of_a_crowded_planner_is_small(tmp_path: Path) -> None:
+    ahead = np.cumsum(np.random.default_rng(1).random((100, 51, 2)), axis=1).astype(np.float32) / 10
+    plans = [DrawnPlan(step=step, lines={"samples": list(ahead)}) for step in range(0, 1200, 5)]
+    write_recording(made.held_recording(1200, plans=plans), tmp_path / "a.rrd")
+    assert (tmp_path / "a.rrd").stat().st_size < 3e6
+    _, strips = column(tmp_path / "a.rrd", "/map/overlay/plan/samples", "strips")
+    for line, shown in zip(ahead, strips[0], strict=True):  # type: ignore[call-overload]
+        ends = np.array(shown)[[0, -1]]
+        np.testing.assert_allclose(ends[:, 0] * 0.5, line[[0, -1], 0], rtol=1e-5)
 
 
 def test_an_episode_that_ended_at_once_can_be_played(tmp_path: Path) -> None:

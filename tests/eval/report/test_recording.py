@@ -26,6 +26,14 @@ def test_a_snapshot_is_of_the_last_plan_by_its_time(
     np.testing.assert_array_equal(snapshot.extent_m, [30, 20])
 
 
+def test_a_snapshot_is_of_the_recordings_own_ground() -> None:
+    recording = made.held_recording()
+    snapshot = take_snapshot(recording)
+    for name in ("field", "soft", "holding"):
+        np.testing.assert_array_equal(getattr(snapshot, name), getattr(recording, name))
+    assert take_snapshot(made.recording()).field is None
+
+
 def test_fifteen_seconds_is_the_moment() -> None:
     assert take_snapshot(made.recording(400, 0.1)).time_s == pytest.approx(15)
 

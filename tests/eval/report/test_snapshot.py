@@ -10,7 +10,9 @@ from benchnav.eval.report.snapshot import Snapshot
 from tests.eval.report import made
 
 
-@pytest.mark.parametrize("recording", [made.recording(200), made.recording(0), made.recording(0, plans=())])
+@pytest.mark.parametrize(
+    "recording", [made.recording(200), made.recording(0), made.recording(0, plans=()), made.held_recording()]
+)
 def test_a_snapshot_comes_back_as_it_was(recording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     snapshot = take_snapshot(recording)
     snapshot.save(tmp_path / "there" / "a.npz")
@@ -29,6 +31,20 @@ def test_a_snapshot_comes_back_as_it_was(recording, tmp_path: Path) -> None:  # 
         for before, after in zip(lines, again.plan.lines[name], strict=True):
             np.testing.assert_array_equal(after, before)
     assert [path.name for path in (tmp_path / "there").iterdir()] == ["a.npz"]
+
+
+def test_what_earlier_versions_wrote_reads_as_no_ground(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    take_snapshot(made.held_recording()).save(path)
+    with np.load(path) as stored:
+        earlier = {name: stored[name] for name in stored if name not in ("field", "soft", "holding")}
+        assert len(earlier) == len(stored.files) - 3
+    np.savez_compressed(path, **earlier)
+    snapshot = Snapshot.load(path)
+    assert snapshot.field is None
+    for region in (snapshot.soft, snapshot.holding):
+        assert (region.dtype, region.shape) == (bool, (40, 60))
+        assert not region.any()
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

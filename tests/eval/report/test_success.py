@@ -3,6 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from benchnav.eval.report.success import success_figure
@@ -90,6 +91,19 @@ def test_models_and_worlds_are_told_apart() -> None:
     assert points(first) == {"MPPI, a, cvar": 0, "MPPI, b, cvar": 20}
     expected = {"MPPI, a, cvar": 10, "MPPI, b, cvar": 30}
     assert dict(zip(points(first), points_by_height(second), strict=True)) == expected
+
+
+def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_blind() -> None:
+    told = made.trial("astar_dwa", "–", model="clairvoyant")
+    for others in ((), (made.trial("astar_dwa", model="oracle"),)):
+        labels = [made.trial(**BLIND), told, *others]
+        (panel,) = panels(success_figure(summarise(made.rows(*(shares(one, 5) for one in labels)))))
+        named = [label.get_text() for label in panel.get_yticklabels()]
+        assert named == ["straight", "A* + DWA, clairvoyant", "A* + DWA, oracle, cvar"][: len(labels)]
+        marked = [line for line in panel.lines if line.get_marker() == "o"]
+        grey = [len(set(to_rgb(line.get_color()))) == 1 for line in marked]
+        assert grey == [True, False, False][: len(labels)]
+        assert len([line for line in panel.lines if line.get_linestyle() == "--"]) == 1
 
 
 def points_by_height(panel: Axes) -> list[float]:

@@ -1,10 +1,13 @@
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from benchnav.eval.report.figures import save
+from benchnav.eval.report.ground import field_colours, hatching, outline
 from benchnav.eval.report.recording import take_snapshot
 from benchnav.eval.report.snapshot import Snapshot
 from benchnav.eval.report.trajectories import MOST_PANELS, choose, trajectory_figure
@@ -66,9 +69,114 @@ def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     np.testing.assert_array_equal(np.isfinite(np.ma.filled(closed, np.nan)), ~taken.free)
 
 
+def held(world: str = "stakes", **changes: Any) -> Snapshot:
+    recording = made.held_recording(170)
+    changes = {"about": recording.about | {"world": world}} | changes
+    return take_snapshot(replace(recording, **changes))
+
+
+def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended() -> None:
+    taken = held()
+    above, below, last = shown(trajectory_figure([taken]))
+    assert taken.field is not None
+    (drawn,) = (image.get_array() for image in last.get_images())
+    np.testing.assert_array_equal(drawn, field_colours(taken.field, taken.holding))
+    assert last.get_images()[0].origin == "lower"
+    paths = [line for line in last.lines if len(line.get_xdata()) > 1]
+    assert paths
+    for line in paths:
+        np.testing.assert_array_equal(np.stack(line.get_data(), axis=1), taken.track)
+    marks = {
+        (line.get_marker(), line.get_color()): tuple(np.ravel(line.get_data()))
+        for line in last.lines
+        if line.get_marker() != "None"
+    }
+    assert marks["X", "black"] == marks["o", "black"] == tuple(taken.track[-1])
+    assert marks["o", "red"] == tuple(taken.track[0])
+    assert marks["X", "magenta"] == tuple(taken.goal_m)
+    assert last.get_title() == "driven to the end (17 s), on λ as it was"
+    # Where it was by the moment of the plan is told by the panels above.
+    for panel in (above, below):
+        assert not [line for line in panel.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
+        assert max(len(line.get_xdata()) for line in panel.lines) == 151
+
+
+def test_soft_ground_is_marked_on_the_terrain_alone() -> None:
+    taken = held()
+    above, below, last = shown(trajectory_figure([taken]))
+    drawn = [
+        {path.vertices.tobytes() for c in p.collections for path in c.get_paths()}
+        for p in (above, below, last)
+    ]
+    for lines in (outline, hatching):
+        wanted = {line.astype(float).tobytes() for line in lines(taken.soft, 0.5)}
+        assert wanted <= drawn[0]
+        assert not wanted & (drawn[1] | drawn[2])
+
+
+def test_a_robot_that_was_not_held_has_no_mark_of_it() -> None:
+    taken = held(about=made.recording().about)
+    *_, last = shown(figure := trajectory_figure([taken]))
+    assert not [line for line in last.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
+    assert "immobilised" not in names_in_legend(figure)
+
+
+def test_only_panels_whose_λ_stayed_have_a_third() -> None:
+    figure = trajectory_figure([snapshot(), held(), snapshot(), snapshot(), held()])
+    titles = [axes.get_title() for axes in shown(figure)]
+    assert len(titles) == 5 * 2 + 2
+    assert sum("as it was" in title for title in titles) == 2
+    figure.draw_without_rendering()
+    columns = [
+        axes.get_subplotspec().colspan.start for axes in shown(figure) if "as it was" in axes.get_title()
+    ]
+    assert columns == [1, 0]
+
+
+def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
+    taken = held(field=None)
+    bare = replace(taken, soft=np.zeros_like(taken.soft), holding=np.zeros_like(taken.holding))
+    with_ground, without = (trajectory_figure([one]) for one in (taken, bare))
+    assert names_in_legend(with_ground) == names_in_legend(without)
+    for one, other in zip(shown(with_ground), shown(without), strict=True):
+        assert len(one.collections) == len(other.collections)
+
+
+def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
+    def titles(*labels: dict[str, str]) -> list[str]:
+        figure = trajectory_figure([snapshot(**one) for one in labels])
+        return [axes.get_title().split("\n")[0] for axes in shown(figure) if axes.get_title()]
+
+    blind = {"planner": "straight", "model": "–", "risk": "–"}
+    assert titles({}, blind) == ["MPPI, cvar, std 0", "straight, std 0"]
+    told = {"model": "clairvoyant", "risk": "–"}
+    assert titles(told) == ["MPPI, clairvoyant, std 0"]
+    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, cvar, std 0", "MPPI, clairvoyant, std 0"]
+    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, cvar, std 0", "MPPI, stakes, cvar, std 0"]
+
+
+def names_in_legend(figure: Figure) -> list[str]:
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, ["not free", "soft ground", "holds a robot", "immobilised"]),
+        ({"soft": np.zeros((40, 60), bool)}, ["not free", "holds a robot", "immobilised"]),
+        ({"holding": np.zeros((40, 60), bool)}, ["not free", "soft ground", "immobilised"]),
+    ],
+)
+def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: list[str]) -> None:
+    assert names_in_legend(trajectory_figure([held(**changes)]))[3 : 3 + len(names) + 1] == [
+        *names,
+        "samples",
+    ]
+
+
 def test_the_legend_names_layers_that_are_there() -> None:
-    (legend,) = trajectory_figure([snapshot()]).legends
-    names = [text.get_text() for text in legend.get_texts()]
+    names = names_in_legend(trajectory_figure([snapshot()]))
     assert names == ["start", "goal", "robot", "not free", "samples", "reference path", "planned"]
 
 

@@ -86,7 +86,9 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
     rows = episodes()
     folder = run_folder(tmp_path / "run", rows)
     for name, group in rows.groupby("trial", sort=False):
-        labels = {label: group[label].iloc[0] for label in ("planner", "risk", "scenario", "model", "data")}
+        labels = {
+            label: group[label].iloc[0] for label in ("planner", "risk", "scenario", "model", "data", "world")
+        }
         about = {
             "trial": str(name),
             **labels,
@@ -101,6 +103,17 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
     text = (folder / "summary.md").read_text()
     assert "![trajectories](figures/trajectories.png)" in text
     assert "3 of 3 recorded episodes" in text
+    assert "λ as it was" not in text
+
+
+def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
+    rows = made.rows(made.row(made.trial(world="stakes"), 4, None, outcome="immobilised"))
+    folder = run_folder(tmp_path / "run", rows)
+    about = {**made.held_recording().about, "trial": rows["trial"][0]}
+    write_playback(folder, "a", made.held_recording(about=about))
+    write_report(folder)
+    text = (folder / "summary.md").read_text()
+    assert "Below, the whole driven path on λ as it was. 1 of 1 recorded episodes." in text
 
 
 @pytest.mark.parametrize("outcome", ["planner_error", "model_error"])
