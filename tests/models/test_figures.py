@@ -4,12 +4,14 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 from scipy.stats import binom
 
-from benchnav.datagen.latent import expected_traversability
+from benchnav.datagen.latent import SoftSpots, expected_traversability
+from benchnav.datagen.scenario import load_recipe
 from benchnav.datagen.store import TerrainDataset
 from benchnav.models.calibration import Quality, Reliability, evaluate
 from benchnav.models.figures import (
@@ -21,8 +23,9 @@ from benchnav.models.figures import (
     save_figure,
 )
 from benchnav.models.predictor import Oracle
+from benchnav.models.slope_table import SoftModes
 
-from .stub import ColourModel
+from .stub import ColourModel, true_table
 
 Qualities = dict[str, Quality]
 
@@ -184,3 +187,22 @@ def test_every_number_of_splits_can_be_drawn(count: int, qualities: Qualities) -
         figure.set_dpi(20)
         figure.draw_without_rendering()
         assert len([axes for axes in figure.axes if axes.get_title()]) == count
+
+
+def test_soft_spots_are_drawn_and_count_in_what_is_expected() -> None:
+    classes = load_recipe("tiny-v1").classes
+    soft_ground = replace(classes[0], soft=SoftSpots(weight=0.3, mean=0.1, std=0.05))
+    table, cells = true_table((soft_ground,)), [[100] * 30 + [0] * 60]
+    modes = SoftModes(weight=torch.tensor([0.3]), mean=torch.tensor([0.1]), std=torch.tensor([0.05]))
+    whole = replace(table, soft=modes)
+    figures = [latent_figure(one, (soft_ground,), cells) for one in (table, whole)]
+    plain, drawn = (figure.axes[0].get_lines() for figure in figures)
+    assert len(drawn) == len(plain) + 1
+    assert [text.get_text() for text in figures[1].legends[0].get_texts()].count("mean of soft spots") == 1
+    (level,) = [line for line in drawn if line.get_linestyle() == "-."]
+    assert list(level.get_ydata()) == pytest.approx([0.1, 0.1])
+    slopes = torch.from_numpy(drawn[1].get_xdata()).float().view(1, 1, -1)
+    expected = whole.own(torch.zeros(1, 1, slopes.shape[2], dtype=torch.int64), slopes).mean().flatten()
+    np.testing.assert_allclose(drawn[1].get_ydata(), expected, atol=1e-4)
+    # The true E[λ], dotted, is that of both as well; the table's own spread of 0.03 is between them.
+    np.testing.assert_allclose(drawn[3].get_ydata(), drawn[1].get_ydata(), atol=0.01)

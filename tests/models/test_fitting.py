@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -165,7 +166,8 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
     command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
     command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--seed", "1"]
     command += ["--trainer.precision", "32-true", "--trainer.accelerator", "cpu", "--half-precision", "false"]
-    command += [f"--classifier.{name}={value}" for name, value in vars(SMALL).items()]
+    settings = json.loads(json.dumps(vars(SMALL)))
+    command += [f"--classifier.{name}={value}" for name, value in settings.items()]
     environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stderr
