@@ -8,6 +8,7 @@ import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ import pytest
 import torch
 
 from benchnav import registry
+from benchnav.datagen.scenario import load_recipe
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.recorder import record_episode
 from benchnav.eval.report.playback import read_path
@@ -412,3 +414,38 @@ def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: 
     (recording,) = (tmp_path / "run" / "playback").glob("*.rrd")
     _, positions = read_path(recording)
     assert len(positions) <= 2
+
+
+def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
+    """Of a file with some maps of a shipped recipe; of others there is nothing to be told."""
+    recipe = load_recipe("tiny-v1")
+    few = {name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hg")}
+    path = factories.tiny_dataset(tmp_path / "few.h5", replace(recipe, splits=few))
+    made = "All maps of tiny-v1 are made with `benchnav-datagen create tiny-v1`"
+    for changes, told in (
+        ({"instances": 3}, True),
+        ({"instances": 5}, False),
+        ({"scenarios": ("hs",)}, True),
+        ({"scenarios": ("night",)}, False),
+    ):
+        suite = Suite(data=str(path), model="oracle", planners=("straight",), **changes)
+        with pytest.raises(ConfigError) as refused:
+            finish(suite, tmp_path / "run")
+        assert (made in str(refused.value)) == told, changes
+
+
+def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path: Path) -> None:
+    def told(budget: float, robot: str | dict[str, Any] = "unicycle") -> list[str]:
+        lines: list[str] = []
+        suite = Suite(
+            data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), instances=2,
+            time_budget_s=budget, robots=(robot,), recorded=0,
+        )  # fmt: skip
+        for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
+            pass
+        return [line for line in lines if "within T" in line]
+
+    # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
+    assert told(10.2) == ["in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"]
+    assert told(10.4) == []
+    assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []

@@ -1,18 +1,22 @@
 """The shipped maps and model, as users meet them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.optimize import brentq
+from scipy.stats import norm
 
 from benchnav import rng
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.datagen.validate import find_faults
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
+from benchnav.mixture import TraversabilityMixture
 from benchnav.models.calibration import evaluate
-from benchnav.models.predictor import load_model
+from benchnav.models.predictor import find_checkpoint, load_model, predict
 
 
 @pytest.mark.parametrize("planner", ["astar_dwa", "astar_mppi", "cl_rrt", "mppi"])
@@ -92,3 +96,85 @@ def test_the_shipped_model_is_as_good_as_its_readme_says() -> None:
     assert quality["test/std"].classes[0].accuracy == pytest.approx(0.9950, abs=2e-3)
     assert quality["test/hs"].classes[0].accuracy == pytest.approx(0.5289, abs=1e-2)
     assert quality["test/std"].traversability.coverage == pytest.approx(0.8996, abs=5e-3)
+
+
+# `straight` on the first maps of stakes-v1's std, in the world `stakes`, seed 0: outcome, path length, λ̄.
+IN_STAKES = [
+    ("success", 22.050, 0.8856), ("immobilised", 21.588, 0.6276), ("success", 23.739, 0.5395),
+    ("immobilised", 1.029, 0.1979), ("success", 20.886, 0.9242), ("immobilised", 17.220, 0.6573),
+    ("immobilised", 5.899, 0.5958), ("immobilised", 6.892, 0.5941),
+]  # fmt: skip
+
+
+def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_mission(tmp_path: Path) -> None:
+    suite = Suite(
+        data="stakes-v1", world="stakes", model="oracle", planners=("straight",), scenarios=("std",),
+        instances=8, recorded=0,
+    )  # fmt: skip
+    for _ in run_suite(suite, tmp_path / "run"):
+        pass
+    rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
+    assert rows["outcome"].tolist() == [outcome for outcome, *_ in IN_STAKES]
+    measures = rows[["path_length_m", "traversability"]].to_numpy()
+    assert (np.abs(measures - [numbers for _, *numbers in IN_STAKES]) < [1e-3, 1e-4]).all()
+    driven = [drive_straight_on_frozen_ground(instance) for instance in range(8)]
+    assert rows["outcome"].tolist() == [outcome for outcome, *_ in driven]
+    np.testing.assert_allclose(measures, [numbers for _, *numbers in driven], atol=1e-3)
+
+
+def drive_straight_on_frozen_ground(instance: int) -> tuple[str, float, float]:
+    """The same episode in a loop of its own, on a field by scipy's filter and root finder."""
+    dataset = TerrainDataset(find_dataset("stakes-v1"))
+    terrain = dataset.terrain("test/std", [instance])
+    places = dataset.read("test/std", [instance], ["start_m", "goal_m", "reference_time_s"])
+    start, goal = (places[name][0].astype(float) for name in ("start_m", "goal_m"))
+    field = frozen_field(terrain.truth, instance)
+    direction, place, met, held = (goal - start) / np.linalg.norm(goal - start), start, [], 0
+    for _ in range(round(3 * float(places["reference_time_s"][0]) / 0.1)):
+        column, row = (place // 0.5).astype(int)
+        met.append(field(row, column))
+        held = held + 1 if met[-1] < 0.1 else 0
+        place = place + 0.1 * met[-1] * direction
+        outcome = "success" if np.linalg.norm(goal - place) < 1 else "immobilised" if held == 20 else ""
+        if outcome:
+            return outcome, 0.1 * sum(met), float(np.mean(met))
+    return "timeout", 0.1 * sum(met), float(np.mean(met))
+
+
+def frozen_field(truth: TraversabilityMixture, instance: int) -> Callable[[int, int], float]:
+    """λ of a cell of the first draw, by sums over the white noise and bisection in the cell's own CDF."""
+    key = rng.stream_key(rng.stream_key(0, "simulation", "test/std"), instance, "field", 0)
+    white = rng.normal(key, np.zeros(1, np.int64), (128, 128))[0]
+    away = np.minimum(np.arange(128), 128 - np.arange(128))
+    weights, means, stds = (t[0].double().numpy() for t in (truth.weights, truth.means, truth.stds))
+
+    def met(row: int, column: int) -> float:
+        rows, columns = (np.exp(-((np.roll(away, n) / 3.0) ** 2)) for n in (row, column))
+        kernel = np.outer(rows, columns)
+        share = norm.cdf((kernel * white).sum() / np.sqrt((kernel**2).sum()))
+        w, m, s = weights[:, row, column], means[:, row, column], stds[:, row, column]
+        found = brentq(lambda x: float((w * norm.cdf((x - m) / s)).sum() - share), -3, 4)
+        return float(np.clip(found, 0, 1))
+
+    return met
+
+
+def test_the_shipped_model_of_ground_with_stakes() -> None:
+    folder = find_checkpoint("stakes-v1")
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 8e6
+    model, dataset = load_model("stakes-v1"), TerrainDataset(find_dataset("stakes-v1"))
+    terrain = dataset.terrain("test/std", range(20))
+    predicted, ideal = predict(model, terrain), predict(load_model("ideal"), terrain)
+    for found, best, most in (
+        (predicted.mean(), ideal.mean(), 0.02),
+        (predicted.cvar(0.9), ideal.cvar(0.9), 0.02),
+        (predicted.harmonic_mean(0.05), ideal.harmonic_mean(0.05), 0.02),
+        (predicted.chance(0.1), ideal.chance(0.1), 0.02),
+    ):
+        assert (found - best).abs().mean() < most
+    soft = model.table.soft
+    for name, terrain_class, weight in zip(
+        model.class_names, dataset.recipe.classes, soft.weight, strict=True
+    ):
+        wanted = terrain_class.soft.weight if terrain_class.soft else 0.0
+        assert float(weight) == pytest.approx(wanted, abs=0.005), name
