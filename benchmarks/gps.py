@@ -21,7 +21,6 @@ from typing import Any
 
 import gpytorch
 import torch
-from benchnav.models.pixels import PixelTable, read_pixels
 from gpytorch.distributions import MultivariateNormal
 from rich.console import Console
 from rich.table import Table
