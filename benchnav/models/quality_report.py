@@ -26,7 +26,7 @@ HEADINGS = {
     "miou": "mIoU\n",
     "twin_accuracy": "accuracy\ntwins=1",
     "twin_miou": "mIoU\ntwins=1",
-    "twin_share_error": "twins\n|s−½|",
+    "twin_share_error": "twins\noff ½",
     "twin_share_ece": "ECE\ntwins",
     "ece": "ECE\n",
     "brier": "Brier\n",

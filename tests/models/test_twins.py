@@ -118,7 +118,9 @@ def test_a_dataset_with_look_alikes_is_measured_with_them_merged(
     row = json.loads(quality_json({}, qualities))["splits"]["test/std"]
     assert {name: row[name] for name in TWINS} == pytest.approx(vars(measured.twins))
     assert f"{measured.twins.twin_accuracy:.6g}" in quality_csv(qualities)
-    assert "mIoU twins=1" in quality_markdown("", qualities, [], [])
+    page = quality_markdown("", qualities, [], [])
+    assert "mIoU twins=1" in page
+    assert len({row.count("|") for row in page.splitlines() if row.startswith("|")}) == 1
 
 
 def test_the_command_writes_and_draws_look_alikes(
