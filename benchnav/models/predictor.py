@@ -43,10 +43,10 @@ class Model(Protocol):
 
 @runtime_checkable
 class ClassModel(Model, Protocol):
-    """A model whose components are terrain classes, so that its weights are class probabilities.
+    """A model that knows terrain classes: its weights, summed by `group`, are class probabilities.
 
     Args:
-        class_names: names of the classes, in the order of the components.
+        class_names: names of the classes, in the order of their ids.
     """
 
     class_names: tuple[str, ...]
@@ -54,7 +54,7 @@ class ClassModel(Model, Protocol):
 
 @runtime_checkable
 class EnsembleModel(ClassModel, Protocol):
-    """A model whose class probabilities are the average of its members'."""
+    """A model whose class probabilities are the average of its members', calibrated as a whole."""
 
     def member_probabilities(self, observation: Observation) -> Tensor:
         """Class probabilities of each member, shape [M, B, C, H, W]; M = 1 for a single classifier."""
