@@ -31,6 +31,8 @@ _MAP = ("data", "scenario", "instance", "seed", "realisation")
 def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapshot]:
     """Chooses one snapshot a trial, all of one map where there are such, at most `MOST_PANELS`.
 
+    Of the maps that the first trial was recorded on it is the first on which outcomes differ, if there is one.
+
     Args:
         snapshots: all there are.
         trials: ids in the order wanted.
@@ -38,12 +40,20 @@ def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapsho
     order = {trial: place for place, trial in enumerate(trials)}
     known = [snapshot for snapshot in snapshots if snapshot.about["trial"] in order]
     known.sort(key=lambda s: (order[s.about["trial"]], int(s.about["instance"])))
-    shown = [known[0].about[name] for name in _MAP] if known else []
-    known.sort(key=lambda s: [s.about[name] for name in _MAP] != shown)
+    outcomes: dict[tuple[str, ...], set[str]] = {}
+    for snapshot in known:
+        outcomes.setdefault(_map(snapshot), set()).add(snapshot.about["outcome"])
+    maps = [_map(snapshot) for snapshot in known if snapshot.about["trial"] == known[0].about["trial"]]
+    shown = next((one for one in maps if len(outcomes[one]) > 1), maps[0] if maps else ())
+    known.sort(key=lambda s: _map(s) != shown)
     first: dict[str, Snapshot] = {}
     for snapshot in known:
         first.setdefault(snapshot.about["trial"], snapshot)
     return sorted(first.values(), key=lambda s: order[s.about["trial"]])[:MOST_PANELS]
+
+
+def _map(snapshot: Snapshot) -> tuple[str, ...]:
+    return tuple(snapshot.about[name] for name in _MAP)
 
 
 def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:

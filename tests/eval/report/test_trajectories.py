@@ -32,6 +32,17 @@ def test_one_a_trial_on_one_map_in_the_tables_order() -> None:
     assert chosen([], ["a"]) == []
 
 
+def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do_not() -> None:
+    def ended(trial: str, instance: int, outcome: str) -> Snapshot:
+        made = snapshot(trial, instance)
+        return replace(made, about={**made.about, "outcome": outcome})
+
+    outcomes = {("a", 1): "success", ("b", 1): "success", ("a", 2): "success", ("b", 2): "immobilised"}
+    every = [ended(*place, outcome) for place, outcome in outcomes.items()]
+    every += [ended("a", 3, "success"), ended("b", 3, "stuck"), ended("b", 0, "stuck"), ended("c", 0, "success")]
+    assert chosen(every, ["a", "b", "c"]) == [("a", "2"), ("b", "2"), ("c", "0")]
+
+
 def test_no_more_than_can_be_seen() -> None:
     trials = [f"t{k}" for k in range(12)]
     assert len(chosen([snapshot(trial) for trial in trials], trials)) == MOST_PANELS
