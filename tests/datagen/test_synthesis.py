@@ -296,7 +296,7 @@ def test_the_presets_of_a_recipe_are_those_of_its_synthesis() -> None:
 @pytest.mark.parametrize(
     ("split", "digest"),
     [
-        ("train", "3006351f4fe21ebfac16dc6753c1c67f1370cbdfc89539eb9a194091612b6a13"),
+        ("train", "ac0d1fa5bac16592e6dace1e9ac05ff7041b065e50ffd047df15aadf09c8ef91"),
         ("test/hg", "4b77b5694bb189749dd16df89722aebdf46063d4f970bbf22fd6db8065f00379"),
     ],
 )
