@@ -27,7 +27,7 @@ value-at-risk". Letters in shapes: K components, H×W cells, *B any leading dime
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -50,8 +50,8 @@ class TraversabilityMixture:
         weights: probability of each component, summing to 1 over K, shape [*B, K, H, W].
         means: component means before clipping, shape [*B, K, H, W].
         stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
-        group: the terrain class that each component belongs to, K of them; None where components are
-            no classes.
+        group: K numbers: in a cell the components of one number belong to one terrain class together; None
+            where components are no classes.
 
     Raises:
         ConfigError: the shapes differ or have fewer than three dimensions, or `group` has another length.
@@ -223,6 +223,8 @@ class TraversabilityMixture:
         Raises:
             ConfigError: the components are not told to belong to classes.
         """
+        if self.weights.shape[-3] == 1:
+            return TraversabilityMixture(torch.ones_like(self.means), self.means, self.stds, (0,))
         if self.group is None:
             raise ConfigError(
                 "Expected components that belong to terrain classes for the single-class option, got a "
@@ -230,19 +232,15 @@ class TraversabilityMixture:
             )
         classes = sorted(set(self.group))
         members = [[k for k, own in enumerate(self.group) if own == c] for c in classes]
-        most = max(len(own) for own in members)
-        # Of the classes with fewer components some are taken again, at no weight.
-        table = torch.tensor([own + own[:1] * (most - len(own)) for own in members])
-        counted = torch.tensor([[1.0] * len(own) + [0.0] * (most - len(own)) for own in members])
-        table, counted = table.to(self.weights.device), counted.to(self.weights)
-        of_class = (self.weights.movedim(-3, -1)[..., table] * counted).sum(-1)
-        best = of_class.argmax(dim=-1)
-        index = table[best].movedim(-1, -3)
-        weights, means, stds = (torch.gather(t, -3, index) for t in (self.weights, self.means, self.stds))
-        weights = weights * counted[best].movedim(-1, -3)
-        if most == 1:
-            weights = torch.ones_like(weights)
-        return TraversabilityMixture(weights / weights.sum(-3, keepdim=True), means, stds, (0,) * most)
+        of_class = torch.stack([self.weights[..., own, :, :].sum(-3) for own in members], dim=-3)
+        best = of_class.argmax(dim=-3, keepdim=True)
+        if len(classes) == len(self.group):  # a component a class: the others need not be kept at no weight
+            order = torch.tensor([own[0] for own in members], device=best.device)[best]
+            means, stds = (torch.gather(t, -3, order) for t in (self.means, self.stds))
+            return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))
+        class_of = torch.tensor([classes.index(own) for own in self.group], device=best.device)
+        kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
+        return replace(self, weights=kept / kept.sum(-3, keepdim=True))
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))

@@ -5,6 +5,7 @@ Conventions: maps are indexed [row = y, column = x]; cell (i, j) is centred at
 space. Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×W cells.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -136,8 +137,9 @@ class Terrain:
             own class at its slope, and of its soft spots where the class has them.
         traversability: one realised λ, shape [B, H, W].
         grid: size and resolution.
-        look_alikes: what colours can tell at best: the truth of all classes that look like the cell's own,
-            weighted alike; None where no two classes look alike, so that it is the truth.
+        look_alikes: gives what colours can tell at best, from classes and slopes [B, H, W]: the truth of all
+            classes that look like the cell's own, weighted alike; None where no two classes look alike, so
+            that it is the truth.
     """
 
     rgb: Tensor
@@ -147,7 +149,7 @@ class Terrain:
     truth: TraversabilityMixture
     traversability: Tensor
     grid: Grid
-    look_alikes: TraversabilityMixture | None = None
+    look_alikes: Callable[[Tensor, Tensor], TraversabilityMixture] | None = None
 
     def __post_init__(self) -> None:
         """Checks that the layers fit the grid and one another."""

@@ -240,6 +240,9 @@ def test_most_likely_keeps_the_heaviest_class_whole() -> None:
 def test_the_most_likely_class_of_components_that_are_none_is_refused() -> None:
     with pytest.raises(ConfigError, match="without `group`"):
         replace(random_mixture(), group=None).most_likely()
+    alone = single(0.4, 0.1)
+    assert alone.group is None
+    assert alone.most_likely().cvar(0.9).item() == alone.cvar(0.9).item()
     with pytest.raises(ConfigError, match="each of 4 components, got 3"):
         replace(random_mixture(), group=(0, 1, 2))
 

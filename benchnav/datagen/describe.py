@@ -68,13 +68,16 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
     yield "content digests"
     yield from (f"  {name:12} {entry['digest']}" for name, entry in described["splits"].items())
     soft = any(item["soft"] for item in described["classes"])
-    heads = ["id", "class", "colour", "a", "b", "o", "σ", *(["soft spots"] if soft else [])]
+    heads = ["id", "class", "colour", "a", "b", "o", "σ"]
+    if soft:
+        heads.append("soft spots")
     classes = Table(*heads, title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
     for number, item in enumerate(described["classes"]):
         colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
-        numbers = (f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise"))
-        spots = [_soft_spots(item["soft"])] if soft else []
-        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers, *spots)
+        numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
+        if soft:
+            numbers.append(_soft_spots(item["soft"]))
+        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers)
     yield classes
 
 

@@ -169,7 +169,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         data = yaml.safe_load(path.read_text())
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
         raise ConfigError(f"Expected YAML in {path}, got: {' '.join(str(error).split())}") from error
-    changed = override(data, overrides) if overrides else data
+    changed = override(_with_class_table(data), overrides) if overrides else data
     recipe = recipe_from_dict(changed, str(source))
     if overrides and recipe.id == data.get("id"):
         raise ConfigError(
@@ -225,6 +225,13 @@ def shipped_recipes() -> list[str]:
     return sorted(path.stem for path in RECIPES.glob("*.yaml") if path != PRESETS)
 
 
+def _with_class_table(data: Any) -> Any:
+    """Puts the shipped class table in the place of `default`, or of none."""
+    if not isinstance(data, dict) or data.get("classes", "default") != "default":
+        return data
+    return {**data, "classes": load_presets(data.get("synthesis"))[0]}
+
+
 def recipe_from_dict(data: Any, origin: str) -> Recipe:
     """Builds a recipe from plain data, resolving presets.
 
@@ -243,10 +250,8 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
             raise ConfigError(
                 f"Expected names in `{key}` of recipe {origin}, got {list(named)}. Quote numbers."
             )
-    classes, presets = load_presets(data.get("synthesis"))
-    data = {"classes": "default", **data}
-    if data["classes"] == "default":
-        data["classes"] = classes
+    data = _with_class_table(data)
+    _, presets = load_presets(data.get("synthesis"))
     scenarios = data.get("scenarios", {name: {"preset": name} for name in presets})
     if isinstance(scenarios, dict):
         data["scenarios"] = {name: resolve(entry, presets, name) for name, entry in scenarios.items()}

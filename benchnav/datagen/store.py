@@ -5,7 +5,7 @@ Readers open the file at each call, so they may be passed to other processes.
 
 import json
 from collections.abc import Iterable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -128,21 +128,7 @@ class TerrainDataset:
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> Terrain:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
-        maps = self.read(split, indices, schema.MAP_FIELDS)
-        classes, slope = self.recipe.classes, maps["slope_deg"].astype(np.float64)
-        truth = latent.truth(maps["class_id"], slope, classes)
-        seen = latent.look_alikes(maps["class_id"], slope, classes) if self.recipe.synthesis > 1 else None
-        per_class = truth[0].shape[1]
-        return Terrain(
-            rgb=torch.from_numpy(maps["rgb"]),
-            class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
-            elevation_m=torch.from_numpy(maps["elevation_m"]),
-            slope_deg=torch.from_numpy(maps["slope_deg"]),
-            truth=mixture_of(truth, per_class),
-            traversability=torch.from_numpy(maps["traversability"]),
-            grid=self.grid,
-            look_alikes=None if seen is None else mixture_of(seen, per_class),
-        )
+        return terrain_of(self.read(split, indices, schema.MAP_FIELDS), self.recipe)
 
     def map_count(self, split: str) -> int:
         """Number of maps of a split.
@@ -202,9 +188,42 @@ class TerrainDataset:
         )
 
 
-def mixture_of(parameters: latent.Parameters, per_class: int) -> TraversabilityMixture:
-    """A mixture in float32, each class with `per_class` of its components, from those of `latent.truth`."""
+def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
+    """Makes Terrain of stored arrays, float32 on the CPU.
+
+    Args:
+        maps: the fields of `schema.MAP_FIELDS`, each of shape [B, *entry shape].
+        recipe: by which they were made.
+    """
+    slope = maps["slope_deg"].astype(np.float64)
+    alike = max(len(own) for own in latent.twins(recipe.classes)) > 1
+    return Terrain(
+        rgb=torch.from_numpy(maps["rgb"]),
+        class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
+        elevation_m=torch.from_numpy(maps["elevation_m"]),
+        slope_deg=torch.from_numpy(maps["slope_deg"]),
+        truth=_mixture(latent.truth(maps["class_id"], slope, recipe.classes), recipe.classes),
+        traversability=torch.from_numpy(maps["traversability"]),
+        grid=recipe.grid,
+        look_alikes=partial(_look_alikes, recipe.classes) if alike and recipe.synthesis > 1 else None,
+    )
+
+
+def _look_alikes(
+    classes: tuple[latent.TerrainClass, ...], class_id: torch.Tensor, slope_deg: torch.Tensor
+) -> TraversabilityMixture:
+    slope = slope_deg.cpu().numpy().astype(np.float64)
+    parameters = latent.look_alikes(class_id.cpu().numpy(), slope, classes)
+    assert parameters is not None, "asked of a table in which no two classes look alike"
+    return _mixture(parameters, classes).to(class_id.device)
+
+
+def _mixture(
+    parameters: latent.Parameters, classes: tuple[latent.TerrainClass, ...]
+) -> TraversabilityMixture:
+    """In float32; the components of a class, one or with its soft spots two, stand next to one another."""
     weights, means, stds = (torch.from_numpy(values.astype(np.float32)) for values in parameters)
+    per_class = 2 if any(item.soft for item in classes) else 1
     group = tuple(k // per_class for k in range(weights.shape[1]))
     return TraversabilityMixture(weights, means, stds, group)
 

@@ -49,7 +49,7 @@ class Suite:
     model: PartSpec = "paper-v1"
     models: tuple[PartSpec, ...] = ()
     planners: tuple[PartSpec, ...] = ("straight", "astar_dwa", "cl_rrt", "mppi")
-    risks: tuple[PartSpec, ...] = ("cvar", "var", "mean", "single-class")
+    risks: tuple[PartSpec, ...] = ("cvar", "var", "mean")
     robots: tuple[PartSpec, ...] = ("unicycle",)
     objectives: tuple[PartSpec, ...] = ("goal_distance",)
     world: PartSpec = "paper"

@@ -114,7 +114,7 @@ def train_all(
     dataset = _open_dataset(data)
     classifier, options = _options(out, classifier, trainer, resume)
     target = _open_target(out, dataset, ["gp", *_members(members)], options, overwrite)
-    if not target.holds("gp", asdict(gp), seed):
+    if not target.holds("gp", asdict(gp), seed, asdict(LatentGPConfig())):
         target.add("gp", _fit_gp(gp, dataset, seed, options))
     _train_members(target, classifier, dataset, members, seed, options, half_precision)
 
@@ -150,7 +150,7 @@ def train_mdn(
     mdn, options = _options(out, mdn, trainer, resume)
     fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=MDN)
     target = open_target(Path(out), fresh, [MDN], training_digest(dataset), options, overwrite)
-    if target.holds(MDN, asdict(mdn), seed):
+    if target.holds(MDN, asdict(mdn), seed, asdict(MDNConfig())):
         return
     network, metrics = fit_mdn(mdn, dataset, seed, options, half_precision)
     _say(
@@ -226,7 +226,7 @@ def _train_members(
     half_precision: bool,
 ) -> None:
     for index, part in enumerate(_members(members)):
-        if not target.holds(part, asdict(config), seed + index):
+        if not target.holds(part, asdict(config), seed + index, asdict(ClassifierConfig())):
             trained = _fit_classifier(config, dataset, seed + index, options, part, half_precision)
             target.add(part, trained)
     _calibrate_pool(target, dataset, seed)

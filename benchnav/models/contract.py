@@ -17,9 +17,8 @@ import torch
 from torch import Tensor
 
 from benchnav.datagen.generate import generate
-from benchnav.datagen.latent import truth
 from benchnav.datagen.scenario import Split, load_recipe
-from benchnav.datagen.store import mixture_of
+from benchnav.datagen.store import terrain_of
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import AnyModel, predict
@@ -187,17 +186,7 @@ def _make_terrain(recipe: str, height: int, width: int, device: torch.device) ->
         splits={"contract": Split(scenario=name, maps=_MAPS)},
     )
     maps = generate(made, "contract", np.arange(_MAPS))
-    true = truth(maps["class_id"], maps["slope_deg"].astype(np.float64), made.classes)
-    made_terrain = Terrain(
-        rgb=torch.from_numpy(maps["rgb"]),
-        class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
-        elevation_m=torch.from_numpy(maps["elevation_m"]),
-        slope_deg=torch.from_numpy(maps["slope_deg"]),
-        truth=mixture_of(true, per_class=true[0].shape[1]),
-        traversability=torch.from_numpy(maps["traversability"]),
-        grid=made.grid,
-    )
-    return made_terrain.to(device)
+    return terrain_of(maps, made).to(device)
 
 
 def _generators() -> dict[str, bytes]:

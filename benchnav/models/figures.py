@@ -311,6 +311,9 @@ def latent_figure(
     _drop_rest(panels, len(classes))
     figure.supxlabel("slope [°]  (σ: noise, in brackets the true one)", size=TEXT)
     figure.supylabel("traversability", size=TEXT)
+    handles: list[Line2D] = []
+    if table.soft:
+        handles.append(Line2D([], [], color=_BLUE, lw=0.9, ls="-.", label="mean of soft spots"))
     _legend(
         figure,
         [
@@ -320,11 +323,7 @@ def latent_figure(
             Line2D([], [], color="black", lw=0.9, ls="--", label="true latent function"),
             Line2D([], [], color=_ORANGE, lw=1.1, label="predicted E[λ]"),
             Line2D([], [], color="black", lw=1, ls=":", label="true E[λ]"),
-            *(
-                [Line2D([], [], color=_BLUE, lw=0.9, ls="-.", label="mean of soft spots")]
-                if table.soft
-                else []
-            ),
+            *handles,
             Patch(facecolor="0.4", alpha=0.12, label="steeper: 1 cell in 1000"),
             Patch(facecolor="0.4", alpha=0.35, label="steeper: no cell of the class"),
         ],

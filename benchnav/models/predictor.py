@@ -93,12 +93,15 @@ class Oracle:
 class Ideal:
     """Knows all that colours can tell: of look-alikes, the mixture of their true distributions.
 
-    What a model falls short of it is the model's error; what it falls short of the oracle cannot be seen.
+    What a model falls short of it is the model's error; what it falls short of the oracle cannot be seen. Its
+    look-alikes weigh the same, so that of them the single-class option keeps the first of the class table.
     """
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
         """Gives the true distributions of all classes that look like the cell's own."""
-        return terrain.truth if terrain.look_alikes is None else terrain.look_alikes
+        if terrain.look_alikes is None:
+            return terrain.truth
+        return terrain.look_alikes(terrain.class_id, terrain.slope_deg)
 
 
 class Clairvoyant:

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from benchnav.errors import CheckpointError
@@ -40,8 +41,20 @@ class Target:
         self.folder, self.checkpoint = folder, checkpoint
         self.digest, self.options = digest, options
 
-    def holds(self, name: str, config: Mapping[str, Any], seed: int) -> bool:
+    def holds(
+        self,
+        name: str,
+        config: Mapping[str, Any],
+        seed: int,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
+    ) -> bool:
         """Tells whether an interrupted run has left a part, trained in the same way.
+
+        Args:
+            name: of the part.
+            config: settings of its training.
+            seed: its root seed.
+            defaults: what settings are that a part of an earlier version does not name.
 
         Raises:
             CheckpointError: it was trained in another way.
@@ -49,7 +62,9 @@ class Target:
         part = self.checkpoint.parts.get(name)
         if part is None:
             return False
-        wanted, there = (json.loads(json.dumps(dict(settings))) for settings in (config, part.config))
+        wanted, there = (
+            json.loads(json.dumps(dict(settings))) for settings in (config, {**defaults, **part.config})
+        )
         if wanted.items() <= there.items() and (part.seed, part.data_digest) == (seed, self.digest):
             self._forget(name)  # a kill may have come between saving and forgetting
             return True

@@ -5,7 +5,7 @@ over this. Letters in shapes: B sub-environments, H×W cells, S state and A acti
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ class EnvBatch:
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
         dataset = TerrainDataset(find_dataset(data))
         split = split or _default_split(dataset)
-        self._maps = replace(dataset.terrain(split), look_alikes=None)  # which nobody asks for here
+        self._maps = dataset.terrain(split)
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
         self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)  # to be refused at once

@@ -213,7 +213,9 @@ def pose_problem(
         free=rules.free_space.mask(risk_map, mixture) | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
-        time_budget_s=torch.as_tensor(time_budget_s).to(goal_m).expand(len(goal_m)).clone(),
+        time_budget_s=torch.as_tensor(time_budget_s, dtype=torch.float64, device=goal_m.device)
+        .expand(len(goal_m))
+        .clone(),
     )
 
 

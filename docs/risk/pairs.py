@@ -32,12 +32,21 @@ DRAWS = 10_000
 def families(rows: pd.DataFrame, by: str) -> Iterator[tuple[str, dict[str, pd.DataFrame]]]:
     """A family's name, and the episodes of each of its members by name; those that stand alone are left out."""
     others = [name for name in PARTS if name != by]
-    told = [name for name in others if rows[name].nunique() > 1]
+    if by == "model":
+        rows = for_each_risk(rows)
+    several = [name for name in others if rows[name].nunique() > 1]
     for values, family in rows.groupby(others, sort=False):
         members = {name: member for name, member in family.groupby(by, sort=False) if name != "–"}
         if len(members) > 1:
             known = dict(zip(others, values, strict=True))
-            yield ", ".join(str(known[name]) for name in told) or "all", members
+            yield ", ".join(str(known[name]) for name in several) or "all", members
+
+
+def for_each_risk(rows: pd.DataFrame) -> pd.DataFrame:
+    """Stands a model that is run once for all settings, the clairvoyant, beside each of them."""
+    once = (rows["risk"] == "–") & (rows["model"] != "–")
+    settings = [risk for risk in rows["risk"].unique() if risk != "–"]
+    return pd.concat([rows[~once], *(rows[once].assign(risk=risk) for risk in settings)])
 
 
 def compare(one: pd.DataFrame, other: pd.DataFrame) -> dict[str, float]:
@@ -89,13 +98,15 @@ def print_pairs(name: str, table: pd.DataFrame) -> None:
 def print_order(name: str, members: dict[str, pd.DataFrame]) -> None:
     """Prints a row: success of each member, and what the best gains on the worst."""
     success = {label: 100 * rows["success"].mean() for label, rows in members.items()}
-    best, worst = max(success, key=success.__getitem__), min(success, key=success.__getitem__)
+    order = sorted(success, key=success.__getitem__)
+    worst, best = order[0], order[-1]
     table = compared(members, "")
     found = table[table["one"].isin((best, worst)) & table["other"].isin((best, worst))].iloc[0]
-    sign = 1 if found["one"] == best else -1
-    ends = sorted((sign * found["success_low"], sign * found["success_high"]))
+    ends = found["success_low"], found["success_high"]
+    if found["one"] == worst:
+        ends = -ends[1], -ends[0]
     rates = " | ".join(f"{value:.0f}" for value in success.values())
-    gap = f"{sign * found['success']:+.0f} ({ends[0]:+.0f} to {ends[1]:+.0f})"
+    gap = f"{success[best] - success[worst]:+.0f} ({ends[0]:+.0f} to {ends[1]:+.0f})"
     print(f"| {name} | {rates} | {best} − {worst} {gap} | {found['success_p']:.2g} |")
 
 

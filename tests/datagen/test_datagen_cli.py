@@ -321,6 +321,8 @@ def test_an_override_names_an_item_of_a_list_by_its_name() -> None:
     assert by_name["dune_sand"].soft == SoftSpots(weight=0.2, mean=0.05, std=0.05)
     assert by_name["gravel"].noise == 0.3
     assert by_name["wet_clay"] == whole["wet_clay"]
+    shipped = load_recipe("paper-v1", ["id=rough", "classes.gravel.noise=0.3"])
+    assert {item.name: item for item in shipped.classes}["gravel"].noise == 0.3
     for wrong in ("classes.dune.noise=1", "classes.3.noise=1", "occupancy.first=1"):
         with pytest.raises(ConfigError, match="something in the recipe"):
             load_recipe("stakes-v1", ["id=deep", wrong])

@@ -46,6 +46,14 @@ class Spy:
         return torch.zeros(len(step.state), 2), (note, felt), Plan.empty(len(step.state))
 
 
+class TwoModes:
+    """A model whose two components are no classes."""
+
+    def predict(self, observation):  # type: ignore[no-untyped-def]
+        half = torch.full((len(observation.rgb), 2, *observation.grid.shape), 0.5)
+        return TraversabilityMixture(half, half + torch.tensor([0.4, 0.1]).view(2, 1, 1), 0.1 * half)
+
+
 class Faulty:
     """Drives straight on until `after_s`, then does something wrong for the episode nearest to its goal."""
 

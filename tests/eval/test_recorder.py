@@ -82,6 +82,7 @@ def test_cells_that_hold_a_robot_are_those_under_the_worlds_own_limit(stakes: Pa
 def test_soft_ground_is_that_of_classes_with_soft_spots_on_the_episodes_own_map(
     dataset: Path, stakes: Path
 ) -> None:
+    assert len(snapshots(stakes)) > 2
     for snapshot in snapshots(stakes):
         classes = TerrainDataset(dataset).read("test/std", [int(snapshot.about["instance"])], ["class_id"])
         np.testing.assert_array_equal(snapshot.soft, np.isin(classes["class_id"][0], SOFT))
@@ -110,7 +111,9 @@ def test_an_episode_that_is_run_again_is_recorded_on_its_own_ground(
 def test_where_nothing_holds_a_robot_no_cell_does(
     world: Any, stays: bool, dataset: Path, tmp_path: Path
 ) -> None:
-    for snapshot in snapshots(run(dataset, tmp_path / "run", world=world, seeds=(), recorded=1)):
+    recorded = snapshots(run(dataset, tmp_path / "run", world=world, seeds=(), recorded=1))
+    assert recorded
+    for snapshot in recorded:
         assert (snapshot.field is not None) == stays
         assert not snapshot.holding.any()
         assert snapshot.soft.any()

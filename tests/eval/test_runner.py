@@ -449,3 +449,38 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
     assert told(10.2) == ["in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"]
     assert told(10.4) == []
     assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []
+
+
+def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    suite = Suite(
+        data=str(dataset_path),
+        model="oracle",
+        planners=("straight",),
+        scenarios=("std",),
+        instances=2,
+        recorded=0,
+    )
+    before = finish(suite, tmp_path / "run")
+    for world, expected in (
+        ({"noise": "frozen", "correlation_m": 4.1}, r"`world.correlation_m` of at most 4 m.* got 4.1 m"),
+        ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for instance"),
+    ):
+        for place in ("run", "new"):
+            with pytest.raises(ConfigError, match=expected):
+                finish(replace(suite, world=world), tmp_path / place, overwrite=True)
+    same(before, pd.read_parquet(tmp_path / "run" / "episodes.parquet"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    suite = Suite(
+        data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
+        scenarios=("std",), instances=1, recorded=0, time_budget_s=1.0,
+    )  # fmt: skip
+    with pytest.raises(ConfigError, match="without `group`"):
+        finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
+    assert set(finish(suite, tmp_path / "run")["risk"]) == {"–", *Suite().risks}

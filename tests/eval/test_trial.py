@@ -207,6 +207,8 @@ def test_a_world_with_stakes_is_told_apart_by_what_is_changed() -> None:
     held = one(world={"immobile": {"for_s": 4}})
     assert held.world.immobile == Immobile(below=0.1, for_s=4.0)
     assert one(world="stakes", time_budget_s=50.0).world.time_budget_s == 50.0
+    own = one(world={"preset": "stakes", "time_budget_ratio": 2}, time_budget_s=50.0).world
+    assert (own.time_budget_s, own.time_budget_ratio) == (None, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -216,6 +218,7 @@ def test_a_world_with_stakes_is_told_apart_by_what_is_changed() -> None:
         ({"world": {"correlation_m": 2.0}}, "with `world.noise` frozen, got it with 'resampled'"),
         ({"world": {"time_budget_s": 5.0, "time_budget_ratio": 2.0}}, "either"),
         ({"world": {"time_budget_s": None}}, "either"),
+        ({"world": {"preset": "stakes", "correlation_m": False}}, "like 1.5, got False"),
         ({"world": {"immobile": 3}}, "like {'below': 0.1, 'for_s': 2.0}, got 3"),
         ({"world": {"immobile": {"belw": 0.2}}}, "Did you mean 'below'"),
         ({"model": "clairvoyant"}, "can be known for the model 'clairvoyant', got 'paper'"),

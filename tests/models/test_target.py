@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,9 @@ from benchnav.models.checkpoint import (
     member_names,
     save_checkpoint,
 )
+from benchnav.models.config import ClassifierConfig
 from benchnav.models.fitting import STATE, FitOptions
+from benchnav.models.predictor import find_checkpoint
 from benchnav.models.target import Target, open_target
 
 FRESH = Checkpoint(class_names=("a", "b"))
@@ -123,3 +125,15 @@ def test_processes_beside_the_first_refuse_and_write_nothing(
     assert not target.holds("gp", {"width": 3}, 0)
     target.add("classifier", PART)
     assert (folder / "config.json").read_bytes() == before
+
+
+def test_a_part_of_an_earlier_version_has_the_defaults_of_settings_that_came_later(tmp_path: Path) -> None:
+    """The shipped model of 0.1 knows nothing of the depth of its encoder."""
+    shipped = load_checkpoint(find_checkpoint("paper-v1"))
+    classifier = shipped.parts["classifier"]
+    target = Target(tmp_path / "mine", shipped, classifier.data_digest, FitOptions())
+    defaults = asdict(ClassifierConfig())
+    assert "encoder_depth" not in classifier.config
+    assert target.holds("classifier", defaults, 0, defaults)
+    with pytest.raises(CheckpointError, match="got others"):
+        target.holds("classifier", asdict(ClassifierConfig(encoder_depth=3)), 0, defaults)

@@ -65,11 +65,11 @@ def test_of_two_look_alikes_one_half_each_is_right() -> None:
 def test_shares_other_than_one_half_may_be_calibrated() -> None:
     share = torch.where(torch.arange(20_000) % 2 == 0, 0.8, 0.3)
     class_id = drawn(20_000, share)
-    told = torch.stack([0.5 * share, torch.full_like(share, 0.5), 0.5 * (1 - share), 0 * share], 1)
+    told = torch.stack([0.6 * share, torch.full_like(share, 0.4), 0.6 * (1 - share), 0 * share], 1)
     quality = tally(told, class_id)
     assert quality.twin_share_ece < 0.02
     assert quality.twin_share_error == pytest.approx(0.25, abs=1e-5)
-    assert quality.twin_accuracy == pytest.approx(0.0 if bool((told[:, 1] > 0.5).all()) else 1.0)
+    assert quality.twin_accuracy == 1
 
 
 def test_cells_of_other_classes_and_without_any_share_count_as_nothing_and_as_one_half() -> None:

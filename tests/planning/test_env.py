@@ -307,7 +307,8 @@ def test_the_world_with_stakes_holds_a_robot_for_good(dataset_path: Path) -> Non
     # On ground of λ under 1, so everywhere; a frozen world would see to it that the start is no such ground.
     held = {"noise": "stored", "time_budget_ratio": 3.0, "immobile": {"below": 1.0, "for_s": 0.4}}
     env = make(dataset_path, split="test/std", world=held, objective="goal_distance")
-    for seed in range(20):
+    env._batch._maps.traversability.clamp_(max=0.99)
+    for seed in range(4):
         _, info = env.reset(seed=seed)
         steps, ended = 0, False
         while not ended:
@@ -320,10 +321,9 @@ def test_the_world_with_stakes_holds_a_robot_for_good(dataset_path: Path) -> Non
         left = round(3 * reference / 0.1) - steps
         assert reward == pytest.approx(-info["distance_m"] * (1 + left), rel=1e-4)
         shaped = make(dataset_path, split="test/std", world=held)
+        shaped._batch._maps.traversability.clamp_(max=0.99)
         shaped.reset(seed=seed)
         assert [shaped.step(np.zeros(2, np.float32))[1] for _ in range(4)][-1] == pytest.approx(-10.01)
-        if seed > 2:
-            return
 
 
 def test_a_world_may_be_given_as_itself(dataset_path: Path) -> None:

@@ -64,7 +64,7 @@ def read_report(folder: Path) -> Report:
         about = {**about, **convert_about(about, episodes)}
     summary = summarise(episodes)
     return Report(
-        header=(*_header(summary, about), *_redrawn(episodes)),
+        header=(*_header(summary, about), *_redrawn(episodes, about["trials"])),
         table=result_table(summary, about["trials"]),
         warnings=tuple(_warnings(summary, folder)),
         summary=summary,
@@ -124,12 +124,16 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
 
 
-def _redrawn(episodes: pd.DataFrame) -> list[str]:
-    """How often λ was drawn again; runs of before it was frozen have no such column."""
+def _redrawn(episodes: pd.DataFrame, trials: Mapping[str, Any]) -> list[str]:
+    """How often frozen λ was drawn again; runs of before there was such have no such column."""
+    frozen = [name for name, about in trials.items() if about["value"]["world"]["noise"] == "frozen"]
+    episodes = episodes[episodes["trial"].isin(frozen)]
     if "redrawn" not in episodes or not episodes["redrawn"].any():
         return []
-    once = episodes.drop_duplicates(["data", "scenario", "world", "seed", "realisation", "instance"])
-    share = once["redrawn"].sum() / (once["redrawn"] + 1).sum()
+    draws = ["data", "scenario", "world", "seed", "realisation", "instance"]
+    # All trials met the same; where a model failed nothing was drawn.
+    again = episodes.groupby(draws)["redrawn"].max()
+    share = again.sum() / (again + 1).sum()
     return [f"Of the draws of λ {100 * share:.1f} % joined start and goal by no ground and were drawn again."]
 
 

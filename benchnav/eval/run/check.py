@@ -1,24 +1,19 @@
 """What is refused, and what a user is told, before anything of a suite is run or dropped."""
 
-from collections.abc import Callable
 from typing import Any
-
-import numpy as np
-import torch
 
 from benchnav import registry
 from benchnav.datagen.scenario import load_recipe, shipped_recipes
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.run.check_world import Say, check_budgets, check_luck
 from benchnav.eval.run.unit import Extent
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint
+from benchnav.models.predictor import class_mismatch, find_checkpoint, predict
 from benchnav.options import one_line
 from benchnav.planning.planners.planner import check_steers
-
-Say = Callable[[str], None]
 
 _MEMBERS = {
     "planner": ("init", "plan"),
@@ -70,7 +65,9 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
         _check_first_plan(trial)
     for trial in trials:
         trial.make_risk()
-    _check_budgets(trials, datasets, suite.instances, say)
+    check_budgets(trials, datasets, suite.instances, say)
+    check_luck(trials, datasets, suite)
+    _check_single_class(trials, datasets)
     if elsewhere:
         _check_everywhere(trials)
     for trial in _distinct(trials, ("model",)):
@@ -119,29 +116,16 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
 
 
-def _check_budgets(
-    trials: list[Trial], datasets: dict[str, TerrainDataset], instances: int, say: Say
-) -> None:
-    """Refuses time budgets without a step, and tells of goals that top speed does not reach within them."""
-    seen = set()
-    for trial in trials:
-        task = trial.make_task()
-        top_speed, radius = task.robot.top_speed_mps, task.rules.goal_radius_m
-        case = (trial.data, trial.split, trial.world, top_speed, task.robot.dt_s, radius)
-        if case in seen:
+def _check_single_class(trials: list[Trial], datasets: dict[str, TerrainDataset]) -> None:
+    """Refuses the single-class option of a model whose components are no classes, by its first prediction."""
+    for trial in _distinct(trials, ("model", "risk")):
+        if trial.risk.part != "single-class" or trial.blind:
             continue
-        seen.add(case)
-        chosen = range(instances or datasets[trial.data].map_count(trial.split))
-        read = datasets[trial.data].read(trial.split, chosen, ["start_m", "goal_m", "reference_time_s"])
-        budget = trial.world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
-        trial.world.steps(budget, task.robot.dt_s)
-        way = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - radius
-        late = way / top_speed > budget.numpy()
-        if late.any():
-            say(
-                f"in {late.sum()} of {len(late)} instances of {trial.split} a robot of {top_speed:g} m/s cannot "
-                f"reach the goal within T"
-            )
+        try:
+            mixture = predict(trial.make_model(), datasets[trial.data].terrain(trial.split, [0]))
+        except (Exception, SystemExit):
+            continue  # a model that fails is its episodes' own matter
+        trial.make_risk()(mixture)
 
 
 def _check_members(trial: Trial) -> None:

@@ -4,7 +4,7 @@ Only the unit's own block of maps is read and predicted. A prediction serves all
 of its block that a process runs one after another.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -41,6 +41,15 @@ class Block:
 
     terrain: Terrain
     places: Places
+
+
+def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> Block:
+    """Reads some instances of a split, with starts, goals and reference times."""
+    places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
+    return Block(
+        terrain=dataset.terrain(split, instances),
+        places=Places(**{name: torch.from_numpy(values) for name, values in places.items()}),
+    )
 
 
 def read_block(unit: Unit, run_id: str) -> Block:
@@ -178,12 +187,7 @@ class _ModelOf:
 
 @lru_cache(maxsize=2)
 def _block(run_id: str, data: str, split: str, instances: tuple[int, ...]) -> Block:
-    dataset = TerrainDataset(find_dataset(data))
-    places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
-    return Block(
-        terrain=dataset.terrain(split, instances),
-        places=Places(**{name: torch.from_numpy(values) for name, values in places.items()}),
-    )
+    return read_maps(TerrainDataset(find_dataset(data)), split, instances)
 
 
 @lru_cache(maxsize=2)

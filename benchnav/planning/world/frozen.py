@@ -16,7 +16,7 @@ from benchnav.copula import correlated_normal
 from benchnav.errors import ConfigError
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
+from benchnav.terrain import Grid, Terrain
 
 MOST_ATTEMPTS = 100
 
@@ -39,25 +39,39 @@ def draw_frozen(
     Raises:
         ConfigError: no field of some episode joins its start and goal.
     """
+    check_correlation(world, terrain.grid)
     field = torch.zeros_like(terrain.traversability)
-    attempts = torch.zeros(len(terrain), dtype=torch.int64)
-    pending = torch.arange(len(terrain))
+    attempts = torch.zeros(len(terrain), dtype=torch.int64, device=field.device)
+    pending = torch.arange(len(terrain), device=field.device)
     for attempt in range(MOST_ATTEMPTS):
         normal = _normals(terrain, world, key, [instances[i] for i in pending.tolist()], attempt)
-        members = pending.to(field.device)
-        drawn = terrain.truth.select(members).from_normal(normal.to(field))
-        field = field.index_copy(0, members, drawn)
-        attempts[pending] += 1
+        drawn = terrain.truth.select(pending).from_normal(normal.to(field))
+        field = field.index_copy(0, pending, drawn)
+        attempts = attempts.index_add(0, pending, torch.ones_like(pending))
         if world.immobile is None:
             return field, attempts
-        ways = joined(drawn >= world.immobile.below, terrain.grid, places.select(members))
-        pending = pending[~ways.cpu()]
+        ways = joined(drawn >= world.immobile.below, terrain.grid, places.select(pending))
+        pending = pending[~ways]
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
         f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for instance "
         f"{instances[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
     )
+
+
+def check_correlation(world: World, grid: Grid) -> None:
+    """Refuses a correlation that is too long for the fields of a grid.
+
+    Raises:
+        ConfigError: it is.
+    """
+    longest = min(grid.extent_m) / 4
+    if world.correlation_m > longest:
+        raise ConfigError(
+            f"Expected `world.correlation_m` of at most {longest:g} m, a quarter of the maps' shorter side, got "
+            f"{world.correlation_m:g} m."
+        )
 
 
 def _normals(terrain: Terrain, world: World, key: int, instances: Sequence[int], attempt: int) -> Tensor:

@@ -49,12 +49,12 @@ def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:
     Returns:
         bool, shape [B].
     """
-    found = []
-    cells = zip(ground.cpu().numpy(), _cells(grid, places.start_m), _cells(grid, places.goal_m), strict=True)
-    for here, start, goal in cells:
-        parts, _ = label(here)
-        found.append(bool(parts[start] > 0 and parts[start] == parts[goal]))
-    return torch.tensor(np.array(found, dtype=bool), device=ground.device)
+    answers = np.zeros(len(ground), dtype=bool)
+    starts, goals = _cells(grid, places.start_m), _cells(grid, places.goal_m)
+    for b, (start, goal) in enumerate(zip(starts, goals, strict=True)):
+        parts, _ = label(ground[b].cpu().numpy())
+        answers[b] = parts[start] > 0 and parts[start] == parts[goal]
+    return torch.from_numpy(answers).to(ground.device)
 
 
 def _cells(grid: Grid, position_m: Tensor) -> list[tuple[int, int]]:

@@ -48,7 +48,7 @@ class Realisation:
     ) -> None:
         """Draws all luck."""
         self._grid = terrain.grid
-        self.attempts = torch.ones(len(terrain), dtype=torch.int64)
+        self.attempts = torch.ones(len(terrain), dtype=torch.int64, device=terrain.traversability.device)
         self.field: Tensor | None = None
         if world.noise == "stored":
             self.field = _stored(terrain)
@@ -82,7 +82,8 @@ class Realisation:
             self._ground.flatten(0, 1), x.repeat_interleave(count), y.repeat_interleave(count)
         )
         weights, means, stds = found.view(len(x), 3, count // 3, 1, 1).unbind(1)
-        return TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
+        met = TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
+        return torch.where(self._grid.contains(x, y), met, 0.0)
 
     def exchange(self, members: Tensor, others: "Realisation") -> "Realisation":
         """Gives some episodes what they meet in another realisation of the same world.
@@ -114,9 +115,6 @@ def _stored(terrain: Terrain) -> Tensor:
 
 
 def _padded_parameters(truth: TraversabilityMixture, grid: Grid) -> Tensor:
-    """Weights, means and stds framed for lookups, shape [B, 3·K, N]; off the map λ is 0."""
-    framed = []
-    for values, outside in ((truth.weights, 1.0), (truth.means, 0.0), (truth.stds, 0.0)):
-        for k in range(values.shape[1]):
-            framed.append(grid.pad(values[:, k], outside=outside if k == 0 else 0.0))
-    return torch.stack(framed, dim=1)
+    """Weights, means and stds framed for lookups, shape [B, 3·K, N]."""
+    maps = torch.cat((truth.weights, truth.means, truth.stds), dim=1)
+    return torch.stack([grid.pad(layer, outside=0.0) for layer in maps.unbind(1)], dim=1)

@@ -9,19 +9,20 @@ from benchnav.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.world.world import PRESETS, Immobile, World
 
+_BUDGETS = ("time_budget_s", "time_budget_ratio")
 # Fields that may be null, with what they are like where they are not.
 _OPTIONAL: Mapping[str, Any] = {"immobile": Immobile(), "time_budget_s": 100.0, "time_budget_ratio": 3.0}
 
 
 def read_world(
-    world: Any, task: Any = (), short: Mapping[str, Any] | None = None
+    world: Any, task: Any = None, short: Mapping[str, Any] | None = None
 ) -> tuple[World, Rules, str]:
     """Reads a world and the rules that go with it.
 
     Args:
         world: name of a preset, or a mapping of changes with the preset's name under `preset`; without it
             they change the paper's.
-        task: a mapping of changes to the preset's rules.
+        task: a mapping of changes to the preset's rules, if there are any.
         short: further changes to the world, for what `world` itself does not name.
 
     Returns:
@@ -30,9 +31,10 @@ def read_world(
     Raises:
         ConfigError: there is no such preset or field, or a value is of the wrong kind.
     """
-    for where, value in (("world", world), ("task", task or {})):
-        if not isinstance(value, Mapping) and not (where == "world" and isinstance(value, str)):
-            raise ConfigError(f"Expected `{where}` as a mapping of settings, got {value!r}.")
+    if not isinstance(world, Mapping | str):
+        raise ConfigError(f"Expected `world` as a mapping of settings, got {world!r}.")
+    if not isinstance(task, Mapping | None):
+        raise ConfigError(f"Expected `task` as a mapping of settings, got {task!r}.")
     given = {"preset": world} if isinstance(world, str) else dict(world)
     name = given.pop("preset", "paper")
     if name not in PRESETS:
@@ -40,18 +42,20 @@ def read_world(
             f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{registry.hint(name, PRESETS)}"
         )
     preset = PRESETS[name]
-    made_world = _changed_world(preset.world, {**(short or {}), **given})
-    made_rules = _changed(preset.rules, dict(task), "task")
-    changes = _differences(preset.world, made_world) + _differences(preset.rules, made_rules)
-    return made_world, made_rules, " ".join([name, *changes])
+    further = dict(short or {})
+    if set(_BUDGETS) & set(given):
+        further = {key: value for key, value in further.items() if key not in _BUDGETS}
+    changed_world = _changed_world(preset.world, {**further, **given})
+    rules = _changed(preset.rules, dict(task or {}), "task")
+    changes = _differences(preset.world, changed_world) + _differences(preset.rules, rules)
+    return changed_world, rules, " ".join([name, *changes])
 
 
 def _changed_world(preset: World, given: dict[str, Any]) -> World:
     """Replaces fields of a world; of the two ways to give a time budget one takes the other's place."""
-    budgets = {"time_budget_s", "time_budget_ratio"}
-    named = {name for name in budgets if given.get(name) is not None}
+    named = {name for name in _BUDGETS if given.get(name) is not None}
     if len(named) == 1:
-        given = given | dict.fromkeys(budgets - named)
+        given = given | dict.fromkeys(set(_BUDGETS) - named)
     made: World = _changed(preset, given, "world")
     if "correlation_m" in given and made.noise != "frozen":
         raise ConfigError(
@@ -74,7 +78,7 @@ def _changed(value: Any, changes: dict[str, Any], where: str) -> Any:
             made[name] = None
         elif isinstance(like, FreeSpace | Immobile) and isinstance(change, Mapping):
             made[name] = _changed(like, dict(change), f"{where}.{name}")
-        elif isinstance(like, float) and isinstance(change, int | float) and change is not True:
+        elif isinstance(like, float) and isinstance(change, int | float) and not isinstance(change, bool):
             made[name] = float(change)
         elif isinstance(like, str) and isinstance(change, str):
             made[name] = change

@@ -80,11 +80,12 @@ class World:
             top_speed_mps: of the robot.
 
         Returns:
-            Seconds, shape [B].
+            Seconds, float64, shape [B].
 
         Raises:
             ConfigError: T is a multiple of a reference time that is not there.
         """
+        reference_time_s = reference_time_s.double()
         if self.time_budget_s is not None:
             return torch.full_like(reference_time_s, self.time_budget_s)
         assert self.time_budget_ratio is not None
@@ -101,7 +102,7 @@ class World:
         Raises:
             ConfigError: there is none.
         """
-        steps = (budget_s.double() / dt_s).round().long()
+        steps = (budget_s / dt_s).round().long()
         if bool((steps < 1).any()):
             raise ConfigError(
                 f"Expected a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s."
@@ -118,9 +119,12 @@ class World:
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> "World":
         """Reads what `to_dict` gave."""
-        immobile = Immobile(**plain["immobile"]) if "immobile" in plain else None
-        budget = {"time_budget_s": None} if "time_budget_ratio" in plain else {}
-        return cls(**{**plain, **budget, "immobile": immobile})
+        settings = dict(plain)
+        if "immobile" in plain:
+            settings["immobile"] = Immobile(**plain["immobile"])
+        if "time_budget_ratio" in plain:
+            settings["time_budget_s"] = None
+        return cls(**settings)
 
 
 @dataclass(frozen=True, kw_only=True)

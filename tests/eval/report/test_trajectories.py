@@ -39,7 +39,12 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
 
     outcomes = {("a", 1): "success", ("b", 1): "success", ("a", 2): "success", ("b", 2): "immobilised"}
     every = [ended(*place, outcome) for place, outcome in outcomes.items()]
-    every += [ended("a", 3, "success"), ended("b", 3, "stuck"), ended("b", 0, "stuck"), ended("c", 0, "success")]
+    every += [
+        ended("a", 3, "success"),
+        ended("b", 3, "stuck"),
+        ended("b", 0, "stuck"),
+        ended("c", 0, "success"),
+    ]
     assert chosen(every, ["a", "b", "c"]) == [("a", "2"), ("b", "2"), ("c", "0")]
 
 

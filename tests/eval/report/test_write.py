@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.report import write
 from benchnav.eval.report.playback import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
 from benchnav.eval.stats.intervals import summarise
@@ -170,3 +171,22 @@ def test_a_run_of_0_1_is_reported(tmp_path: Path) -> None:
     assert "| std | mppi¹ | mean | 50 | 9–91 | 29.8 ± 0.4 | 29.5 | 82.8 ± 6.6 | 1 timeout |" in text
     assert "benchnav-eval run --model oracle" in text
     assert (folder / "figures" / "success.png").stat().st_size > 1000
+
+
+def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_failed(tmp_path: Path) -> None:
+    """Two trials met the same three draws, of which one was the third; one of a resampled world met none."""
+    worlds = {"a": "frozen", "b": "frozen", "c": "resampled"}
+    trials = {name: {"value": {"world": {"noise": noise}}} for name, noise in worlds.items()}
+    rows = pd.DataFrame(
+        {
+            "trial": ["a"] * 2 + ["b"] * 2 + ["c"] * 2,
+            "data": "d", "scenario": "std", "seed": 0, "realisation": 0,
+            "world": ["stakes"] * 4 + ["paper"] * 2,
+            "instance": [0, 1] * 3,
+            "redrawn": [0, 0, 2, 0, 0, 0],  # the model of the first failed: it drew nothing
+        }
+    )  # fmt: skip
+    (line,) = write._redrawn(rows, trials)
+    assert line.startswith("Of the draws of λ 50.0 %")
+    assert write._redrawn(rows[rows["trial"] == "c"], trials) == []
+    assert write._redrawn(rows.drop(columns="redrawn"), trials) == []
