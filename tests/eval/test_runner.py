@@ -186,13 +186,13 @@ def test_a_run_is_extended_by_what_is_missing(
 
 
 def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
-    dataset = factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=23))
+    dataset = factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=53))
     folder, suite = tmp_path / "run", quick(dataset, scenarios=("std",), risks=("mean",))
     sizes = []
-    for instances in (20, 22, 0, 4):
+    for instances in (50, 52, 0, 4):
         rows = finish(replace(suite, instances=instances), folder)
         sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
-    assert sizes == [(20, 1), (22, 2), (23, 2), (23, 2)]
+    assert sizes == [(50, 1), (52, 2), (53, 2), (53, 2)]
     same(rows, finish(replace(suite, instances=0), tmp_path / "fresh"))
 
 

@@ -1,6 +1,6 @@
 """What each unit of a suite is given: every setting reaches the episodes that it is meant for, and no other.
 
-A spy planner writes down what it sees, on 25 maps that are not square, in two blocks a cell, with two
+A spy planner writes down what it sees, on 54 maps that are not square, in two blocks a cell, with two
 workers; expectations are worked out here from the dataset and the random streams alone.
 """
 
@@ -20,7 +20,7 @@ from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
 from tests import factories
 
-MAPS, SEEDS, REALISATIONS = 25, (3, 4), 2
+MAPS, SEEDS, REALISATIONS = 54, (3, 4), 2
 SCENARIOS = ("std", "hg")
 RISKS = {"mean": lambda m: m.mean(), "cvar:0.5": lambda m: m.cvar(0.5)}
 GAINS = {"quiet": 1.0, "loud": 2.5}
@@ -129,7 +129,7 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
         assert note["start"][:, :2].tolist() == [[3.0, 4.0]] * len(instances)
         assert note["time_budget_s"] == pytest.approx(0.6)
         assert note["components"] == 1
-    blocks = (tuple(range(20)), tuple(range(20, 25)))
+    blocks = (tuple(range(50)), tuple(range(50, MAPS)))
     wanted = {
         (scenario, risk, block, seed, realisation, noise, gain)
         for scenario in SCENARIOS

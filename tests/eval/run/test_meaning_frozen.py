@@ -1,6 +1,6 @@
 """What each unit of a suite meets where λ is frozen: worked out here from the dataset and the streams alone.
 
-A spy planner writes down what it sees, on 23 maps with places of their own, in two blocks, with two workers.
+A spy planner writes down what it sees, on 53 maps with places of their own, in two blocks, with two workers.
 """
 
 from collections import Counter
@@ -21,9 +21,9 @@ from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
 from tests import factories
 
-MAPS, SEEDS, REALISATIONS, RATIO = 23, (3, 4), 2, 0.05
+MAPS, SEEDS, REALISATIONS, RATIO = 53, (3, 4), 2, 0.05
 WORLDS = {0.5: 0.05, 2.0: 0.6}  # ℓ in metres, and what λ holds a robot
-BLOCKS = (tuple(range(20)), tuple(range(20, MAPS)))
+BLOCKS = (tuple(range(50)), tuple(range(50, MAPS)))
 
 
 @pytest.fixture(scope="module")
