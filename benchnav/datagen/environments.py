@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-Unit = tuple[int, ...]
+AlikeClasses = tuple[int, ...]
 
 
 def deal_classes(count: int, shown: int, environment: int) -> np.ndarray:
@@ -32,7 +32,7 @@ def deal_classes(count: int, shown: int, environment: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def deal_units(units: tuple[Unit, ...], shown: int, environments: int) -> np.ndarray:
+def deal_units(units: tuple[AlikeClasses, ...], shown: int, environments: int) -> np.ndarray:
     """The classes of all environments, dealt by units so that all are shown about equally often.
 
     Those shown least come first; among them the order is that of the pack, as in `deal_classes`, with
@@ -62,7 +62,7 @@ def deal_units(units: tuple[Unit, ...], shown: int, environments: int) -> np.nda
     return table
 
 
-def never_shown(units: tuple[Unit, ...], shown: int) -> list[Unit]:
+def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasses]:
     """The units that no choice of others fills an environment of `shown` classes with."""
     lost = []
     for number, unit in enumerate(units):
@@ -77,7 +77,7 @@ def strides(count: int) -> list[int]:
     return [s for s in (3, 1, *range(2, count)) if np.gcd(s, count) == 1]
 
 
-def _fill(order: list[int], units: tuple[Unit, ...], room: int) -> list[int]:
+def _fill(order: list[int], units: tuple[AlikeClasses, ...], room: int) -> list[int]:
     """The first units in their order that fill the room exactly; those with which nothing would are left out."""
     dealt = []
     for position, unit in enumerate(order):

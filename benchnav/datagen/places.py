@@ -17,7 +17,7 @@ _CANDIDATES = 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class Places:
+class PlacesRule:
     """A rule for start and goal: uniform over the map but its margin, and some way apart.
 
     Args:
@@ -37,7 +37,7 @@ class Places:
             )
 
 
-def check_places(places: Places, grid: Grid) -> None:
+def check_places(places: PlacesRule, grid: Grid) -> None:
     """Refuses a rule that maps of a grid have no room for.
 
     Raises:
@@ -63,7 +63,9 @@ def check_places(places: Places, grid: Grid) -> None:
         )
 
 
-def draw_places(places: Places, grid: Grid, key: int, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def draw_places(
+    places: PlacesRule, grid: Grid, key: int, indices: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Draws start and goal of some maps: of a map's candidate pairs the first that is far enough apart.
 
     Where none is, as may be when hardly any two places are so far apart, opposite corners are taken.
@@ -87,7 +89,7 @@ def draw_places(places: Places, grid: Grid, key: int, indices: np.ndarray) -> tu
     return chosen[:, 0], chosen[:, 1]
 
 
-def _inside(places: Places, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _inside(places: PlacesRule, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """The first step inside the margin along x and y, and the number of steps inside, each of shape [2]."""
     extent = np.asarray(grid.extent_m)
     first = np.ceil(places.margin_m * _STEPS_A_M)

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 import yaml
 
-from benchnav.datagen.environments import Unit, deal_classes, deal_units
+from benchnav.datagen.environments import AlikeClasses, deal_classes, deal_units
 from benchnav.datagen.latent import TerrainClass, twins
-from benchnav.datagen.places import Places
+from benchnav.datagen.places import PlacesRule
 from benchnav.datagen.plain_data import parse, plain
 from benchnav.datagen.presets import PRESETS, RECIPES, Scenario, load_presets, resolve
 from benchnav.datagen.recipe_rules import check_recipe
@@ -89,7 +89,7 @@ class Recipe:
     splits: dict[str, Split]
     stuck_threshold: float = 0.3
     synthesis: int = 1
-    places: Places | None = None
+    places: PlacesRule | None = None
     correlation_m: float = 0.0
 
     def __post_init__(self) -> None:
@@ -107,7 +107,7 @@ class Recipe:
         return row.numpy(), column.numpy()
 
     @cached_property
-    def units(self) -> tuple[Unit, ...]:
+    def units(self) -> tuple[AlikeClasses, ...]:
         """Classes that are shown together: in synthesis 2 those of one colour, in the table's order."""
         if self.synthesis == 1:
             return tuple((number,) for number in range(len(self.classes)))

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchnav.datagen.latent import SoftSpots, TerrainClass
-from benchnav.datagen.places import Places
+from benchnav.datagen.places import PlacesRule
 from benchnav.datagen.scenario import Recipe, Split, load_recipe
 
 SOFT = SoftSpots(weight=0.1, mean=0.05, std=0.05)
@@ -17,7 +17,7 @@ def small_stakes(**changes: Any) -> Recipe:
         "height": 32,
         "width": 32,
         "class_periods_m": (6, 3),
-        "places": Places(least_distance_m=8, margin_m=1),
+        "places": PlacesRule(least_distance_m=8, margin_m=1),
         "splits": {
             "train": Split(scenario="std", maps=8),
             "test/hg": Split(scenario="hg", maps=3, solvable=True),

@@ -11,7 +11,7 @@ import pytest
 
 from benchnav.datagen.appearance import light_direction, shade
 from benchnav.datagen.dem import import_dem
-from benchnav.datagen.places import Places
+from benchnav.datagen.places import PlacesRule
 from benchnav.datagen.schema import quantise
 from benchnav.datagen.store import TerrainDataset
 from benchnav.datagen.validate import find_faults
@@ -529,7 +529,7 @@ def test_the_remedy_of_the_message_is_one(tmp_path: Path, case: str) -> None:
 
 
 def test_places_and_luck_are_drawn_on_real_ground_too(tmp_path: Path) -> None:
-    places = Places(least_distance_m=6, margin_m=1)
+    places = PlacesRule(least_distance_m=6, margin_m=1)
     recipe = small_stakes(height=16, width=24, places=places)
     values = rough(32, 48).astype(np.float64) / 8
     whole = read(write(tmp_path / "dem.tif", values), recipe=recipe, solvable=True)

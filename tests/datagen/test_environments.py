@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchnav.datagen.environments import Unit, deal_units, never_shown
+from benchnav.datagen.environments import AlikeClasses, deal_units, never_shown
 from benchnav.datagen.generate import class_map
 from benchnav.datagen.scenario import load_recipe
 from benchnav.errors import ConfigError
@@ -15,7 +15,7 @@ STAKES = load_recipe("stakes-v1")
 
 
 @st.composite
-def packs(draw: st.DrawFn) -> tuple[tuple[Unit, ...], int]:
+def packs(draw: st.DrawFn) -> tuple[tuple[AlikeClasses, ...], int]:
     sizes = draw(st.lists(st.integers(1, 3), min_size=1, max_size=9))
     ends = np.cumsum(sizes).tolist()
     units = tuple(tuple(range(end - size, end)) for size, end in zip(sizes, ends, strict=True))
@@ -31,7 +31,7 @@ def can_be_filled(sizes: list[int], room: int) -> bool:
 
 @given(packs())
 @settings(max_examples=200, deadline=None)
-def test_deals_are_full_distinct_whole_and_fair(pack: tuple[tuple[Unit, ...], int]) -> None:
+def test_deals_are_full_distinct_whole_and_fair(pack: tuple[tuple[AlikeClasses, ...], int]) -> None:
     units, shown = pack
     lost = never_shown(units, shown)
     for unit in units:
@@ -43,7 +43,7 @@ def test_deals_are_full_distinct_whole_and_fair(pack: tuple[tuple[Unit, ...], in
     rounds = 12 * len(units)
     table = deal_units(units, shown, rounds)
     assert table.shape == (rounds, shown)
-    times: Counter[Unit] = Counter()
+    times: Counter[AlikeClasses] = Counter()
     for dealt in table.tolist():
         assert len(set(dealt)) == shown
         whole = [unit for unit in units if set(unit) <= set(dealt)]

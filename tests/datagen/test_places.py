@@ -8,7 +8,7 @@ from scipy import stats
 
 from benchnav import rng
 from benchnav.datagen.generate import generate
-from benchnav.datagen.places import Places, check_places, draw_places
+from benchnav.datagen.places import PlacesRule, check_places, draw_places
 from benchnav.datagen.scenario import Split, load_recipe, recipe_from_dict
 from benchnav.errors import ConfigError
 from benchnav.terrain import Grid
@@ -18,7 +18,7 @@ KEY = rng.stream_key(0, "places")
 GRID = Grid(40, 64, 0.5)  # 32 m × 20 m
 
 
-def by_rejection(places: Places, count: int) -> np.ndarray:
+def by_rejection(places: PlacesRule, count: int) -> np.ndarray:
     """Pairs drawn one after the other until they are far enough apart, shape [B, 2, 2]."""
     generator = np.random.default_rng(0)
     low = places.margin_m
@@ -29,7 +29,7 @@ def by_rejection(places: Places, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("least", "margin"), [(1.0, 0.0), (10.0, 3.0), (20.0, 2.0)])
 def test_places_are_uniform_inside_the_margin_given_their_distance(least: float, margin: float) -> None:
-    places = Places(least_distance_m=least, margin_m=margin)
+    places = PlacesRule(least_distance_m=least, margin_m=margin)
     pairs = np.stack(draw_places(places, GRID, KEY, np.arange(2000)), axis=1)
     expected = by_rejection(places, 2000)
     assert len(expected) == 2000
@@ -56,7 +56,7 @@ def test_places_keep_to_any_rule_that_there_is_room_for(
     inside = np.array(grid.extent_m) - 2 * margin_m
     diagonal_m = np.sqrt(2) * resolution
     least_m = diagonal_m + least * (np.hypot(*inside) - diagonal_m)
-    places = Places(least_distance_m=max(least_m, 1e-3), margin_m=margin_m)
+    places = PlacesRule(least_distance_m=max(least_m, 1e-3), margin_m=margin_m)
     try:
         check_places(places, grid)
     except ConfigError:
@@ -72,14 +72,14 @@ def test_places_keep_to_any_rule_that_there_is_room_for(
 
 
 def test_a_distance_that_hardly_any_two_places_have_gives_opposite_corners() -> None:
-    places = Places(least_distance_m=float(np.hypot(26, 14)) - 0.01, margin_m=3)
+    places = PlacesRule(least_distance_m=float(np.hypot(26, 14)) - 0.01, margin_m=3)
     start, goal = draw_places(places, GRID, KEY, np.arange(50))
     corners = (np.abs(start - [3, 3]).max(axis=1) < 0.02) & (np.abs(goal - [29, 17]).max(axis=1) < 0.02)
     assert corners.all()
 
 
 def test_a_map_has_its_places_in_any_batch_and_each_stream_its_own() -> None:
-    places = Places(least_distance_m=10, margin_m=1)
+    places = PlacesRule(least_distance_m=10, margin_m=1)
     whole = np.stack(draw_places(places, GRID, KEY, np.arange(9)))
     np.testing.assert_array_equal(
         np.stack(draw_places(places, GRID, KEY, np.array([2, 5]))), whole[:, [2, 5]]
@@ -95,7 +95,7 @@ def test_a_map_has_its_places_in_any_batch_and_each_stream_its_own() -> None:
 
 def test_a_map_drawn_again_has_other_places() -> None:
     # A wall of λ_stuck so high that few draws can be crossed.
-    recipe = small_stakes(stuck_threshold=0.75, places=Places(least_distance_m=12, margin_m=1))
+    recipe = small_stakes(stuck_threshold=0.75, places=PlacesRule(least_distance_m=12, margin_m=1))
     asked = replace(recipe, splits={"test/hg": Split(scenario="hg", maps=12)})
     first, kept = (generate(made, "test/hg", np.arange(12)) for made in (asked, replace_solvable(asked)))
     again = (first["elevation_m"] != kept["elevation_m"]).any(axis=(1, 2))
@@ -123,7 +123,7 @@ def replace_solvable(recipe):
 )
 def test_rules_without_room_are_refused(rule: dict, expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
-        check_places(Places(**{"least_distance_m": 10, "margin_m": 1} | rule), GRID)
+        check_places(PlacesRule(**{"least_distance_m": 10, "margin_m": 1} | rule), GRID)
 
 
 def test_a_recipe_has_either_places_or_a_start_and_a_goal() -> None:

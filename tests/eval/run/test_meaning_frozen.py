@@ -15,7 +15,7 @@ import torch
 
 from benchnav import rng
 from benchnav.copula import correlated_normal
-from benchnav.datagen.places import Places
+from benchnav.datagen.places import PlacesRule
 from benchnav.datagen.store import TerrainDataset
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
@@ -31,7 +31,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
     recipe = factories.tiny_recipe(train=1, valid=1, test_std=MAPS, test_hg=1, test_hs=1)
     recipe = replace(
         recipe, synthesis=2, start_m=None, goal_m=None, correlation_m=1.0,
-        places=Places(least_distance_m=9.0, margin_m=2.0),
+        places=PlacesRule(least_distance_m=9.0, margin_m=2.0),
     )  # fmt: skip
     return TerrainDataset(factories.tiny_dataset(tmp_path_factory.mktemp("data") / "d.h5", recipe))
 
