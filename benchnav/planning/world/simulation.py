@@ -114,8 +114,7 @@ class Simulation:
         outcome = torch.where(step >= self.steps, Outcome.TIMEOUT, Outcome.RUNNING)
         held = now.held
         if self._immobile is not None:
-            count = torch.where(traversability < self._immobile.below, held + 1, 0)
-            held = torch.where(now.running, count, held)
+            held = torch.where(traversability < self._immobile.below, held + 1, 0)
             most = max(1, round(self._immobile.for_s / self.robot.dt_s))
             outcome = torch.where(held >= most, Outcome.IMMOBILISED, outcome)
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)

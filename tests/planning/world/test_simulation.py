@@ -192,6 +192,8 @@ def test_ground_under_the_bound_ends_an_episode_after_its_time_and_other_ground_
     assert now.step.tolist() == [5, 20]
     longer = simulation(even(0.099), FAR, time_budget_s=2.0, immobile=Immobile(below=0.1, for_s=1.2))
     assert held_after(longer, (4.0, 4.0, 0.0)).step.tolist() == [12]
+    slow = simulation(even(0.099), FAR, robot=Unicycle(dt_s=0.5), immobile=Immobile(below=0.1, for_s=2.0))
+    assert held_after(slow, (4.0, 4.0, 0.0)).step.tolist() == [4]
     free = simulation(even(0.0), FAR, time_budget_s=2.0)
     assert held_after(free, (4.0, 4.0, 0.0)).outcome.tolist() == [Outcome.TIMEOUT]
 
