@@ -13,6 +13,8 @@ import numpy as np
 from benchnav import rng
 from benchnav.errors import ConfigError
 
+LONGEST_CORRELATION = 1 / 4  # of a map's shorter side, so that the torus it is made on does not show
+
 
 def correlated_normal(
     key: int, indices: np.ndarray, shape: tuple[int, int], correlation_cells: float
@@ -33,10 +35,10 @@ def correlated_normal(
         ConfigError: ℓ is out of range.
     """
     height, width = shape
-    if not 0 <= correlation_cells <= min(shape) / 4:
+    if not 0 <= correlation_cells <= LONGEST_CORRELATION * min(shape):
         raise ConfigError(
             "Expected a correlation length of at most a quarter of the map's shorter side, "
-            f"{min(shape) / 4:g} cells, got {correlation_cells:g} cells."
+            f"{LONGEST_CORRELATION * min(shape):g} cells, got {correlation_cells:g} cells."
         )
     white = rng.normal(key, indices, (2 * height, 2 * width))
     if correlation_cells == 0:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchnav.copula import LONGEST_CORRELATION
 from benchnav.datagen import latent
 from benchnav.datagen.environments import never_shown
 from benchnav.datagen.places import check_places
@@ -164,8 +165,7 @@ def _check_look_alikes(recipe: "Recipe") -> None:
 
 
 def _check_correlation(recipe: "Recipe") -> None:
-    # As `copula.correlated_normal` asks; said here of the recipe's key.
-    most_m = min(recipe.grid.extent_m) / 4
+    most_m = LONGEST_CORRELATION * min(recipe.grid.extent_m)
     if not 0 <= recipe.correlation_m <= most_m:
         raise ConfigError(
             f"Expected `correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, "

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import load_model
 from benchnav.terrain import Observation
@@ -32,4 +30,4 @@ class OffBy:
             more = (self.factor - 1) * mixture.weights[:, k]
             weights[:, k] += more
             weights[:, mixture.group[k]] -= more
-        return replace(mixture, weights=weights.clamp(min=torch.zeros(())))
+        return replace(mixture, weights=weights)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchnav import rng
-from benchnav.copula import correlated_normal
+from benchnav.copula import LONGEST_CORRELATION, correlated_normal
 from benchnav.errors import ConfigError
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import World
@@ -66,7 +66,7 @@ def check_correlation(world: World, grid: Grid) -> None:
     Raises:
         ConfigError: it is.
     """
-    longest = min(grid.extent_m) / 4
+    longest = LONGEST_CORRELATION * min(grid.extent_m)
     if world.correlation_m > longest:
         raise ConfigError(
             f"Expected `world.correlation_m` of at most {longest:g} m, a quarter of the maps' shorter side, got "
