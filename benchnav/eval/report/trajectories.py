@@ -31,7 +31,8 @@ _MAP = ("data", "scenario", "instance", "seed", "realisation")
 def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapshot]:
     """Chooses one snapshot a trial, all of one map where there are such, at most `MOST_PANELS`.
 
-    Of the maps that the first trial was recorded on it is the first on which outcomes differ, if there is one.
+    Of the maps that the first trial was recorded on it is the first on which outcomes differ, if there is one;
+    else the first on which an episode failed.
 
     Args:
         snapshots: all there are.
@@ -44,7 +45,9 @@ def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapsho
     for snapshot in known:
         outcomes.setdefault(_map(snapshot), set()).add(snapshot.about["outcome"])
     maps = [_map(snapshot) for snapshot in known if snapshot.about["trial"] == known[0].about["trial"]]
-    shown = next((one for one in maps if len(outcomes[one]) > 1), maps[0] if maps else ())
+    differ = [place for place in maps if len(outcomes[place]) > 1]
+    failed = [place for place in maps if outcomes[place] != {"success"}]
+    shown = next(iter([*differ, *failed, *maps]), ())
     known.sort(key=lambda s: _map(s) != shown)
     first: dict[str, Snapshot] = {}
     for snapshot in known:

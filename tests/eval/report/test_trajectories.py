@@ -46,6 +46,9 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
         ended("c", 0, "success"),
     ]
     assert chosen(every, ["a", "b", "c"]) == [("a", "2"), ("b", "2"), ("c", "0")]
+    alike = [ended(trial, 1, "success") for trial in "ab"] + [ended(trial, 2, "stuck") for trial in "ab"]
+    assert chosen(alike, ["a", "b"]) == [("a", "2"), ("b", "2")]
+    assert chosen(alike[:2], ["a", "b"]) == [("a", "1"), ("b", "1")]
 
 
 def test_no_more_than_can_be_seen() -> None:
