@@ -103,7 +103,7 @@ def test_imports_go_one_way(place: Path) -> None:
         ("eval/run/rollout.py", "benchnav.eval.report.tables", False),
         ("eval/stats/intervals.py", "benchnav.eval.run.rows", False),
         ("eval/stats/intervals.py", "benchnav.eval.report.tables", False),
-        ("eval/report/tables.py", "benchnav.eval.stats.intervals", True),
+        ("eval/report/tables.py", "benchnav.eval.stats.summary", True),
         ("eval/report/tables.py", "benchnav.eval.run.folder", True),
         ("eval/report/tables.py", "benchnav.eval.run.rollout", False),
         ("eval/report/tables.py", "benchnav.models.predictor", False),

@@ -70,6 +70,52 @@ def report(folder: str) -> None:
     _print(Path(folder))
 
 
+def compare(
+    folders: list[str],
+    against: str = "",
+    by: str = "",
+    planner: str = "",
+    risk: str = "",
+    scenario: str = "",
+    model: str = "",
+    robot: str = "",
+    objective: str = "",
+    world: str = "",
+    data: str = "",
+    points: float = 5.0,
+    out: str = "",
+) -> None:
+    """Compare trials that met the same maps under the same luck, with intervals and corrected tests.
+
+    Args:
+        folders: Folders of finished runs, one or more.
+        against: What all others are compared with, such as mean or straight; all pairs when not given.
+        by: Label in which trials differ: risk, planner, model, objective, robot, world or run. When not given, that in
+            which `against` is found; run where runs share trials; else risk.
+        planner: Planners that are looked at, as the table calls them, with a comma between; all when not given.
+        risk: Risk settings.
+        scenario: Scenarios.
+        model: Models.
+        robot: Robots.
+        objective: Objectives.
+        world: Worlds.
+        data: Datasets.
+        points: Difference of success in percentage points, for which the maps that it needs are told.
+        out: Path without a suffix; .csv, .md and .tex are written there.
+    """
+    from benchnav.eval.compare import compare_runs, print_comparison, write_comparison
+
+    labels = {
+        **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
+        **{"robot": robot, "objective": objective, "world": world, "data": data},
+    }
+    asked = {name: label for name, label in labels.items() if label}
+    table, shown = compare_runs([Path(folder) for folder in folders], by, against, asked, points / 100)
+    print_comparison(shown)
+    if out:
+        print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
+
+
 def replay(
     folder: str,
     planner: str = "",
@@ -172,6 +218,7 @@ def main() -> None:
         "run": Command(run_command, settings=Suite, configs=SUITES),
         "list": Command(list_command, ("kinds",)),
         "report": Command(report, ("folder",)),
+        "compare": Command(compare, ("folders",)),
         "replay": Command(replay, ("folder",)),
     }
     sys.exit(run("benchnav-eval", "Evaluate planners under risk settings; report and replay.", commands))

@@ -23,7 +23,7 @@ def success_figure(summary: pd.DataFrame) -> Figure:
     seen against.
 
     Args:
-        summary: from `intervals.summarise`.
+        summary: from `summary.summarise`.
     """
     keys = [name for name in _PANEL if name == "scenario" or summary[name].nunique() > 1]
     panels = [(key, rows) for key, rows in summary.groupby(keys, sort=False)]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.stats.intervals import LABELS
+from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 from benchnav.planning.world.outcome import FAILURES
 
@@ -41,7 +41,7 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
     are the numbers of maps and episodes.
 
     Args:
-        summary: from `intervals.summarise`.
+        summary: from `summary.summarise`.
         trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]

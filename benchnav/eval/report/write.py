@@ -17,7 +17,7 @@ from benchnav.eval.report.tables import NOT_USED, ResultTable, result_table
 from benchnav.eval.report.trajectories import choose, trajectory_figure
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.run.folder import ERRORS, open_run, read_table
-from benchnav.eval.stats.intervals import summarise
+from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
 
 _LEGEND = (
@@ -79,7 +79,7 @@ def write_report(folder: Path) -> pd.DataFrame:
         folder: a finished run.
 
     Returns:
-        The summary, a row a trial; see `intervals.summarise`.
+        The summary, a row a trial; see `summary.summarise`.
     """
     report = read_report(folder)
     write_text(folder / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))

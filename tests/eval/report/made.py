@@ -9,7 +9,7 @@ import torch
 
 from benchnav.eval.report.drawn_plan import drawn_plan
 from benchnav.eval.report.recording import Recording
-from benchnav.eval.stats.intervals import LABELS
+from benchnav.eval.stats.summary import LABELS
 from benchnav.terrain import Grid
 
 PAPER = {

@@ -7,7 +7,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from benchnav.eval.report.success import success_figure
-from benchnav.eval.stats.intervals import summarise
+from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}

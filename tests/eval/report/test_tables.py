@@ -3,7 +3,7 @@ import pytest
 
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.tables import failures_in_words, result_table
-from benchnav.eval.stats.intervals import summarise
+from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}

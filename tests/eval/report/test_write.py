@@ -10,7 +10,7 @@ from benchnav.errors import ConfigError
 from benchnav.eval.report import write
 from benchnav.eval.report.playback import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
-from benchnav.eval.stats.intervals import summarise
+from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 VERSION_1 = Path(__file__).parent.parent.parent / "data" / "run-1"

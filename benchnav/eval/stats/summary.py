@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from benchnav.eval.stats.difference import mean_intervals
 from benchnav.planning.world.outcome import FAILURES
 
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
@@ -82,10 +83,20 @@ def summarise(episodes: pd.DataFrame) -> pd.DataFrame:
         `success_low`, `success_high` on the number of episodes over `design_effect`. Of each quantity
         `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
         counted as T; time of the successes alone; λ met; time over the reference time; score; path length;
-        share of stuck steps; roughness. `planning_ms_median`; `compiled_share`; and `OUTCOME_count` of each
-        failure.
+        share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
+        a bootstrap over maps. `planning_ms_median`; `compiled_share`; and `OUTCOME_count` of each failure.
     """
-    return pd.DataFrame([_summarise_trial(group) for _, group in episodes.groupby("trial", sort=False)])
+    groups = [group for _, group in episodes.groupby("trial", sort=False)]
+    summary = pd.DataFrame([_summarise_trial(group) for group in groups])
+    by_map = [
+        group.groupby(list(MAP), sort=False, dropna=False)["total_time_s"].mean().to_numpy()
+        for group in groups
+    ]
+    _, low, high = mean_intervals(by_map)
+    place = summary.columns.get_loc("total_time_std_s") + 1
+    summary.insert(place, "total_time_low_s", low)
+    summary.insert(place + 1, "total_time_high_s", high)
+    return summary
 
 
 def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray, weighted: float) -> float:

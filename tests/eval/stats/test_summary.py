@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from benchnav.eval.stats.intervals import design_effect, summarise, wilson_interval
+from benchnav.eval.stats.summary import design_effect, summarise, wilson_interval
 from tests.eval.report.made import row, rows, trial
 
 

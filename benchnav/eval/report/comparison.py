@@ -1,0 +1,102 @@
+"""The table of a comparison, formatted, with what has to be known to read it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.eval.report.tables import ResultTable
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.summary import LABELS
+from benchnav.eval.trial import NOT_USED
+
+_LABELS = (*LABELS, "run")
+
+
+def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
+    """Formats a comparison: success in percentage points, times in seconds, p after Holm's correction.
+
+    Args:
+        table: from `comparison.compare`.
+        difference: of success, that `maps_needed` is for.
+    """
+    shown = [name for name in _LABELS if name in table and _differs(table[name])]
+    counts = ["n_maps"] if table["n_maps"].nunique() > 1 else []
+    headings = (
+        *shown,
+        "",
+        "against",
+        *("maps" for _ in counts),
+        "Succ. [%]",
+        "Δ [points]",
+        "95 %",
+        "p",
+        "told apart",
+        "shows from",
+        "Δ T_total [s]",
+        "95 %",
+        "p",
+        "Δ T if both arrive [s]",
+        "95 %",
+    )
+    rows = [
+        (
+            *(row[name] for name in shown),
+            row["one"],
+            row["other"],
+            *(str(row[name]) for name in counts),
+            *_results(row),
+        )
+        for row in table.to_dict("records")
+    ]
+    return ResultTable(
+        headings=headings, labels=len(shown) + 2, rows=tuple(rows), notes=_notes(table, difference)
+    )
+
+
+def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    return (
+        f"{100 * row['success_one']:.0f} : {100 * row['success_other']:.0f}",
+        _signed(100 * row["success_difference"]),
+        _range(100 * row["success_low"], 100 * row["success_high"]),
+        _p(row["success_p_holm"]),
+        "yes" if row["success_p_holm"] < ALPHA else "no",
+        f"{100 * row['success_shown']:.0f}",
+        _signed(row["time_difference_s"]),
+        _range(row["time_low_s"], row["time_high_s"]),
+        _p(row["time_p_holm"]),
+        _signed(row["arrival_time_difference_s"]),
+        _range(row["arrival_time_low_s"], row["arrival_time_high_s"]),
+    )
+
+
+def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
+    pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
+    points = f"{100 * difference:g} points"
+    needed = table["maps_needed"]
+    maps = f"{needed.min()}" if needed.nunique() == 1 else f"{needed.min()} to {needed.max()}"
+    return (
+        f"Family: {pairs}. Holm's correction is over all of them, for success and for T_total apart.",
+        "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
+        "interval of Bonett and Price. T_total: a failure counts as T; Wilcoxon's signed-rank test, bootstrap over "
+        "maps.",
+        "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %. "
+        f"A difference of {points} needs {maps} maps.",
+    )
+
+
+def _differs(labels: pd.Series) -> bool:
+    return labels[labels != NOT_USED].nunique() > 1
+
+
+def _signed(value: float) -> str:
+    return NOT_USED if np.isnan(value) else f"{round(value, 1) + 0.0:+.1f}"  # no minus before a zero
+
+
+def _range(low: float, high: float) -> str:
+    return NOT_USED if np.isnan(low) else f"{_signed(low)} to {_signed(high)}"
+
+
+def _p(value: float) -> str:
+    return "< 0.0001" if value < 1e-4 else f"{value:.2g}"
