@@ -7,6 +7,7 @@ was immobilised, and time series; and a blueprint that arranges them.
 
 import re
 from collections.abc import Sequence
+from datetime import timedelta
 from pathlib import Path
 
 import matplotlib
@@ -73,7 +74,10 @@ def write_recording(recording: Recording, path: Path) -> None:
     """
     import rerun as rr
 
-    stream = rr.RecordingStream(APPLICATION, recording_id=_plain(path.stem))
+    # Written in pieces by their size alone: by the clock, a busy machine would make many small ones of them.
+    pieces = rr.ChunkBatcherConfig.DEFAULT()
+    pieces.flush_tick = timedelta(hours=1)
+    stream = rr.RecordingStream(APPLICATION, recording_id=_plain(path.stem), batcher_config=pieces)
     with replacing(path) as partial:
         stream.save(partial, default_blueprint=arrange(recording))
         try:
