@@ -74,13 +74,7 @@ def test_a_blind_planner_goes_with_every_setting_and_model() -> None:
 def test_luck_is_matched_episode_by_episode() -> None:
     def timed(labels: dict[str, str], late: float) -> list[dict[str, Any]]:
         return [
-            row(
-                labels,
-                instance,
-                30.0 + instance + 10 * realisation + 100 * seed + late,
-                seed=seed,
-                realisation=realisation,
-            )
+            row(labels, i, 30.0 + i + 10 * draw + 40 * seed + late, seed=seed, realisation=draw)
             for seed in (1, 0)
             for draw in (0, 1)
             for i in range(3)
