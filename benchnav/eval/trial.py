@@ -16,6 +16,7 @@ from typing import Any
 from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.eval.suite import Suite
+from benchnav.eval.sweep import each_mapping, each_part
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.problem import Task
 from benchnav.planning.risk import RiskMeasure
@@ -197,11 +198,16 @@ def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Ite
         "robot": chosen("robots", suite.robots),
         "objective": chosen("objectives", suite.objectives),
     }
-    ready = {kind: [_part(kind, part, suite) for part in listed] for kind, listed in parts.items()}
+    ready = {
+        kind: [part for given in listed for part in _parts(kind, given, suite)]
+        for kind, listed in parts.items()
+    }
     worlds = [
         _world(suite, world, task)
-        for world in chosen("world", (suite.world,))
-        for task in chosen("task", (suite.task,))
+        for listed_world in chosen("world", (suite.world,))
+        for world in each_mapping(listed_world)
+        for listed_task in chosen("task", (suite.task,))
+        for task in each_mapping(listed_task)
     ]
     for data in chosen("data", (suite.data,)):
         for scenario, (world, rules, label), robot, objective, model, risk, planner in itertools.product(
@@ -216,13 +222,15 @@ def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Ite
             yield _as_run_once(trial)
 
 
-def _part(kind: str, given: Any, suite: Suite) -> Part:
-    if kind == "model":
-        return read_model(given)
+def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
+    """What is given as one part: several where options are given lists of values."""
     part = registry.read_part(kind, given)
+    if kind == "model" and part.part not in registry.names("model") and ":" not in part.part:
+        return [read_model(part)]
     if kind == "planner" and part.part in suite.planner_options:
         part = replace(part, options={**suite.planner_options[part.part], **part.options})
-    return registry.complete(kind, part)
+    every = each_part(kind, part)
+    return [read_model(one) if kind == "model" else registry.complete(kind, one) for one in every]
 
 
 def read_model(given: Any) -> Part:

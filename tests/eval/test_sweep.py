@@ -1,0 +1,109 @@
+from typing import Any
+
+import pytest
+
+from benchnav.errors import ConfigError
+from benchnav.eval.suite import Suite
+from benchnav.eval.sweep import each_mapping, each_part
+from benchnav.eval.trial import Trial, trials_of
+from benchnav.registry import complete, read_part
+
+
+def parts(kind: str, given: Any) -> list[tuple[str, dict[str, Any]]]:
+    return [(part.label, dict(part.options)) for part in each_part(kind, read_part(kind, given))]
+
+
+def trials(**settings: Any) -> list[Trial]:
+    return trials_of(Suite(model="oracle", **settings), lambda data: ["std"])
+
+
+def test_a_list_of_levels_is_a_part_each_labelled_as_on_the_command_line() -> None:
+    given = {"part": "cvar", "options": {"level": [0.5, 0.9]}}
+    assert parts("risk", given) == [("cvar:0.5", {"level": 0.5}), ("cvar:0.9", {"level": 0.9})]
+    assert parts("risk", "cvar:0.9") == [("cvar:0.9", {"level": 0.9})]
+    assert parts("risk", "mean") == [("mean", {})]
+
+
+def test_several_lists_are_a_product_with_labels_of_their_own() -> None:
+    given = {
+        "part": "astar_dwa",
+        "label": "dwa",
+        "options": {"by_time": [False, True], "dwa": {"horizon": [20, 50], "speeds": 5}},
+    }
+    assert parts("planner", given) == [
+        (
+            f"dwa by_time={by_time} dwa.horizon={horizon}",
+            {"by_time": by_time, "dwa": {"horizon": horizon, "speeds": 5}},
+        )
+        for by_time in (False, True)
+        for horizon in (20, 50)
+    ]
+
+
+def test_a_list_that_the_option_takes_is_one_value() -> None:
+    given = {"part": "mppi", "options": {"noise": [0.3, 0.6], "samples": [8, 16]}}
+    assert [label for label, _ in parts("planner", given)] == ["mppi samples=8", "mppi samples=16"]
+    pairs = {"part": "mppi", "options": {"noise": [[0.3, 0.6], [0.5, 0.5]]}}
+    made = [complete("planner", part) for part in each_part("planner", read_part("planner", pairs))]
+    assert [list(part.options["noise"]) for part in made] == [[0.3, 0.6], [0.5, 0.5]]
+
+
+def test_mappings_are_expanded_at_any_depth() -> None:
+    given = {"preset": "stakes", "correlation_m": [1, 2], "immobile": {"below": [0.1, 0.2], "for_s": 3}}
+    assert each_mapping(given) == [
+        {"preset": "stakes", "correlation_m": ell, "immobile": {"below": below, "for_s": 3}}
+        for ell in (1, 2)
+        for below in (0.1, 0.2)
+    ]
+    assert each_mapping("stakes") == ["stakes"]
+    assert each_mapping({"preset": "stakes"}) == [{"preset": "stakes"}]
+
+
+def test_a_suite_sweeps_levels_planners_worlds_and_tasks() -> None:
+    found = trials(
+        planners=[{"part": "mppi", "options": {"horizon": [10, 20]}}],
+        risks=["mean", {"part": "cvar", "options": {"level": [0.5, 0.9]}}],
+        world={"preset": "stakes", "correlation_m": [1.0, 2.0]},
+        task={"slowest": [0.05, 0.1]},
+    )
+    assert len(found) == 2 * 3 * 2 * 2
+    values = {
+        (t.planner.options["horizon"], t.risk.label, t.world.correlation_m, t.rules.slowest) for t in found
+    }
+    assert len(values) == len(found)
+    assert {t.world_label for t in found} == {
+        f"stakes correlation_m={ell}{rest}" for ell in (1, 2) for rest in ("", " slowest=0.1")
+    }
+
+
+def test_a_sweep_in_one_of_several_products_is_its_own() -> None:
+    swept = {
+        "planners": [{"part": "mppi", "options": {"samples": [8, 16]}}],
+        "world": [{"preset": "stakes", "time_budget_ratio": [2, 3]}],
+    }
+    found = trials(planners=["straight"], risks=["mean"], trials=[{}, swept])
+    assert [t.labels["planner"] for t in found] == ["straight"] + ["mppi samples=8", "mppi samples=16"] * 2
+    assert [t.world.time_budget_ratio for t in found[1:]] == [2, 2, 3, 3]
+
+
+def test_options_of_a_planner_given_apart_are_swept_too() -> None:
+    found = trials(planners=["mppi"], risks=["mean"], planner_options={"mppi": {"samples": [8, 16]}})
+    assert [t.planner.options["samples"] for t in found] == [8, 16]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"risks": [{"part": "cvar", "options": {"level": []}}]}, "one or more values of `level`"),
+        (
+            {"world": {"preset": "stakes", "immobile": {"below": []}}},
+            "one or more values of `immobile.below`",
+        ),
+        ({"risks": [{"part": "cvar", "options": {"level": [0.5, "high"]}}]}, "level"),
+        ({"risks": [{"part": "cvar", "options": {"levels": [0.5]}}]}, "levels"),
+        ({"risks": [{"part": "cvar", "options": {"level": [0.5, 0.5]}}]}, "Expected settings that differ"),
+    ],
+)
+def test_bad_sweeps_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        trials(**{"planners": ["mppi"], **settings})
