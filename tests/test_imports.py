@@ -23,7 +23,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning/env_batch.py": (*PLANNING, "planning.world", "datagen.store"),
     "eval": ("eval", "models", "planning", "datagen"),
     "eval/run": ("eval.run", "eval.suite", "eval.trial", "models", "planning", "datagen"),
-    "eval/stats": ("eval.stats", "planning"),
+    "eval/stats": ("eval.stats", "eval.trial", "planning"),
     "eval/report": ("eval.report", "eval.stats", "eval.run.folder", "eval.suite", "eval.trial", "planning"),
 }
 

@@ -80,7 +80,7 @@ def _with(options: Mapping[str, Any], chosen: Mapping[tuple[str, ...], Any]) -> 
 
 
 def _label(label: str, chosen: Mapping[tuple[str, ...], Any], first: str | None) -> str:
-    if list(chosen) == [(first,)]:
+    if first is not None and list(chosen) == [(first,)]:
         return f"{label}:{_text(chosen[(first,)])}"
     return " ".join([label, *(f"{'.'.join(path)}={_text(value)}" for path, value in chosen.items())])
 

@@ -123,8 +123,9 @@ def mean_intervals(values: Sequence[np.ndarray]) -> np.ndarray:
     made = np.full((3, len(values)), np.nan)
     sizes = np.array([len(one) for one in values])
     for size in np.unique(sizes[sizes > 0]):
-        alike = np.flatnonzero(sizes == size)
-        made[:, alike] = mean_interval(np.stack([values[i] for i in alike]))
+        alike = sizes == size
+        rows = [one for one, same in zip(values, alike, strict=True) if same]
+        made[:, alike] = mean_interval(np.stack(rows))
     return made
 
 
