@@ -44,7 +44,7 @@ def compare_runs(
     if not 0 < difference <= 1:
         raise ConfigError(f"Expected `points` in (0, 100], got {100 * difference:g}.")
     runs = [open_run(folder) for folder in folders]
-    pairs = find_pairs(_chosen(_read(runs), asked), by, against)
+    pairs = find_pairs(_chosen(read_trials(runs), asked), by, against)
     table = compare(pairs, difference)
     shown = comparison_table(table, difference)
     notes = (*_about(pairs, table), *shown.notes, *_sources(runs))
@@ -80,7 +80,12 @@ def print_comparison(shown: ResultTable) -> None:
     print(to_terminal(shown, width).rstrip())
 
 
-def _read(runs: Sequence[Run]) -> list[Compared]:
+def read_trials(runs: Sequence[Run]) -> list[Compared]:
+    """Reads the trials of runs, each with its episodes.
+
+    Raises:
+        ConfigError: a run is not finished, or of format version 1, or there twice.
+    """
     for run in runs:
         if run.version == 1:
             raise ConfigError(

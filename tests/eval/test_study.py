@@ -1,6 +1,7 @@
 """The suites of docs/risk.md can be run as they are written, and its script says what is so."""
 
 import importlib.util
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -10,6 +11,8 @@ import yaml
 
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
+from tests.eval.report.made import row, rows, trial
+from tests.eval.test_compare import run_folder
 
 ROOT = Path(__file__).parents[2]
 STUDY = ROOT / "docs" / "risk"
@@ -31,42 +34,42 @@ def test_each_suite_makes_trials(path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert len(trials) >= 6
 
 
-def rows(**success: list[bool]) -> pd.DataFrame:
-    """Episodes on the same maps under settings, with times of 10 s and, where they fail, 30 s."""
-    made = [
-        {
-            "data": "d", "scenario": "std", "world": "stakes", "planner": "p", "model": "m", "risk": risk,
-            "seed": 0, "realisation": 0, "instance": i, "success": won, "total_time_s": 10.0 if won else 30.0,
-        }
+def made(**success: Sequence[bool]) -> pd.DataFrame:
+    """Episodes on the same maps under settings."""
+    return rows(
+        row(trial("mppi", risk), i, 30.0 if won else None)
         for risk, each in success.items()
         for i, won in enumerate(each)
-    ]  # fmt: skip
-    return pd.DataFrame(made)
+    )
 
 
-def test_a_pair_is_compared_map_by_map() -> None:
-    pairs = script("pairs")
-    # 9 maps won by the second alone, 1 by the first alone: the exact McNemar test is 2 · 11 / 2¹⁰.
-    data = rows(first=[False] * 9 + [True] + [True] * 10, second=[True] * 9 + [False] + [True] * 10)
-    ((name, members),) = pairs.families(data, "risk")
-    table = pairs.compared(members, "").iloc[0]
-    assert (name, table["one"], table["other"]) == ("all", "second", "first")
-    assert table["success"] == pytest.approx(40)
-    assert table["success_low"] < 40 < table["success_high"]
-    assert table["success_p"] == pytest.approx(22 / 1024)
-    assert table["time"] == pytest.approx(-8)
+def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path) -> list[str]:
+    monkeypatch.setattr("sys.argv", ["order.py", str(folder)])
+    script("order").main()
+    return capsys.readouterr().out.split("\n")
 
 
-def test_settings_that_are_equally_good_have_an_order_too(capsys: pytest.CaptureFixture[str]) -> None:
-    pairs = script("pairs")
-    ((name, members),) = pairs.families(rows(first=[True] * 4, second=[True] * 4), "risk")
-    pairs.print_order(name, members)
-    assert "+0 (" in capsys.readouterr().out
+def test_the_best_is_told_from_the_worst(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    # 10 of 12 maps are won by the best alone: the exact test is 2 / 2¹⁰, threefold by Holm's correction.
+    episodes = made(cvar=[True] * 11 + [False], mean=[True] + [False] * 11, var=[True, False] * 6)
+    lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", episodes))
+    assert lines[1] == "| | cvar | mean | var | best − worst [points] (95 %) | p |"
+    assert lines[3].startswith("| all | 91.7 | 8.3 | 50.0 | cvar − mean +83.3 (+")
+    assert lines[3].endswith(f"| {3 * 2 / 2**10:.2g} |")
 
 
-def test_the_clairvoyant_stands_beside_each_setting() -> None:
-    pairs = script("pairs")
-    data = rows(mean=[True, False], cvar=[True, True])
-    knowing = rows(mean=[True, True]).assign(model="clairvoyant", risk="–")
-    found = {name: set(members) for name, members in pairs.families(pd.concat([data, knowing]), "model")}
-    assert found == {"mean": {"m", "clairvoyant"}, "cvar": {"m", "clairvoyant"}}
+def test_the_gain_has_the_sign_of_the_best(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    for name, order in (("a", ("mean", "cvar")), ("b", ("cvar", "mean"))):
+        won = {"mean": [True] * 2 + [False] * 10, "cvar": [True] * 9 + [False] * 3}
+        folder = run_folder(tmp_path / name, made(**{risk: won[risk] for risk in order}))
+        text = printed(monkeypatch, capsys, folder)[3]
+        assert "cvar − mean +58.3 (+" in text
+
+
+def test_each_variant_has_a_row(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
+    other = episodes.assign(model="oracle", trial=episodes["trial"] + "o", success=True)
+    lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", pd.concat([episodes, other])))
+    assert [line.split(" |")[0] for line in lines[3:5]] == ["| paper-v1", "| oracle"]
+    assert "| 100.0 | 50.0 |" in lines[3]
+    assert "| 100.0 | 100.0 |" in lines[4]

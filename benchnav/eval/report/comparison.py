@@ -57,7 +57,7 @@ def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
 
 def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
     return (
-        f"{100 * row['success_one']:.0f} : {100 * row['success_other']:.0f}",
+        f"{_short(100 * row['success_one'])} : {_short(100 * row['success_other'])}",
         _signed(100 * row["success_difference"]),
         _range(100 * row["success_low"], 100 * row["success_high"]),
         _p(row["success_p_holm"]),
@@ -88,6 +88,10 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
 
 def _differs(labels: pd.Series) -> bool:
     return labels[labels != NOT_USED].nunique() > 1
+
+
+def _short(value: float) -> str:
+    return f"{value:.1f}".removesuffix(".0")
 
 
 def _signed(value: float) -> str:

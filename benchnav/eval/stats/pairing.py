@@ -65,6 +65,9 @@ def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> l
             trials; else `risk`.
         against: a value of the label, which all others are compared with; all pairs when not given.
 
+    Returns:
+        Pairs, those with the same other labels together.
+
     Raises:
         ConfigError: there is nothing to compare, or it cannot be paired.
     """
@@ -89,7 +92,8 @@ def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> l
             f"Expected trials that differ in their {by} and in nothing else, got {by} {', '.join(values)}"
             " of which no two go together. Say what is compared with `--by`."
         )
-    return pairs
+    families = list(dict.fromkeys(tuple(pair.shared.values()) for pair in pairs))
+    return sorted(pairs, key=lambda pair: families.index(tuple(pair.shared.values())))
 
 
 def _label_of(trials: Sequence[Compared], against: str) -> str:
