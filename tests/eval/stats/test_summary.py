@@ -3,6 +3,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
+from benchnav.eval.stats.difference import mean_interval
 from benchnav.eval.stats.summary import design_effect, summarise, wilson_interval
 from tests.eval.report.made import row, rows, trial
 
@@ -168,3 +169,23 @@ def test_planning_time_is_the_median_and_compilation_a_share() -> None:
     )
     assert found["planning_ms_median"] == 2.5
     assert found["compiled_share"] == 0.75
+
+
+def test_time_has_the_interval_of_its_own_trial_over_maps() -> None:
+    generator = np.random.default_rng(4)
+    taken = {name: generator.uniform(20, 60, (12, 3)) + late for name, late in (("mppi", 0), ("cl_rrt", 30))}
+    summary = summarise(
+        rows(
+            row(trial(name), m, taken[name][m, seed], seed=seed)
+            for seed in range(3)
+            for m in range(12)
+            for name in taken
+        )
+    ).set_index("planner")
+    for name, times in taken.items():
+        _, low, high = mean_interval(times.mean(axis=1))
+        found = summary.loc[name]
+        assert (found["total_time_low_s"], found["total_time_high_s"]) == pytest.approx(
+            (float(low), float(high))
+        )
+        assert found["total_time_low_s"] < found["total_time_mean_s"] < found["total_time_high_s"]
