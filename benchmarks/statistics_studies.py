@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import beta, norm
 
 from benchnav.eval.stats.difference import mean_interval, sign_flip_p, signed_rank_p, success_interval
-from benchnav.eval.stats.summary import design_effect, wilson_interval
+from benchnav.eval.stats.summary import cautious_design_effect, wilson_interval
 
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
 MAPS = (50, 100, 200)
@@ -63,7 +63,7 @@ def cover_of_success(
         chance = chances(generator, np.array([rate]), (studies, maps), within, common)
         held = 0
         for study in outcomes(generator, chance, draws, common)[:, 0]:
-            effect = design_effect(study.ravel(), member)
+            effect = cautious_design_effect(study.ravel(), member)
             low, high = wilson_interval(study.mean(), study.size / effect)
             held += low <= rate <= high
         yield held / studies

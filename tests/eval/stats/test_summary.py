@@ -4,7 +4,7 @@ import pytest
 from scipy.stats import binomtest
 
 from benchnav.eval.stats.difference import mean_interval
-from benchnav.eval.stats.summary import design_effect, summarise, wilson_interval
+from benchnav.eval.stats.summary import cautious_design_effect, design_effect, summarise, wilson_interval
 from tests.eval.report.made import row, rows, trial
 
 
@@ -189,3 +189,24 @@ def test_time_has_the_interval_of_its_own_trial_over_maps() -> None:
             (float(low), float(high)), abs=0.01
         )
         assert found["total_time_low_s"] < found["total_time_mean_s"] < found["total_time_high_s"]
+
+
+def test_two_maps_more_are_as_if_they_had_been_met() -> None:
+    success = np.array([1, 1, 0, 1, 1, 1, 1, 0, 1], dtype=bool)
+    maps = np.repeat([7, 3, 5], 3)
+    more = np.concatenate([success, [True] * 3, [False] * 3])
+    assert cautious_design_effect(success, maps) == design_effect(more, np.repeat(np.arange(5), 3))
+    assert cautious_design_effect(success[:3], np.arange(3)) == 1
+    assert cautious_design_effect(success[:2], np.zeros(2)) == 2  # at most one map's worth
+
+
+def test_interval_holds_near_the_ends_too() -> None:
+    generator = np.random.default_rng(6)
+    held = np.zeros(2)
+    for _ in range(800):
+        success = drawn(generator, 50, 3, 0.6, 0.05)
+        maps = np.repeat(np.arange(50), 3)
+        for i, effect in enumerate((design_effect, cautious_design_effect)):
+            low, high = wilson_interval(success.mean(), success.size / effect(success.ravel(), maps))
+            held[i] += low <= 0.05 <= high
+    assert held[0] / 800 < 0.93 < held[1] / 800
