@@ -113,7 +113,15 @@ def write_driven(folder: Path) -> dict[str, str]:
     )
     about = ground.about
     words = [f"Whole driven paths on {about['scenario']} {about['instance']}, seed {about['seed']},"]
-    words += [f"realisation {about['realisation']}: of all maps the one on which outcomes differ most."]
+    differ = rows["success"].nunique() > 1
+    words += [
+        f"realisation {about['realisation']}: "
+        + (
+            "of all maps the one on which outcomes differ most."
+            if differ
+            else "on no map did outcomes differ."
+        )
+    ]
     words += [f"{len(shown)} of {len(rows)} trials."] if len(shown) < len(rows) else []
     return {"driven": " ".join(words)}
 
@@ -140,7 +148,7 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         width = 3.4 - 2.2 * place / max(len(rows) - 1, 1)
         style = _STYLES[place // 8 % len(_STYLES)]
         outcome = row["outcome"].replace("_", " ")
-        panel.plot(*track.T, color="white", lw=width + 1.2, alpha=0.7, zorder=2)
+        panel.plot(*track.T, color="white", lw=width + 1.2, alpha=0.7, zorder=1.5)
         panel.plot(
             *track.T, color=colour, lw=width, ls=style, zorder=2,
             label=f"{names[place]}: {outcome}, {row['end_time_s']:.0f} s",

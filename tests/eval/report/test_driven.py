@@ -136,7 +136,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
 
     monkeypatch.setattr("benchnav.eval.report.driven.driven_figure", draw)
     caption = write_driven(folder)
-    assert "std 1, seed 0, realisation 0" in caption["driven"]
+    assert "std 1, seed 0, realisation 0: of all maps" in caption["driven"]
     assert (folder / "figures" / "driven.png").stat().st_size > 5000
     ((_, own, tracks),) = shown
     assert own["instance"].tolist() == [1, 1, 1]
@@ -151,7 +151,8 @@ def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: P
     folder = run_folder(tmp_path / "run", rows, format_version=3)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    assert f"{MOST_PATHS} of {MOST_PATHS + 2} trials." in write_driven(folder)["driven"]
+    caption = write_driven(folder)["driven"]
+    assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} trials." in caption
 
 
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
