@@ -12,7 +12,7 @@ from tests.eval.test_recorder import run
 def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
     dataset: Path, tmp_path: Path
 ) -> None:
-    planners = ("straight", {"part": "astar_dwa", "options": {"by_time": True}})
+    planners = ("straight", "tests.eval.parts:Faulty")
     folder = run(dataset, tmp_path / "run", planners=planners, risks=("mean",))
     kept = Ground.load(folder / GROUND)
     assert dict(kept.about) == telling_map(pd.read_parquet(folder / "episodes.parquet"))
