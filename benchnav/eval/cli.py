@@ -1,12 +1,13 @@
 """The command `benchnav-eval`: run suites, list parts, report on runs, replay episodes."""
 
-import os
+import json
 import shlex
 import sys
 from pathlib import Path
 
 from benchnav.command import Command, run
-from benchnav.eval.suite import Suite
+from benchnav.eval.replay import program, replay
+from benchnav.eval.suite import RENAMED, Suite
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -43,6 +44,7 @@ def run_command(
     show_progress(run_suite(suite, folder, jobs, overwrite, planner_limit_s, _say), "units")
     write_report(folder)
     _print(folder)
+    _print_recorded(folder, suite.record)
     _print_replay(folder)
     return _failed(folder)
 
@@ -116,58 +118,6 @@ def compare(
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
 
 
-def replay(
-    folder: str,
-    planner: str = "",
-    risk: str = "",
-    scenario: str = "",
-    model: str = "",
-    robot: str = "",
-    objective: str = "",
-    world: str = "",
-    data: str = "",
-    seed: int = -1,
-    realisation: int = 0,
-    instance: int = 0,
-    view: bool = True,
-) -> int:
-    """Play an episode back in the Rerun viewer, recording it first where that was not done.
-
-    Args:
-        folder: Run folder.
-        planner: Planner as the table calls it; the run's first that fits when not given, as all of these.
-        risk: Risk setting.
-        scenario: Scenario.
-        model: Model.
-        robot: Robot.
-        objective: Objective.
-        world: World.
-        data: Dataset.
-        seed: Root seed; the run's first when not given.
-        realisation: Draw of the world's luck.
-        instance: Instance of the scenario.
-        view: Open the viewer; false only makes the recording.
-    """
-    import subprocess
-
-    from benchnav.eval.recorder import record_episode
-
-    labels = {
-        **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
-        **{"robot": robot, "objective": objective, "world": world, "data": data},
-    }
-    asked = {name: label for name, label in labels.items() if label}
-    path = record_episode(Path(folder), asked, seed if seed >= 0 else None, realisation, instance)
-    print(f"recording: {path}")
-    shown = sys.platform != "linux" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
-    if view and shown:
-        return 1 if subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode else 0
-    print(
-        f"{'there is no display here; ' if view and not shown else ''}view it with: {_program('rerun')} {path}"
-    )
-    return 0
-
-
 def _say(line: str) -> None:
     print(f"benchnav-eval: {line}", file=sys.stderr, flush=True)
 
@@ -179,7 +129,17 @@ def _print(folder: Path) -> None:
     print(f"report:  {folder / 'summary.md'}")
 
 
+def _print_recorded(folder: Path, record: str) -> None:
+    which = {"first": "the first instance of each trial", "failures": "failures", "all": "all"}
+    files = list((folder / "playback").glob("*.rrd"))
+    if record in which and files:
+        size = sum(path.stat().st_size for path in files) / 1e6
+        print(f"recorded: {which[record]}; {len(files)} files in {folder / 'playback'}, {size:.1f} MB")
+
+
 def _print_replay(folder: Path) -> None:
+    import yaml
+
     from benchnav.eval.run.folder import open_run
     from benchnav.eval.trial import NOT_USED
 
@@ -187,8 +147,9 @@ def _print_replay(folder: Path) -> None:
     words = ["replay", str(folder)]
     for name, label in every[-1].items():
         if label != NOT_USED and (name in ("planner", "scenario") or len({one[name] for one in every}) > 1):
-            words += [f"--{name}", label]
-    print(f"replay:  {_program('benchnav-eval')} {shlex.join(words)}")
+            is_plain = yaml.safe_load(f"[{label}]") == [label]
+            words += [f"--{name}", label if is_plain else json.dumps([label])]
+    print(f"replay:  {program('benchnav-eval')} {shlex.join(words)}")
 
 
 def _failed(folder: Path) -> int:
@@ -204,18 +165,10 @@ def _failed(folder: Path) -> int:
     return 1
 
 
-def _program(name: str) -> str:
-    """How a program of this environment is called from here."""
-    path = Path(sys.executable).parent / name
-    if any(Path(folder) == path.parent for folder in os.environ.get("PATH", "").split(os.pathsep)):
-        return name
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
-
-
 def main() -> None:
     """Entry point of `benchnav-eval`."""
     commands = {
-        "run": Command(run_command, settings=Suite, configs=SUITES),
+        "run": Command(run_command, settings=Suite, configs=SUITES, renamed=RENAMED),
         "list": Command(list_command, ("kinds",)),
         "report": Command(report, ("folder",)),
         "compare": Command(compare, ("folders",)),

@@ -17,6 +17,7 @@ from typing import Any
 import joblib
 
 from benchnav.errors import ConfigError
+from benchnav.eval.driven_ground import keep_ground
 from benchnav.eval.recorder import Recorder
 from benchnav.eval.run import provenance
 from benchnav.eval.run.changes import changed_options
@@ -34,15 +35,18 @@ from benchnav.eval.run.folder import (
     FORMAT_VERSION,
     RUN,
     about_unit,
+    has_all,
     merge_tables,
     open_run,
     write_unit,
 )
-from benchnav.eval.run.rows import episode_rows, error_rows, step_columns
+from benchnav.eval.run.rows import episode_rows, error_rows
+from benchnav.eval.run.steps import align_steps, step_table, write_steps
 from benchnav.eval.run.unit import Extent, Unit, in_table_order, units
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial, check_labels
 from benchnav.files import sole_writer, write_text
+from benchnav.planning.world.outcome import Outcome
 
 Trials = dict[str, tuple[Trial, Extent]]
 
@@ -74,21 +78,26 @@ def run_suite(
         if overwrite:
             _drop(folder)
         run_id, trials = _begin(suite, folder, wanted, planner_limit_s, say)
-        every = units(trials, suite.recorded)
-        missing = [unit for unit in every if about_unit(folder, unit, run_id) is None]
+        every = units(trials, suite.keep)
+        known = [(unit, about_unit(folder, unit, run_id)) for unit in every]
+        missing = [unit for unit, about in known if not has_all(about, unit)]
         done = len(every) - len(missing)
         if done:
             say(f"{done} of {len(every)} units were there already")
+        if again := sum(about is not None and not has_all(about, unit) for unit, about in known):
+            say(f"{again} finished units are run again for recordings or steps that they were not asked for")
         yield done, len(every)
         for _ in _run_all(missing, folder, run_id, jobs, planner_limit_s):
             done += 1
             yield done, len(every)
         _check_unchanged(folder)
+        align_steps(folder, every)
         merge_tables(folder, in_table_order(every, trials), run_id)
+        keep_ground(folder)
 
 
 def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0) -> None:
-    """Runs one unit on one thread and writes its file, and its recordings before it.
+    """Runs one unit on one thread and writes its file, and before it its recordings and steps.
 
     Args:
         unit: what is run.
@@ -103,17 +112,22 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
         except PredictionError as error:
             about |= {"traceback": traceback.format_exc(), "errors": [str(error)]}
             rows = error_rows(unit, time_budgets(unit, run_id), str(error))
-            write_unit(folder, unit, rows, [], about)
+            write_unit(folder, unit, rows, about)
             return
-        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id).terrain)
-        watch = recorder.watch if unit.recorded else None
+        watched = unit.keep.watched(len(unit.instances))
+        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id).terrain, watched)
+        watch = recorder.watch if watched else None
         episodes, compiled = simulate(unit, problem, simulation, watch, recorder.every, planner_limit_s)
-        recorder.write(episodes, folder)
+    succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
+    for member in unit.keep.recorded(succeeded):
+        recorder.write(episodes, member, folder)
+    if stored := unit.keep.with_steps(succeeded):
+        write_steps(folder, unit, step_table(unit, problem, episodes, stored))
     about |= {"traceback": episodes.traceback, "errors": sorted({e for e in episodes.errors if e})}
     reference = read_block(unit, run_id).places.reference_time_s.numpy()
     redrawn = (simulation.attempts - 1).tolist()
     rows = episode_rows(unit, problem, episodes, reference, redrawn, compiled)
-    write_unit(folder, unit, rows, step_columns(problem, episodes), about)
+    write_unit(folder, unit, rows, about)
 
 
 def _run_all(

@@ -8,8 +8,12 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from benchnav.errors import ConfigError
+from benchnav.eval.run.keep import Keep, Record, Steps
 
 PartSpec = str | dict[str, Any]
+
+# What to say in place of settings that had other names.
+RENAMED = {"recorded": "`record`: none, failures, first or all"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +44,8 @@ class Suite:
         seed: Root seed of all luck.
         seeds: Several root seeds in place of `seed`.
         realisations: How often the luck of the world is drawn for each instance and seed.
-        recorded: Instances that are recorded for playback in the first trial of each planner.
+        record: Episodes that are recorded for playback: none, failures, the first instance of each trial, or all.
+        steps: Episodes whose steps are stored: none, those that are recorded, or all.
         trials: Several products: mappings of the keys above, each taking what it leaves out from there.
     """
 
@@ -61,7 +66,8 @@ class Suite:
     seed: int = 0
     seeds: tuple[int, ...] = ()
     realisations: int = 1
-    recorded: int = 1
+    record: Record = "first"
+    steps: Steps = "all"
     trials: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -69,19 +75,23 @@ class Suite:
         for name in ("planners", "risks", "robots", "objectives"):
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
-        if self.instances < 0 or self.recorded < 0:
-            raise ConfigError(
-                f"Expected `instances` and `recorded` ≥ 0, got {self.instances} and {self.recorded}."
-            )
+        if self.instances < 0:
+            raise ConfigError(f"Expected `instances` ≥ 0, got {self.instances}.")
         if self.realisations < 1:
             raise ConfigError(f"Expected `realisations` ≥ 1, got {self.realisations}.")
         if len(set(self.all_seeds)) != len(self.all_seeds):
             raise ConfigError(f"Expected `seeds` that differ, got {list(self.seeds)}.")
+        _ = self.keep  # refuses what is no choice
 
     @property
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
+
+    @property
+    def keep(self) -> Keep:
+        """What is kept of episodes beside their rows."""
+        return Keep(record=self.record, steps=self.steps)
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the suite as plain data for JSON."""

@@ -2,20 +2,27 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
 
 from benchnav.datagen.latent import SoftSpots
 from benchnav.datagen.store import TerrainDataset
-from benchnav.eval.recorder import record_episode
-from benchnav.eval.report.snapshot import Snapshot
+from benchnav.errors import BenchnavError
+from benchnav.eval.find_episodes import find_episodes
+from benchnav.eval.recorder import Recorder, find_recording
+from benchnav.eval.report.drawn_plan import drawn_plan, thinned
+from benchnav.eval.report.recording import Recording
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
+from benchnav.planning.planners.planner import Plan
 from tests import factories
 
-BELOW, HELD_S, SEEDS, RECORDED = 0.45, 0.4, (3, 4), 3
+BELOW, HELD_S, SEEDS = 0.45, 0.4, (3, 4)
 SOFT = (1, 3, 4)  # classes with soft spots
 
 
@@ -30,17 +37,30 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return factories.tiny_dataset(tmp_path_factory.mktemp("data") / "soft.h5", recipe)
 
 
-def run(dataset: Path, folder: Path, **changes: Any) -> Path:
+def run(dataset: Path, folder: Path, say: Any = lambda line: None, **changes: Any) -> Path:
     stakes = {"preset": "stakes", "immobile": {"below": BELOW, "for_s": HELD_S}, "time_budget_ratio": 2.0}
-    given: dict[str, Any] = {"world": stakes, "instances": 4, "seeds": SEEDS, "recorded": RECORDED} | changes
-    suite = Suite(data=str(dataset), scenarios=("std",), model="oracle", planners=("straight",), **given)
-    for _ in run_suite(suite, folder):
+    given: dict[str, Any] = {"world": stakes, "instances": 4, "seeds": SEEDS, "record": "all"} | changes
+    given = {"planners": ("straight",)} | given
+    suite = Suite(data=str(dataset), scenarios=("std",), model="oracle", **given)
+    for _ in run_suite(suite, folder, say=say):
         pass
     return folder
 
 
-def snapshots(folder: Path) -> list[Snapshot]:
-    return [Snapshot.load(path) for path in sorted((folder / "playback").glob("*.npz"))]
+def recordings(folder: Path) -> list[Recording]:
+    return [Recording.load(path) for path in sorted((folder / "playback").glob("*.npz"))]
+
+
+def recorded(folder: Path) -> list[tuple[str, str, str]]:
+    """Which episodes are recorded, each with a file for the viewer: risk setting, seed and instance."""
+    stems = sorted(path.stem for path in (folder / "playback").glob("*.rrd"))
+    assert stems == sorted(path.stem for path in (folder / "playback").glob("*.npz"))
+    return sorted((r.about["risk"], r.about["seed"], r.about["instance"]) for r in recordings(folder))
+
+
+def again(folder: Path, seed: int, instance: int) -> Recording:
+    ((unit, member),) = find_episodes(folder, {}, seed, 0, instance)
+    return find_recording(folder, unit, member)
 
 
 @pytest.fixture(scope="module")
@@ -48,60 +68,136 @@ def stakes(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run(dataset, tmp_path_factory.mktemp("stakes") / "run")
 
 
-def cells(snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
+def cells(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns in which a robot stood at each step."""
-    column, row = np.floor(snapshot.track[:-1] / 0.5).astype(int).T
+    column, row = np.floor(recording.states[:-1, :2] / 0.5).astype(int).T
     return row, column
 
 
 def test_a_recorded_field_is_what_the_robot_met_in_its_own_episode(stakes: Path) -> None:
-    taken = snapshots(stakes)
-    assert len(taken) == RECORDED
-    for snapshot in taken:
-        assert snapshot.field is not None
-        assert snapshot.field.shape == (32, 32)
-        np.testing.assert_array_equal(snapshot.field[cells(snapshot)], snapshot.traversability)
+    taken = recordings(stakes)
+    assert len(taken) == 4 * len(SEEDS)
+    for recording in taken:
+        assert recording.field is not None
+        assert recording.field.shape == (32, 32)
+        np.testing.assert_array_equal(recording.field[cells(recording)], recording.traversability)
     # The others' fields are others.
-    for snapshot, other in zip(taken, taken[1:] + taken[:1], strict=True):
-        assert not np.array_equal(other.field[cells(snapshot)], snapshot.traversability)  # type: ignore[index]
+    for recording, other in zip(taken, taken[1:] + taken[:1], strict=True):
+        assert not np.array_equal(other.field[cells(recording)], recording.traversability)  # type: ignore[index]
 
 
 def test_cells_that_hold_a_robot_are_those_under_the_worlds_own_limit(stakes: Path) -> None:
     ends = []
-    for snapshot in snapshots(stakes):
-        assert snapshot.field is not None
-        np.testing.assert_array_equal(snapshot.holding, snapshot.field < np.float32(BELOW))
-        assert snapshot.holding.any()
-        held = snapshot.holding[cells(snapshot)]
-        last = round(HELD_S / snapshot.dt_s)
-        assert held[-last:].all() == (snapshot.about["outcome"] == "immobilised")
-        ends.append(snapshot.about["outcome"])
+    for recording in recordings(stakes):
+        assert recording.field is not None
+        np.testing.assert_array_equal(recording.holding, recording.field < np.float32(BELOW))
+        assert recording.holding.any()
+        held = recording.holding[cells(recording)]
+        last = round(HELD_S / recording.dt_s)
+        assert held[-last:].all() == (recording.about["outcome"] == "immobilised")
+        ends.append(recording.about["outcome"])
     assert "immobilised" in ends
 
 
 def test_soft_ground_is_that_of_classes_with_soft_spots_on_the_episodes_own_map(
     dataset: Path, stakes: Path
 ) -> None:
-    assert len(snapshots(stakes)) > 2
-    for snapshot in snapshots(stakes):
-        classes = TerrainDataset(dataset).read("test/std", [int(snapshot.about["instance"])], ["class_id"])
-        np.testing.assert_array_equal(snapshot.soft, np.isin(classes["class_id"][0], SOFT))
-        assert 0 < snapshot.soft.mean() < 1
+    assert len(recordings(stakes)) > 2
+    for recording in recordings(stakes):
+        classes = TerrainDataset(dataset).read("test/std", [int(recording.about["instance"])], ["class_id"])
+        np.testing.assert_array_equal(recording.soft, np.isin(classes["class_id"][0], SOFT))
+        assert 0 < recording.soft.mean() < 1
+
+
+def test_the_true_mean_is_that_of_the_episodes_own_map(dataset: Path, stakes: Path) -> None:
+    for recording in recordings(stakes):
+        terrain = TerrainDataset(dataset).terrain("test/std", [int(recording.about["instance"])])
+        np.testing.assert_allclose(recording.true_mean, terrain.truth.mean()[0].numpy(), atol=1e-6)
+        # The oracle's mean is the truth's.
+        assert recording.true_mean.shape == recording.predicted.shape
 
 
 def test_an_episode_that_is_run_again_is_recorded_on_its_own_ground(
     dataset: Path, stakes: Path, tmp_path: Path
 ) -> None:
-    folder = run(dataset, tmp_path / "run", recorded=0)
-    record_episode(folder, {}, SEEDS[0], 0, 1)
-    (again,) = snapshots(folder)
-    (first,) = [s for s in snapshots(stakes) if s.about["instance"] == "1"]
-    for name in ("field", "soft", "holding", "track"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
-    record_episode(folder, {}, SEEDS[1], 0, 1)
-    (other,) = [s for s in snapshots(folder) if s.about["seed"] == str(SEEDS[1])]
-    assert not np.array_equal(other.field, again.field)  # type: ignore[arg-type]
+    folder = run(dataset, tmp_path / "run", record="none")
+    found = again(folder, SEEDS[0], 1)
+    (first,) = [
+        r for r in recordings(stakes) if (r.about["instance"], r.about["seed"]) == ("1", str(SEEDS[0]))
+    ]
+    for name in ("field", "soft", "holding", "states", "true_mean", "predicted", "free"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(first, name))
+    assert (found.about, found.free_by, found.free_above) == (first.about, "mean", 0.1)
+    assert recorded(folder) == [("–", str(SEEDS[0]), "1")]
+    other = again(folder, SEEDS[1], 1)
+    assert not np.array_equal(other.field, found.field)  # type: ignore[arg-type]
     np.testing.assert_array_equal(other.field[cells(other)], other.traversability)  # type: ignore[index]
+
+
+def test_what_is_recorded_is_not_run_again(stakes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchnav.eval.recorder.build", None)
+    assert again(stakes, SEEDS[1], 2).about["instance"] == "2"
+
+
+@pytest.mark.parametrize("name", ["path_length_m", "traversability", "end_time_s", "outcome"])
+def test_an_episode_that_does_not_repeat_is_refused(name: str, dataset: Path, tmp_path: Path) -> None:
+    folder = run(dataset, tmp_path / "run", record="none", seeds=(), instances=2)
+    again(folder, 0, 0)
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    rows[name] = "planner_failure" if name == "outcome" else rows[name] + 0.1
+    rows.to_parquet(folder / "episodes.parquet")
+    with pytest.raises(BenchnavError, match="did not repeat"):
+        again(folder, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("record", "expected"),
+    [
+        ("none", lambda rows: rows["instance"] < 0),
+        ("first", lambda rows: (rows["instance"] == 0) & (rows["seed"] == SEEDS[0])),
+        ("failures", lambda rows: ~rows["success"]),
+        ("all", lambda rows: rows["instance"] >= 0),
+    ],
+)
+def test_what_is_asked_for_is_recorded(record: str, expected: Any, dataset: Path, tmp_path: Path) -> None:
+    """Of a run at once, and of one that was run to record nothing and then extended."""
+    # All are at the goal at once but the first of each unit, whose planner fails.
+    faulty = {"part": "tests.eval.parts:Faulty", "options": {"fault": "nan", "after_s": 0.0}}
+    given: dict[str, Any] = {"planners": (faulty,), "task": {"goal_radius_m": 30.0}, "record": record}
+    folder = run(dataset, tmp_path / "run", risks=("mean", "cvar"), **given)
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    assert rows.groupby("instance")["success"].mean().tolist() == [0, 1, 1, 1]
+    asked = rows[expected(rows)].astype({"seed": str, "instance": str})
+    wanted = sorted(zip(asked["risk"], asked["seed"], asked["instance"], strict=True))
+    assert recorded(folder) == wanted
+    other = tmp_path / "other"
+    run(dataset, other, risks=("mean",), **given | {"record": "none"}, instances=3)
+    said: list[str] = []
+    run(dataset, other, risks=("mean",), **given, instances=3, say=said.append)
+    assert any("run again" in line for line in said) == (record != "none")
+    run(dataset, other, risks=("mean", "cvar"), **given)
+    assert recorded(other) == wanted
+    # The same again finds all done.
+    run(dataset, other, risks=("mean", "cvar"), **given, say=said.append)
+    assert said[-1] == "4 of 4 units were there already"
+
+
+def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
+    """So that a unit's recordings fit into memory; the viewer is given no more of them."""
+    unit = find_episodes(stakes, {}, None, 0, 1)[0][0]
+    problem: Any = SimpleNamespace(dt_s=0.1)
+    nothing: Any = None
+    recorder = Recorder(unit, problem, nothing, nothing, [1, 3])
+    assert recorder.every == 5
+    samples = torch.rand(4, 40, 30, 2)
+    for step in (0, 150, 155, 900):
+        recorder.watch(step, Plan.empty(4, samples=samples))
+    for member, plans in recorder._plans.items():
+        whole = drawn_plan(0, {"samples": samples[member]})
+        assert [plan.step for plan in plans] == [0, 150, 155, 900]
+        for plan, lines in zip(plans, (whole, whole, thinned(whole), thinned(whole)), strict=True):
+            for before, after in zip(lines.lines["samples"], plan.lines["samples"], strict=True):
+                np.testing.assert_array_equal(after, before)
 
 
 @pytest.mark.parametrize(
@@ -111,17 +207,17 @@ def test_an_episode_that_is_run_again_is_recorded_on_its_own_ground(
 def test_where_nothing_holds_a_robot_no_cell_does(
     world: Any, stays: bool, dataset: Path, tmp_path: Path
 ) -> None:
-    recorded = snapshots(run(dataset, tmp_path / "run", world=world, seeds=(), recorded=1))
-    assert recorded
-    for snapshot in recorded:
-        assert (snapshot.field is not None) == stays
-        assert not snapshot.holding.any()
-        assert snapshot.soft.any()
+    taken = recordings(run(dataset, tmp_path / "run", world=world, seeds=(), record="first"))
+    assert len(taken) == 1
+    for recording in taken:
+        assert (recording.field is not None) == stays
+        assert not recording.holding.any()
+        assert recording.soft.any()
 
 
 def test_ground_without_soft_spots_is_not_soft(dataset_path: Path, tmp_path: Path) -> None:
-    (snapshot,) = snapshots(
-        run(dataset_path, tmp_path / "run", world="paper", seeds=(), instances=2, recorded=1)
+    (recording,) = recordings(
+        run(dataset_path, tmp_path / "run", world="paper", seeds=(), instances=2, record="first")
     )
-    assert snapshot.soft.shape == (32, 32)
-    assert not snapshot.soft.any()
+    assert recording.soft.shape == (32, 32)
+    assert not recording.soft.any()

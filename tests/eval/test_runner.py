@@ -18,11 +18,14 @@ import torch
 from benchnav import registry
 from benchnav.datagen.scenario import load_recipe
 from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.recorder import record_episode
-from benchnav.eval.report.playback import read_path
+from benchnav.eval.find_episodes import find_episodes
+from benchnav.eval.recorder import find_recording
+from benchnav.eval.report.playback.files import playback_path
+from benchnav.eval.report.playback.rerun_file import read_path
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run import provenance
 from benchnav.eval.run.folder import open_run
+from benchnav.eval.run.steps import read_steps
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
 from tests import factories
@@ -44,7 +47,7 @@ def suite_on(dataset: Path, **changes: object) -> Suite:
 
 def quick(dataset: Path, **changes: object) -> Suite:
     """A suite of a planner that needs no time."""
-    given = {"planners": ("tests.eval.parts:Faulty",), "planner_options": {}, "recorded": 0} | changes
+    given = {"planners": ("tests.eval.parts:Faulty",), "planner_options": {}, "record": "none"} | changes
     return suite_on(dataset, **given)
 
 
@@ -79,7 +82,7 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     assert set(episodes["planner"]) == set(PLANNERS)
     assert set(episodes[episodes["planner"] == "straight"]["risk"]) == {"–"}
     about = json.loads((folder / "run.json").read_text())
-    assert (about["format"], about["format_version"]) == ("benchnav-run", 2)
+    assert (about["format"], about["format_version"]) == ("benchnav-run", 3)
     assert about["code"]["versions"]["torch"] == torch.__version__.split("+")[0]
     (data,) = about["datasets"].values()
     assert [len(digests) for digests in data["maps"].values()] == [2, 2]
@@ -97,17 +100,17 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
 def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
     recordings = sorted((folder / "playback").glob("*.rrd"))
-    assert len(recordings) == len(PLANNERS)
+    trials = open_run(folder).trials
+    assert len(recordings) == len(trials) == (1 + 3 * 2) * 2
     paths = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     subprocess.run(
         ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=paths
     )
-    steps = pd.read_parquet(folder / "steps.parquet")
     for planner in PLANNERS:
-        path = record_episode(folder, {"planner": planner}, None, 0, 0)
+        ((unit, member),) = find_episodes(folder, {"planner": [planner]}, None, 0, 0)
+        path = playback_path(folder, unit.stem(member))
         assert path in recordings
-        trial = next(i for i, (t, _) in open_run(folder).trials.items() if t.labels["planner"] == planner)
-        episode = steps[(steps["trial"] == trial) & (steps["instance"] == 0)]
+        episode = read_steps(folder, trial=unit.trial.id, instance=0)
         times, positions = read_path(path)
         np.testing.assert_allclose(times, episode["time_s"], atol=1e-6)
         np.testing.assert_array_equal(positions[:, :2], episode[["x_m", "y_m"]].to_numpy())
@@ -116,7 +119,7 @@ def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]
 def test_rows_do_not_depend_on_workers(finished: tuple[Suite, Path], tmp_path: Path) -> None:
     suite, folder = finished
     same(finish(suite, tmp_path / "two", jobs=2), pd.read_parquet(folder / "episodes.parquet"))
-    steps = [pd.read_parquet(place / "steps.parquet") for place in (folder, tmp_path / "two")]
+    steps = [read_steps(place) for place in (folder, tmp_path / "two")]
     pd.testing.assert_frame_equal(*steps)
 
 
@@ -320,17 +323,13 @@ def test_a_run_of_the_first_format_is_not_gone_on_with(dataset_path: Path, tmp_p
 
 def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
-    asked = {"planner": "astar_dwa", "risk": "mean", "scenario": "hs"}
-    path = record_episode(folder, asked, None, 0, 1)
-    _, positions = read_path(path)
-    rows = pd.read_parquet(folder / "episodes.parquet")
-    rows = rows[(rows["planner"] == "astar_dwa") & (rows["risk"] == "mean") & (rows["scenario"] == "hs")]
-    steps = pd.read_parquet(folder / "steps.parquet")
-    steps = steps[(steps["trial"] == rows["trial"].iloc[0]) & (steps["instance"] == 1)]
-    np.testing.assert_array_equal(positions[:, :2], steps[["x_m", "y_m"]].to_numpy())
-    for labels, seed, instance in (({"planner": "mppi"}, None, 9), ({"planner": "no"}, None, 0), ({}, 7, 0)):
-        with pytest.raises(ConfigError, match="Expected an episode"):
-            record_episode(folder, labels, seed, 0, instance)
+    asked = {"planner": ["astar_dwa"], "risk": ["mean"], "scenario": ["hs"]}
+    ((unit, member),) = find_episodes(folder, asked, None, 0, 1)
+    recording = find_recording(folder, unit, member)
+    steps = read_steps(folder, planner="astar_dwa", risk="mean", scenario="hs", instance=1)
+    np.testing.assert_array_equal(recording.states[:, :2], steps[["x_m", "y_m"]].to_numpy())
+    _, positions = read_path(playback_path(folder, unit.stem(member)))
+    np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
 
 
 def test_what_the_caller_set_is_left_alone(dataset_path: Path, tmp_path: Path) -> None:
@@ -405,7 +404,7 @@ def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: 
     hopeless = {
         "part": "tests.eval.parts:Faulty", "label": "hopeless", "options": {"fault": "give up", "after_s": 0.0},
     }  # fmt: skip
-    suite = quick(dataset_path, planners=(hopeless,), scenarios=("std",), risks=("mean",), recorded=1)
+    suite = quick(dataset_path, planners=(hopeless,), scenarios=("std",), risks=("mean",), record="first")
     episodes = finish(suite, tmp_path / "run")
     assert episodes["outcome"].tolist() == ["planner_failure"] * 2
     assert episodes["end_time_s"].tolist() == [0, 0]
@@ -439,7 +438,7 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
         lines: list[str] = []
         suite = Suite(
             data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), instances=2,
-            time_budget_s=budget, robots=(robot,), recorded=0,
+            time_budget_s=budget, robots=(robot,), record="none",
         )  # fmt: skip
         for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
             pass
@@ -460,7 +459,7 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
         planners=("straight",),
         scenarios=("std",),
         instances=2,
-        recorded=0,
+        record="none",
     )
     before = finish(suite, tmp_path / "run")
     for world, expected in (
@@ -479,7 +478,7 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
-        scenarios=("std",), instances=1, recorded=0, time_budget_s=1.0,
+        scenarios=("std",), instances=1, record="none", time_budget_s=1.0,
     )  # fmt: skip
     with pytest.raises(ConfigError, match="without `group`"):
         finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")

@@ -29,7 +29,7 @@ def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
         risks=("mean",),
         scenarios=("std",),
         planner_options={"mppi": {"samples": 1024}} if planner == "mppi" else {},
-        recorded=0,
+        record="none",
     )
     for _ in run_suite(suite, tmp_path / "run"):
         pass
@@ -41,7 +41,7 @@ STRAIGHT = [(25.1, 21.664, 0.8631), (29.0, 21.662, 0.7470), (26.4, 21.642, 0.819
 
 
 def test_golden_rows_of_the_blind_straight_line(tmp_path: Path) -> None:
-    suite = Suite(model="oracle", planners=("straight",), scenarios=("std",), instances=4, recorded=0)
+    suite = Suite(model="oracle", planners=("straight",), scenarios=("std",), instances=4, record="none")
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
@@ -71,7 +71,7 @@ def drive_straight(instance: int) -> tuple[float, float, float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["std", "hg", "hs"])
 def test_astar_dwa_never_stalls_under_any_risk_setting(scenario: str, tmp_path: Path) -> None:
-    suite = Suite(planners=("astar_dwa",), scenarios=(scenario,), recorded=0)
+    suite = Suite(planners=("astar_dwa",), scenarios=(scenario,), record="none")
     for _ in run_suite(suite, tmp_path / "run", jobs=2):
         pass
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
@@ -109,7 +109,7 @@ IN_STAKES = [
 def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_mission(tmp_path: Path) -> None:
     suite = Suite(
         data="stakes-v1", world="stakes", model="oracle", planners=("straight",), scenarios=("std",),
-        instances=8, recorded=0,
+        instances=8, record="none",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass

@@ -181,7 +181,8 @@ def test_a_suite_refuses_what_means_nothing() -> None:
         {"realisations": 0},
         {"instances": -1},
         {"seeds": (1, 1)},
-        {"recorded": -1},
+        {"record": "sometimes"},
+        {"steps": "first"},
     ):
         with pytest.raises(ConfigError):
             replace(Suite(), **bad)

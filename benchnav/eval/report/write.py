@@ -9,9 +9,10 @@ from typing import Any
 
 import pandas as pd
 
+from benchnav.eval.report.driven import write_driven
 from benchnav.eval.report.figures import save
+from benchnav.eval.report.recording import read_snapshots
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
-from benchnav.eval.report.snapshot import Snapshot
 from benchnav.eval.report.success import success_figure
 from benchnav.eval.report.tables import NOT_USED, ResultTable, result_table
 from benchnav.eval.report.trajectories import choose, trajectory_figure
@@ -84,7 +85,7 @@ def write_report(folder: Path) -> pd.DataFrame:
     report = read_report(folder)
     write_text(folder / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(folder / "summary.tex", _as_latex(report))
-    figures = {"success": _SUCCESS} | _trajectories(folder, report.summary)
+    figures = {"success": _SUCCESS} | _trajectories(folder, report.summary) | write_driven(folder)
     save(success_figure(report.summary), folder / "figures" / "success.png")
     write_text(folder / "summary.md", _as_markdown(report, figures))
     return report.summary
@@ -99,7 +100,7 @@ def print_report(folder: Path) -> None:
 
 def _trajectories(folder: Path, summary: pd.DataFrame) -> dict[str, str]:
     """Draws the trajectories of recorded episodes; a caption by name, none where nothing was recorded."""
-    recorded = [Snapshot.load(path) for path in sorted((folder / "playback").glob("*.npz"))]
+    recorded = read_snapshots(folder)
     chosen = choose(recorded, list(summary["trial"]))
     if not chosen:
         return {}

@@ -1,32 +1,31 @@
-"""Run folders, format version 2: what lies where, and how it is read.
+"""Run folders, format version 3: what lies where, and how it is read.
 
 A run folder holds `run.json` (trials, and where everything came from), `units/` (what is finished: one
-Parquet file a unit, with rows, steps and, in its metadata, what else is known of it), `playback/`, and,
-when all is done, `episodes.parquet`, `steps.parquet`, `errors.txt` where a planner or model failed, and the
-report. Every file is written under another name first.
+Parquet file a unit, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
+when all is done, `episodes.parquet`, `errors.txt` where a planner or model failed, and the report. Every file
+is written under another name first. Version 2 had all steps within the files of units and in one table.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
+from benchnav.eval.run.keep import Keep
 from benchnav.eval.run.unit import Extent, Unit
 from benchnav.eval.trial import Trial, trial_from
 from benchnav.files import replacing, write_text
 
-FORMAT, FORMAT_VERSION = "benchnav-run", 2
-RUN, EPISODES, STEPS, ERRORS = "run.json", "episodes.parquet", "steps.parquet", "errors.txt"
+FORMAT, FORMAT_VERSION = "benchnav-run", 3
+RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
 
 _METADATA = b"benchnav"
-_STEP_COLUMN = "step:"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,27 +89,17 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
         raise ConfigError(f"{path} is damaged: {error}. Remove it and run the same command again.") from error
 
 
-def write_unit(
-    folder: Path,
-    unit: Unit,
-    rows: pd.DataFrame,
-    steps: Sequence[dict[str, np.ndarray]],
-    about: dict[str, Any],
-) -> None:
+def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, Any]) -> None:
     """Writes a finished unit.
 
     Args:
         folder: the run folder.
         unit: what was run.
         rows: a row an episode.
-        steps: of each episode its columns; empty where none began.
         about: what else is known; `run_id` and `traceback` among it.
     """
     table = pa.Table.from_pandas(rows, preserve_index=False)
-    for name in steps[0] if steps else ():
-        values = pa.array([columns[name] for columns in steps])
-        table = table.append_column(_STEP_COLUMN + name, values)
-    text = json.dumps({**about, "instances": list(unit.instances)})
+    text = json.dumps({**about, "instances": list(unit.instances), "keep": unit.keep.to_dict()})
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), _METADATA: text.encode()})
     with replacing(folder / unit.path) as partial:
         pq.write_table(table, partial)
@@ -127,8 +116,18 @@ def about_unit(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
     return about if own else None
 
 
+def has_all(about: Mapping[str, Any] | None, unit: Unit) -> bool:
+    """Whether a unit is finished, and was recorded as it is now to be.
+
+    Args:
+        about: from `about_unit`.
+        unit: as it is now to be run.
+    """
+    return about is not None and Keep(**about["keep"]).covers(unit.keep)
+
+
 def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
-    """Writes `episodes.parquet` and `steps.parquet` of all units, a unit at a time, and `errors.txt`.
+    """Writes `episodes.parquet` of all units, a unit at a time, and `errors.txt`.
 
     Raises:
         ConfigError: a unit is missing, or of another run.
@@ -138,13 +137,7 @@ def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
     for unit, about in zip(finished, abouts, strict=True):
         if about is None:
             raise ConfigError(f"{folder / unit.path} is not of this run. Run the same command again.")
-    schemas = [pq.read_schema(folder / unit.path) for unit in finished]
-    names = dict.fromkeys(name for schema in schemas for name in schema.names)
-    layers = [name.removeprefix(_STEP_COLUMN) for name in names if name.startswith(_STEP_COLUMN)]
-    # `traversability` last, whatever actions the robots of the run have.
-    layers = [name for name in layers if name != "traversability"] + ["traversability"]
     _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
-    _merge(folder / STEPS, (_step_table(folder, unit, layers) for unit in finished))
     traces = [
         text for unit, about in zip(finished, abouts, strict=True) if about and (text := _trace(unit, about))
     ]
@@ -165,27 +158,8 @@ def _merge(path: Path, tables: Iterable[pa.Table]) -> None:
 
 
 def _episode_table(folder: Path, unit: Unit) -> pa.Table:
-    table = pq.read_table(folder / unit.path, partitioning=None)
-    rows = table.select([name for name in table.column_names if not name.startswith(_STEP_COLUMN)])
-    return pa.Table.from_pandas(rows.to_pandas(), preserve_index=False).replace_schema_metadata(None)
-
-
-def _step_table(folder: Path, unit: Unit, layers: Sequence[str]) -> pa.Table:
-    table = pq.read_table(folder / unit.path, partitioning=None)
-    keys = ["trial", "seed", "realisation", "instance"]
-    there = _STEP_COLUMN + "time_s" in table.column_names
-    counts = [len(values) for values in table.column(_STEP_COLUMN + "time_s")] if there else [0] * len(table)
-    columns: dict[str, Any] = {
-        name: np.repeat(table.column(name).to_numpy(zero_copy_only=False), counts) for name in keys
-    }
-    columns["step"] = np.concatenate([np.arange(count) for count in counts]).astype(np.int64)
-    for name in layers:
-        full, kind = _STEP_COLUMN + name, np.float64 if name == "time_s" else np.float32
-        column = table.column(full).combine_chunks().flatten() if full in table.column_names else None
-        values = np.full(sum(counts), np.nan) if column is None else column.to_numpy(zero_copy_only=False)
-        columns[name] = values.astype(kind)
-    columns["trial"] = pa.array(columns["trial"].tolist(), pa.string())
-    return pa.table(columns)
+    rows = pq.read_table(folder / unit.path, partitioning=None).to_pandas()
+    return pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
 
 
 def _trace(unit: Unit, about: dict[str, Any]) -> str:

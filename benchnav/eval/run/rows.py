@@ -1,4 +1,4 @@
-"""Rows of tables: an episode's metrics, and its steps.
+"""Rows of tables: an episode's metrics.
 
 Sources: paper IV-A for success rate, total time and average traversability; Perille et al. (2020),
 "Benchmarking metric ground navigation" (BARN), for the score.
@@ -113,32 +113,6 @@ def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
         for instance, budget in zip(unit.instances, time_budget_s.tolist(), strict=True)
     ]
     return pd.DataFrame(rows)
-
-
-def step_columns(problem: Problem, episodes: Episodes) -> list[dict[str, np.ndarray]]:
-    """The driven paths, for each episode its columns: a value a step and one for the last state.
-
-    Returns:
-        `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its name and `traversability` as met; the last
-        two NaN at the last state.
-    """
-    made = []
-    for b in range(len(episodes.steps)):
-        steps = int(episodes.steps[b])
-        states = episodes.states[b, : steps + 1].cpu().numpy()
-        actions = episodes.actions[b, :steps].cpu().numpy()
-        met = episodes.traversability[b, :steps].cpu().numpy()
-        columns = {
-            "time_s": np.arange(steps + 1) * problem.dt_s,
-            "x_m": states[:, 0],
-            "y_m": states[:, 1],
-            "heading_rad": states[:, 2],
-        }
-        for index, name in enumerate(problem.robot.action_names):
-            columns[name] = np.append(actions[:, index], np.float32(np.nan))
-        columns["traversability"] = np.append(met, np.float32(np.nan))
-        made.append(columns)
-    return made
 
 
 def path_length_m(track: np.ndarray) -> float:

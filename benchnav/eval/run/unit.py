@@ -1,10 +1,11 @@
 """Units of work: a trial's block of instances under one seed and realisation, run as one batch."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from benchnav.eval.run.keep import Keep
 from benchnav.eval.trial import Trial
 
 BLOCK_INSTANCES = 50
@@ -62,14 +63,14 @@ class Unit:
         seed: root seed.
         realisation: which draw of the world's luck.
         instances: which instances of the trial's split; of one block.
-        recorded: how many of them, from the first on, are recorded for playback.
+        keep: what is kept beside rows; a unit that does not begin its trial has no first instance.
     """
 
     trial: Trial
     seed: int
     realisation: int
     instances: tuple[int, ...]
-    recorded: int = 0
+    keep: Keep = field(default_factory=Keep)
 
     @property
     def block(self) -> int:
@@ -79,7 +80,16 @@ class Unit:
     @property
     def path(self) -> Path:
         """The unit's file in a run folder."""
-        return Path("units", self.trial.id, f"{self.seed}-{self.realisation}-{self.block:05d}.parquet")
+        return Path("units", self.trial.id, self._file)
+
+    @property
+    def steps_path(self) -> Path:
+        """The file of the unit's steps in a run folder, one partition a trial."""
+        return Path("steps", f"trial={self.trial.id}", self._file)
+
+    @property
+    def _file(self) -> str:
+        return f"{self.seed}-{self.realisation}-{self.block:05d}.parquet"
 
     def stem(self, member: int) -> str:
         """A name for files of one of the unit's episodes."""
@@ -89,22 +99,19 @@ class Unit:
         return "+".join("".join(c if c.isalnum() or c in "._-" else "_" for c in word) for word in words)
 
 
-def units(trials: Mapping[str, tuple[Trial, Extent]], recorded: int) -> list[Unit]:
+def units(trials: Mapping[str, tuple[Trial, Extent]], keep: Keep) -> list[Unit]:
     """Cuts trials into units of work, those that share a prediction next to one another.
 
     Args:
         trials: by id, with how often each is run.
-        recorded: instances to record in the first trial of each planner.
+        keep: what is kept beside rows.
     """
-    every = [unit for trial, extent in trials.values() for unit in _blocks(trial, extent)]
-    recorders = {id(unit) for unit in _first_of_each_planner(every)}
+    later = replace(keep, record="none") if keep.record == "first" else keep
     made = [
-        Unit(
-            trial=unit.trial, seed=unit.seed, realisation=unit.realisation, instances=unit.instances,
-            recorded=min(recorded, len(unit.instances)) if id(unit) in recorders else 0,
-        )
-        for unit in every
-    ]  # fmt: skip
+        replace(unit, keep=later if place else keep)
+        for trial, extent in trials.values()
+        for place, unit in enumerate(_blocks(trial, extent))
+    ]
     order = {trial_id: place for place, trial_id in enumerate(trials)}
     return sorted(
         made,
@@ -126,11 +133,3 @@ def _blocks(trial: Trial, extent: Extent) -> Iterator[Unit]:
         for start in range(0, instances, BLOCK_INSTANCES):
             block = tuple(range(start, min(start + BLOCK_INSTANCES, instances)))
             yield Unit(trial=trial, seed=seed, realisation=realisation, instances=block)
-
-
-def _first_of_each_planner(every: Iterable[Unit]) -> Iterator[Unit]:
-    seen = set()
-    for unit in every:
-        if unit.trial.planner.label not in seen:
-            seen.add(unit.trial.planner.label)
-            yield unit

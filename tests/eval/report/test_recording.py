@@ -1,7 +1,12 @@
+from dataclasses import fields
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from benchnav.eval.report.recording import take_snapshot
+from benchnav.errors import ConfigError
+from benchnav.eval.report.drawn_plan import DrawnPlan, thinned
+from benchnav.eval.report.recording import Recording, read_snapshots, take_snapshot
 from tests.eval.report import made
 
 
@@ -54,3 +59,61 @@ def test_an_episode_that_ended_before_it_was_planned_has_a_snapshot_all_the_same
 
 def test_its_title_says_what_is_seen() -> None:
     assert made.recording().title == "mppi, cvar, paper-v1, std, 4, success"
+
+
+def crowded(steps: int) -> Recording:
+    """An episode of a planner with more points than are kept."""
+    generator = np.random.default_rng(5)
+    plans = [
+        DrawnPlan(step=step, lines={"path": [generator.random((9, 2), np.float32)],
+                                    "samples": list(generator.random((40, 30, 2), np.float32))})
+        for step in range(0, steps, 5)
+    ]  # fmt: skip
+    return made.held_recording(steps, plans=plans, free_by="mean", free_above=0.1, time_budget_s=77.5)
+
+
+@pytest.mark.parametrize(
+    "recording", [made.recording(60), made.recording(0), made.recording(0, plans=()), crowded(200)]
+)
+def test_a_recording_comes_back_as_it_was(recording: Recording, tmp_path: Path) -> None:
+    recording.save(tmp_path / "there" / "a.npz")
+    again = Recording.load(tmp_path / "there" / "a.npz")
+    for item in fields(Recording):
+        before, after = getattr(recording, item.name), getattr(again, item.name)
+        if isinstance(before, np.ndarray):
+            assert before.dtype == after.dtype
+            np.testing.assert_array_equal(after, before)
+        elif item.name != "plans":
+            assert after == before
+    # The plan of figures is whole; the others are thinned, as the viewer is given them.
+    moment = recording.plan_at(15.0).step
+    for before, after in zip(recording.own_plans, again.plans, strict=True):
+        expected = before if before.step == moment else thinned(before)
+        assert (after.step, set(after.lines)) == (before.step, set(before.lines))
+        for name, lines in expected.lines.items():
+            assert len(after.lines[name]) == len(lines)
+            for one, other in zip(lines, after.lines[name], strict=True):
+                np.testing.assert_array_equal(one, other)
+    assert [path.name for path in (tmp_path / "there").iterdir()] == ["a.npz"]
+
+
+def test_thinning_keeps_ends_and_what_was_thinned() -> None:
+    plan = crowded(10).plans[0]
+    once = thinned(plan)
+    for before, after in zip(plan.lines["samples"], once.lines["samples"], strict=True):
+        np.testing.assert_array_equal(after[[0, -1]], before[[0, -1]])
+        assert len(after) == 4
+    np.testing.assert_array_equal(once.lines["path"][0], plan.lines["path"][0])
+    for before, after in zip(once.lines["samples"], thinned(once).lines["samples"], strict=True):
+        np.testing.assert_array_equal(after, before)
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "playback" / "a.npz"
+    made.recording(20).save(path)
+    whole = path.read_bytes()
+    for damage in (b"", b"no zip", whole[: len(whole) // 2], whole[:500] + bytes(400) + whole[900:]):
+        path.write_bytes(damage)
+        for read in (lambda: Recording.load(path), lambda: read_snapshots(tmp_path)):
+            with pytest.raises(ConfigError, match=r"a\.npz is damaged"):
+                read()

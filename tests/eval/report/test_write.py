@@ -8,7 +8,7 @@ import pytest
 
 from benchnav.errors import ConfigError
 from benchnav.eval.report import write
-from benchnav.eval.report.playback import write_playback
+from benchnav.eval.report.playback.files import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
 from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made

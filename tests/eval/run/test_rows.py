@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from benchnav.eval.run.rollout import Episodes
-from benchnav.eval.run.rows import episode_rows, error_rows, score, step_columns
+from benchnav.eval.run.rows import episode_rows, error_rows, score
 from benchnav.eval.run.unit import Unit
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
@@ -97,16 +97,3 @@ def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
 def test_score_is_barns() -> None:
     # OT = 5 s: nothing is better than arriving in 10 s, nothing worse than in 40 s.
     assert [score(t, 10.0) for t in (4.0, 10.0, 20.0, 40.0, 90.0)] == [0.5, 0.5, 0.25, 0.125, 0.125]
-
-
-def test_steps_hold_the_driven_path_and_the_robots_own_actions() -> None:
-    problem, episodes = made()
-    first, second = step_columns(problem, episodes)
-    assert first["x_m"].tolist() == [0, 3, 3]
-    assert first["y_m"].tolist() == [0, 0, 4]
-    assert first["speed_mps"].tolist()[:2] == [1, 1]
-    assert first["turn_rate_radps"].tolist()[:2] == [0, 0.5]
-    assert np.isnan(first["traversability"][-1])
-    assert np.isnan(first["speed_mps"][-1])
-    assert len(second["time_s"]) == 5
-    assert second["time_s"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])

@@ -1,0 +1,87 @@
+"""Which episodes of a run are meant, by what tables call their trials."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchnav.errors import ConfigError
+from benchnav.eval.run.folder import open_run
+from benchnav.eval.run.keep import Keep
+from benchnav.eval.run.unit import Extent, Unit, units
+from benchnav.eval.trial import NOT_USED, Trial
+
+_COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
+
+
+def find_episodes(
+    folder: Path, labels: Mapping[str, Sequence[str]], seed: int | None, realisation: int, instance: int
+) -> list[tuple[Unit, int]]:
+    """Finds an episode of each trial that is asked for, all of them on one map.
+
+    Args:
+        folder: a run.
+        labels: what tables call the trials, by column; several of a column ask for several trials, and of the
+            columns that are left out the first trial that fits is taken.
+        seed: root seed; the first trial's first when None.
+        realisation: draw of the world's luck.
+        instance: instance of the split.
+
+    Returns:
+        Units, and which of their episodes.
+
+    Raises:
+        ConfigError: the run has no such episode, or they are not on one map.
+    """
+    run = open_run(folder)
+    if run.version == 1:
+        raise ConfigError(f"Expected a run of this version to replay, got {folder} of benchnav 0.1.")
+    found: dict[str, tuple[Unit, int]] = {}
+    for values in itertools.product(*labels.values()):
+        asked = dict(zip(labels, values, strict=True))
+        unit = _find(run.trials, asked, seed, realisation, instance)
+        if unit is None:
+            raise ConfigError(_refusal(run.trials, asked, seed, realisation, instance))
+        seed = unit.seed
+        found.setdefault(unit.trial.id, (unit, unit.instances.index(instance)))
+    episodes = list(found.values())
+    maps = dict.fromkeys(f"{unit.trial.data} {unit.trial.scenario}" for unit, _ in episodes)
+    if len(maps) > 1:
+        raise ConfigError(f"Expected trials on one map to show together, got {', '.join(maps)}.")
+    return episodes
+
+
+def _find(
+    trials: Mapping[str, tuple[Trial, Extent]],
+    asked: Mapping[str, str],
+    seed: int | None,
+    realisation: int,
+    instance: int,
+) -> Unit | None:
+    """The unit of the first trial that fits; a trial that does not use a part fits any label where no other does."""
+    for unused_fits in (False, True):
+        for trial_id, entry in trials.items():
+            labels = entry[0].labels
+            if any(labels[n] != v and not (unused_fits and labels[n] == NOT_USED) for n, v in asked.items()):
+                continue
+            wanted = entry[1].seeds[0] if seed is None else seed
+            for unit in units({trial_id: entry}, Keep()):
+                if (unit.seed, unit.realisation) == (wanted, realisation) and instance in unit.instances:
+                    return unit
+    return None
+
+
+def _refusal(
+    trials: Mapping[str, tuple[Trial, Extent]],
+    asked: Mapping[str, str],
+    seed: int | None,
+    realisation: int,
+    instance: int,
+) -> str:
+    words = [f"{name} {label!r}" for name, label in asked.items()]
+    words += [f"realisation {realisation}", f"instance {instance}"]
+    words += [] if seed is None else [f"seed {seed}"]
+    known = {name: list(dict.fromkeys(t.labels[name] for t, _ in trials.values())) for name in _COLUMNS}
+    return (
+        f"Expected an episode of the run, got {', '.join(words)}. "
+        f"It has {', '.join(f'{name}s {values}' for name, values in known.items())}."
+    )

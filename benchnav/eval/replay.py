@@ -1,0 +1,131 @@
+"""The command `replay`: episodes in the viewer, in a browser, or as a video.
+
+This module imports nothing heavy, so that the command's help is quick.
+"""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchnav.errors import ConfigError
+
+if TYPE_CHECKING:
+    from benchnav.eval.report.recording import Recording
+    from benchnav.eval.run.unit import Unit
+
+VIDEO = ".mp4"
+
+
+def replay(
+    folder: str,
+    planner: tuple[str, ...] = (),
+    risk: tuple[str, ...] = (),
+    scenario: tuple[str, ...] = (),
+    model: tuple[str, ...] = (),
+    robot: tuple[str, ...] = (),
+    objective: tuple[str, ...] = (),
+    world: tuple[str, ...] = (),
+    data: tuple[str, ...] = (),
+    seed: int = -1,
+    realisation: int = 0,
+    instance: int = 0,
+    view: bool = True,
+    web: bool = False,
+    video: str = "",
+) -> int:
+    """Play an episode back, or several on one map, recording first what was not recorded.
+
+    Several labels of a column, such as --risk mean,cvar:0.9, show their trials together.
+
+    Args:
+        folder: Run folder.
+        planner: Planner as the table calls it; the run's first that fits when not given, as all of these.
+        risk: Risk setting.
+        scenario: Scenario.
+        model: Model.
+        robot: Robot.
+        objective: Objective.
+        world: World.
+        data: Dataset.
+        seed: Root seed; the run's first when not given.
+        realisation: Draw of the world's luck.
+        instance: Instance of the scenario.
+        view: Open the viewer; false only makes the recording.
+        web: Serve the viewer to a browser on this machine until Ctrl-C.
+        video: Write a video to this file, .mp4, in place of opening the viewer; trials stand side by side.
+    """
+    from benchnav.eval.find_episodes import find_episodes
+
+    if video and Path(video).suffix != VIDEO:
+        raise ConfigError(f"Expected `video` as a file {VIDEO}, got {video!r}.")
+    columns = {
+        **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
+        **{"robot": robot, "objective": objective, "world": world, "data": data},
+    }
+    asked = {name: labels for name, labels in columns.items() if labels}
+    found = find_episodes(Path(folder), asked, seed if seed >= 0 else None, realisation, instance)
+    if video:
+        from benchnav.command import show_progress
+        from benchnav.eval.report.playback.video import write_video
+
+        show_progress(write_video(_recordings(Path(folder), found), Path(video)), "frames")
+        print(f"video:   {video}")
+        return 0
+    path = _viewer_file(Path(folder), found)
+    print(f"recording: {path}")
+    if web:
+        from benchnav.eval.report.playback.web import serve
+
+        serve(path)
+        return 0
+    shown = sys.platform != "linux" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if view and shown:
+        return (
+            1 if subprocess.run([sys.executable, "-m", "rerun_cli", str(path)], check=False).returncode else 0
+        )
+    lacking = "there is no display here; " if view else ""
+    print(
+        f"{lacking}view it with: {program('rerun')} {path}, in a browser with --web, or as --video FILE{VIDEO}"
+    )
+    return 0
+
+
+def program(name: str) -> str:
+    """How a program of this environment is called from here."""
+    path = Path(sys.executable).parent / name
+    if any(Path(folder) == path.parent for folder in os.environ.get("PATH", "").split(os.pathsep)):
+        return name
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+
+
+def _recordings(folder: Path, found: "list[tuple[Unit, int]]") -> "list[Recording]":
+    from benchnav.eval.recorder import find_recording
+
+    return [find_recording(folder, unit, member) for unit, member in found]
+
+
+def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]") -> Path:
+    """The viewer's file of the episodes, which is made where it is not there."""
+    from benchnav.eval.report.playback.files import playback_path
+    from benchnav.eval.report.playback.rerun_file import write_rerun
+
+    unit, member = found[0]
+    stem = unit.stem(member)
+    if len(found) > 1:
+        trials = hashlib.sha256("".join(other.trial.id for other, _ in found).encode()).hexdigest()[:8]
+        words = (
+            "together",
+            unit.trial.scenario,
+            trials,
+            unit.seed,
+            unit.realisation,
+            f"{unit.instances[member]:05d}",
+        )
+        stem = "+".join(map(str, words))
+    path = playback_path(folder, stem)
+    if len(found) > 1 or not path.exists():
+        write_rerun(_recordings(folder, found), path)
+    return path

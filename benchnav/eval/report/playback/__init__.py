@@ -1,0 +1,1 @@
+"""Episodes to watch: files for the Rerun viewer, the viewer in a browser, and videos."""

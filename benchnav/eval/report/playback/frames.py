@@ -1,0 +1,203 @@
+"""Frames of a video: episodes side by side, on one map, at one time.
+
+Each episode is a column: above, the terrain with what is planned and the path driven so far, coloured by the λ
+met; below, λ as it was where it stayed so, else the λ̂ that the planner was given.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from benchnav.eval.report.contenders import contender_names
+from benchnav.eval.report.drawn_plan import STYLES
+from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, trial_name
+from benchnav.eval.report.ground import SOFT, field_colours, hatching, immobilised_at, outline
+from benchnav.eval.report.recording import Recording
+
+# Red, green, blue of the robot, as no λ is coloured.
+ROBOT = (255, 120, 0)
+
+_DPI = 100
+_PANEL, _GAP, _HEAD, _FOOT = 440, 20, 92, 76  # pixels
+_TALLEST = 2.0  # of a map, over its width
+_ROBOT_M = np.array([(0.9, 0.0), (-0.6, 0.5), (-0.6, -0.5)])
+_CLOSED = 0.25
+_LINE_WIDTH = 0.5
+
+
+class Frames:
+    """Draws episodes at any time.
+
+    Args:
+        recordings: at least one.
+
+    Attributes:
+        size: width and height in pixels, both even, as video formats ask for.
+    """
+
+    def __init__(self, recordings: Sequence[Recording]) -> None:
+        """Draws what never changes."""
+        wide, high = recordings[0].grid.extent_m
+        panel_high = round(_PANEL * min(high / wide, _TALLEST))
+        width = len(recordings) * (_PANEL + _GAP) + _GAP
+        height = _HEAD + 2 * panel_high + _GAP + _FOOT
+        self.size = (width + width % 2, height + height % 2)
+        self._figure = Figure(figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._columns = []
+        for place, (recording, name) in enumerate(zip(recordings, _names(recordings), strict=True)):
+            left = _GAP + place * (_PANEL + _GAP)
+            panels = [
+                self._axes(left, _FOOT + row * (panel_high + _GAP), _PANEL, panel_high) for row in (1, 0)
+            ]
+            self._columns.append(_Column(self._figure, panels, recording, name, left / self.size[0]))
+        self._draw_foot(recordings)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def draw(self, time_s: float) -> np.ndarray:
+        """Draws a frame, uint8 of shape [height, width, 3].
+
+        Args:
+            time_s: since the episodes began; those that have ended stay as they ended.
+        """
+        self._canvas.restore_region(self._background)
+        for column in self._columns:
+            column.move(time_s)
+            for artist in column.moving:
+                if artist.get_visible():
+                    self._figure.draw_artist(artist)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def pixel_of(self, place: int, x_m: float, y_m: float) -> tuple[float, float]:
+        """Where a position on the terrain of an episode is in a frame: column and row from the top."""
+        x, y = self._columns[place].panels[0].transData.transform((x_m, y_m))
+        return float(x), float(self.size[1] - y)
+
+    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        across, up = self.size
+        return self._figure.add_axes((left / across, bottom / up, width / across, height / up))
+
+    def _draw_foot(self, recordings: Sequence[Recording]) -> None:
+        bar = self._axes(_GAP, 44, _PANEL, 12)
+        shades = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
+        self._figure.colorbar(shades, cax=bar, orientation="horizontal")
+        bar.tick_params(labelsize=8, length=2)
+        words = ["traversability λ"]
+        words += ["hatched: soft ground"] if any(r.soft.any() for r in recordings) else []
+        words += ["dark red: holds a robot"] if any(r.holding.any() for r in recordings) else []
+        words += ["grey: not free"] if any(r.field is None for r in recordings) else []
+        self._figure.text(_GAP / self.size[0], 10 / self.size[1], "; ".join(words), fontsize=8)
+
+
+class _Column:
+    """One episode: its two panels, and what of them moves."""
+
+    def __init__(
+        self, figure: Figure, panels: Sequence[Axes], recording: Recording, name: str, left: float
+    ) -> None:
+        self.panels, self.recording = panels, recording
+        top = figure.get_size_inches()[1] * _DPI
+        figure.text(left, 1 - 26 / top, name, fontsize=12, weight="bold")
+        self._time = figure.text(left, 1 - 52 / top, "", fontsize=11, family="monospace")
+        self._outcome = figure.text(left, 1 - 78 / top, "", fontsize=12, weight="bold")
+        self._layers = {name: _layer(panels[0], style) for name, style in STYLES.items()}
+        self._driven = LineCollection([], cmap=TRAVERSABILITY_COLOURS, linewidths=3.5, capstyle="round")
+        self._driven.set_clim(0, 1)
+        self._edges = [
+            panel.plot([], [], color=colour, lw=width, solid_capstyle="round")[0]
+            for panel, colour, width in (
+                (panels[0], "white", 5.5),
+                (panels[1], "white", 4.5),
+                (panels[1], "black", 2),
+            )
+        ]
+        panels[0].add_collection(self._driven)
+        robot = [value / 255 for value in ROBOT]
+        self._robots = [Polygon(_ROBOT_M, fc=robot, ec="black", lw=0.8) for _ in panels]
+        for panel, body in zip(panels, self._robots, strict=True):
+            panel.add_patch(body)
+        self._crosses = [panel.plot([], [], "X", color="black", mec="white", ms=13)[0] for panel in panels]
+        _draw_ground(panels, recording)
+        self.moving: list[Artist] = [
+            *self._layers.values(), *self._edges, self._driven, *self._robots, *self._crosses, self._time,
+            self._outcome,
+        ]  # fmt: skip
+        for artist in self.moving:
+            artist.set_animated(True)
+
+    def move(self, time_s: float) -> None:
+        """Puts everything where it is at a time."""
+        recording = self.recording
+        steps = len(recording.traversability)
+        now = min(int(time_s / recording.dt_s + 1e-6), steps)
+        x, y, heading = recording.states[now, :3]
+        track = recording.states[: now + 1, :2]
+        self._driven.set_segments(list(np.stack((track[:-1], track[1:]), axis=1)))
+        self._driven.set_array(recording.traversability[:now])
+        for line in self._edges:
+            line.set_data(*track.T)
+        turn = np.array(((np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))))
+        for body in self._robots:
+            body.set_xy(_ROBOT_M @ turn + (x, y))
+        has_ended = now == steps
+        plan = recording.plan_at(time_s)
+        for name, layer in self._layers.items():
+            layer.set_segments([] if has_ended else list(plan.lines.get(name, ())))
+        met = f"{recording.traversability[min(now, steps - 1)]:.2f}" if steps else "–"
+        self._time.set_text(f"t = {now * recording.dt_s:5.1f} s   λ met = {met}")
+        self._outcome.set_text(recording.outcome if has_ended else "")
+        self._outcome.set_color("#00684a" if recording.about["outcome"] == "success" else "#a00000")
+        held = immobilised_at(recording.about, track) if has_ended else None
+        for cross in self._crosses:
+            cross.set_data(*(([], []) if held is None else ([held[0]], [held[1]])))
+
+
+def _names(recordings: Sequence[Recording]) -> list[str]:
+    if len(recordings) == 1:
+        return [trial_name(recordings[0].about, ())]
+    return contender_names([recording.about for recording in recordings])
+
+
+def _layer(panel: Axes, style: Any) -> LineCollection:
+    red, green, blue, alpha = (value / 255 for value in style.colour)
+    lines = LineCollection(
+        [], colors=[(red, green, blue, alpha)], linewidths=_LINE_WIDTH * style.width,
+        linestyles="dashed" if style.dashed else "solid",
+    )  # fmt: skip
+    panel.add_collection(lines)
+    return lines
+
+
+def _draw_ground(panels: Sequence[Axes], recording: Recording) -> None:
+    wide, high = recording.grid.extent_m
+    panels[0].imshow(np.moveaxis(recording.rgb, 0, -1), origin="lower", extent=(0, wide, 0, high))
+    for lines in (outline, hatching):
+        drawn = list(lines(recording.soft, recording.grid.resolution_m))
+        panels[0].add_collection(
+            LineCollection(drawn, colors=[tuple(value / 255 for value in SOFT)], linewidths=0.5)
+        )
+    if recording.field is not None:
+        shown, title = field_colours(recording.field, recording.holding), "λ as it was"
+    else:
+        shown = field_colours(recording.predicted, np.zeros_like(recording.free))
+        shown[~recording.free] = round(255 * _CLOSED)
+        title = "λ̂ given to the planner"
+    panels[1].imshow(shown, origin="lower", extent=(0, wide, 0, high))
+    for panel, words in zip(panels, ("terrain and plan", title), strict=True):
+        panel.plot(*recording.states[0, :2], "o", color="red", mec="white", ms=8)
+        panel.plot(*recording.goal_m, "X", color="magenta", mec="white", ms=10)
+        panel.set(xlim=(0, wide), ylim=(0, high), aspect="auto", xticks=[], yticks=[])
+        panel.text(
+            0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
+            bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},
+        )  # fmt: skip

@@ -1,0 +1,106 @@
+"""Files for the Rerun viewer: one episode, or several on one map.
+
+A file holds the terrain as a mesh, its colours, λ in truth and as it was, the λ̂ that each planner was given,
+each robot with its heading at every step, the path driven so far, what the planner was thinking, how it
+ended, and time series; and a blueprint that arranges them.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchnav.eval.report.contenders import contender_names, trial_colours
+from benchnav.eval.report.playback.blueprint import arrange
+from benchnav.eval.report.playback.robot import (
+    TIMELINE,
+    Driver,
+    log_driven,
+    log_outcome,
+    log_plans,
+    log_robot,
+    log_series,
+)
+from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
+from benchnav.eval.report.playback.words import describe
+from benchnav.eval.report.recording import Recording
+from benchnav.files import replacing
+
+APPLICATION = "benchnav"
+
+_ALONE = (0, 170, 0)
+
+
+def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
+    """Writes an `.rrd` file, whole or not at all.
+
+    Args:
+        recordings: one, or several of one map.
+        path: file to write; its name is what the viewer calls it.
+    """
+    import rerun as rr
+
+    drivers = drivers_of(recordings)
+    first = recordings[0]
+    # One chunk an entity, however slow the machine is: each has a header of more than a kilobyte.
+    batches = rr.ChunkBatcherConfig.NEVER()
+    stream = rr.RecordingStream(APPLICATION, recording_id=path.stem, batcher_config=batches)
+    with replacing(path) as partial:
+        stream.save(partial, default_blueprint=arrange(drivers))
+        try:
+            stream.send_recording_name(_title(drivers))
+            stream.log("about", rr.TextDocument(describe(drivers), media_type="text/markdown"), static=True)
+            log_terrain(stream, first)
+            log_maps(stream, first)
+            for driver in drivers:
+                risk, closed = driver.entity("map/risk"), driver.entity("map/closed")
+                log_predicted(stream, driver.recording, risk, closed)
+                for log in (log_robot, log_series, log_driven, log_plans, log_outcome):
+                    log(stream, driver)
+            stream.flush()
+        finally:
+            stream.disconnect()
+
+
+def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
+    """Gives each robot a name and a colour; one that is alone needs no name."""
+    if len(recordings) == 1:
+        return [Driver(recording=recordings[0], name="", colour=_ALONE)]
+    names = contender_names([recording.about for recording in recordings])
+    colours = trial_colours(len(recordings))
+    return [
+        Driver(recording=recording, name=name, colour=colour)
+        for recording, name, colour in zip(recordings, names, colours, strict=True)
+    ]
+
+
+def read_path(path: Path, entity: str = "/world/robot") -> tuple[np.ndarray, np.ndarray]:
+    """Reads a robot's path back from a file.
+
+    Args:
+        path: an `.rrd` file.
+        entity: the robot.
+
+    Returns:
+        Times in seconds, shape [N + 1], and positions (x, y, z) in metres, float32, shape [N + 1, 3].
+    """
+    from rerun.chunk import RrdReader
+
+    times, positions = [], []
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path != entity or TIMELINE not in chunk.timeline_names:
+            continue
+        batch = chunk.to_record_batch()
+        column = next(name for name in batch.schema.names if name.endswith("positions"))
+        times.append(batch.column(TIMELINE).to_numpy(zero_copy_only=False).astype("timedelta64[ns]"))
+        positions += [row[0] for row in batch.column(column).to_pylist()]
+    when = np.concatenate(times).astype(np.int64) * 1e-9
+    order = np.argsort(when, kind="stable")
+    return when[order], np.asarray(positions, dtype=np.float32)[order]
+
+
+def _title(drivers: Sequence[Driver]) -> str:
+    if len(drivers) == 1:
+        return drivers[0].recording.title
+    about = drivers[0].recording.about
+    return f"{about['scenario']} {about['instance']}: {', '.join(driver.name for driver in drivers)}"

@@ -1,0 +1,70 @@
+"""The Rerun viewer in a browser, served to this machine alone."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import quote
+
+from benchnav.errors import BenchnavError
+
+HOST = "127.0.0.1"
+
+# The viewer's own, for those who forward ports to another machine.
+_PAGE_PORT, _DATA_PORT = 9090, 9876
+_START_S = 60.0
+
+
+def serve(path: Path) -> None:
+    """Serves the viewer with a recording, and prints its address, until it is interrupted.
+
+    Args:
+        path: an `.rrd` file.
+
+    Raises:
+        BenchnavError: the viewer did not start.
+    """
+    page, data = _free_port(_PAGE_PORT), _free_port(_DATA_PORT)
+    command = [sys.executable, "-m", "rerun_cli", str(path), "--serve-web", "--bind", HOST]
+    command += ["--web-viewer-port", str(page), "--port", str(data)]
+    # It has a child of its own, so that both are ended as a group.
+    viewer = subprocess.Popen(command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True)
+    try:
+        _wait_for(page, viewer)
+        _wait_for(data, viewer)
+        address = f"http://{HOST}:{page}?url={quote(f'rerun+http://{HOST}:{data}/proxy', safe='')}"
+        print(f"viewer:  {address}\nCtrl-C ends it", flush=True)
+        viewer.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGTERM)
+        viewer.wait()
+
+
+def _free_port(wanted: int) -> int:
+    """A port that is free now: the wanted one, or any other."""
+    for port in (wanted, 0):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise BenchnavError("Expected a free port to serve the viewer on, got none.")
+
+
+def _wait_for(port: int, viewer: subprocess.Popen[bytes]) -> None:
+    began = time.monotonic()
+    while time.monotonic() - began < _START_S and viewer.poll() is None:
+        with socket.socket() as probe:
+            if probe.connect_ex((HOST, port)) == 0:
+                return
+        time.sleep(0.05)
+    raise BenchnavError("The viewer did not start. Open the recording with `rerun` to see why.")

@@ -1,0 +1,72 @@
+"""What is kept of episodes beside their rows: recordings and steps."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal, get_args
+
+from benchnav.errors import ConfigError
+
+Record = Literal["none", "failures", "first", "all"]
+Steps = Literal["none", "recorded", "all"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Keep:
+    """Which episodes are recorded, and of which the steps are stored.
+
+    Args:
+        record: `failures` are episodes that did not succeed; `first` is the first instance of each trial,
+            under its first seed and draw of luck.
+        steps: `recorded` stores the steps of recorded episodes alone.
+    """
+
+    record: Record = "none"
+    steps: Steps = "none"
+
+    def __post_init__(self) -> None:
+        """Refuses what is no choice."""
+        for name, choices in (("record", get_args(Record)), ("steps", get_args(Steps))):
+            if getattr(self, name) not in choices:
+                raise ConfigError(
+                    f"Expected `{name}` as {', '.join(choices[:-1])} or {choices[-1]}, got {getattr(self, name)!r}."
+                )
+
+    def watched(self, count: int) -> range:
+        """Which of a unit's episodes may come to be recorded, known before they are run.
+
+        Args:
+            count: episodes of the unit.
+        """
+        return range({"none": 0, "first": 1}.get(self.record, count))
+
+    def recorded(self, succeeded: Sequence[bool]) -> list[int]:
+        """Which of a unit's episodes are recorded, by how they ended."""
+        return _chosen(self.record, succeeded)
+
+    def with_steps(self, succeeded: Sequence[bool]) -> list[int]:
+        """Of which of a unit's episodes the steps are stored, by how they ended."""
+        return _chosen(self._stored, succeeded)
+
+    def covers(self, other: "Keep") -> bool:
+        """Whether a unit that was run to keep this has all that the other asks for."""
+        return _includes(self.record, other.record) and _includes(self._stored, other._stored)
+
+    @property
+    def _stored(self) -> str:
+        return self.record if self.steps == "recorded" else self.steps
+
+    def to_dict(self) -> dict[str, str]:
+        """Plain data for JSON."""
+        return asdict(self)
+
+
+def _chosen(rule: str, succeeded: Sequence[bool]) -> list[int]:
+    """Which episodes of a unit a rule means; the unit is the first of its trial where it says `first`."""
+    every = range(len(succeeded))
+    if rule == "failures":
+        return [member for member in every if not succeeded[member]]
+    return list(every[: {"none": 0, "first": 1, "all": None}[rule]])
+
+
+def _includes(rule: str, other: str) -> bool:
+    return rule == "all" or other in ("none", rule)

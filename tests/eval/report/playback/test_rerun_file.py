@@ -1,0 +1,232 @@
+"""What the viewer is given, read back from the file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+
+from benchnav.eval.report.drawn_plan import MOST_POINTS, DrawnPlan, thinned
+from benchnav.eval.report.ground import HOLDING, field_colours, hatching, outline
+from benchnav.eval.report.playback.rerun_file import read_path, write_rerun
+from benchnav.eval.report.recording import Recording
+from tests.eval.report import made
+from tests.eval.report.playback.rrd import chunks, column, image, static, verify
+
+
+def written(folder: Path, *recordings: Recording) -> Path:
+    path = folder / "a.rrd"
+    write_rerun(recordings, path)
+    return path
+
+
+def pair() -> list[Recording]:
+    """Two trials on one map: one arrives, one is held after 8 s."""
+    other = made.held_recording(80, about={**made.held_recording().about, "risk": "mean"})
+    first = made.held_recording(120, about={**made.held_recording().about, "outcome": "success"})
+    return [first, replace(other, predicted=1 - first.predicted, free=first.predicted < 0.7, free_by="mean")]
+
+
+def test_a_file_verifies_and_holds_the_driven_path(tmp_path: Path) -> None:
+    recording = made.recording(40, dt_s=0.2)
+    path = written(tmp_path, recording)
+    verify(path)
+    times, positions = read_path(path)
+    np.testing.assert_allclose(times, 0.2 * np.arange(41), atol=1e-6)
+    np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
+
+
+def test_the_robot_shows_its_heading_on_the_ground_and_on_the_maps(tmp_path: Path) -> None:
+    turning = made.recording(30).states.copy()
+    turning[:, 2] = np.linspace(0, 3, 31)
+    path = written(tmp_path, made.recording(30, states=turning))
+    for entity, sign in (("/world/heading", 1), ("/map/overlay/heading", -1)):  # images have y downward
+        times, vectors = column(path, entity, "vectors")
+        np.testing.assert_allclose(times, 0.1 * np.arange(31), atol=1e-6)
+        x, y = np.array(vectors)[:, 0, :2].T
+        np.testing.assert_allclose(np.arctan2(sign * y, x), turning[:, 2], atol=1e-5)
+    _, origins = column(path, "/map/overlay/heading", "origins")
+    np.testing.assert_allclose(np.array(origins)[:, 0, 0] * 0.5, turning[:, 0], rtol=1e-5)
+    np.testing.assert_allclose((40 - np.array(origins)[:, 0, 1]) * 0.5, turning[:, 1], rtol=1e-5)
+
+
+def test_commands_are_called_what_the_robot_calls_them(tmp_path: Path) -> None:
+    recording = made.recording(12, action_names=("speed_mps", "arm [rad]"))
+    path = written(tmp_path, recording)
+    for index, entity in enumerate(("/series/command/speed_mps", "/series/command/arm\\ \\[rad\\]")):
+        _, values = column(path, entity, "scalars")
+        np.testing.assert_allclose(np.ravel(values), recording.actions[:, index], rtol=1e-6)
+
+
+def test_λ_met_stands_beside_what_was_predicted_and_the_threshold_of_free_ground(tmp_path: Path) -> None:
+    recording = made.recording(12, free_above=0.17, free_by="mean")
+    path = written(tmp_path, recording)
+    series = {name: column(path, f"/series/traversability/{name}", "scalars")[1] for name in
+              ("met", "predicted", "threshold")}  # fmt: skip
+    np.testing.assert_allclose(np.ravel(series["met"]), recording.traversability, rtol=1e-6)
+    column_, row = np.floor(recording.states[:-1, :2] / 0.5).astype(int).T
+    np.testing.assert_allclose(np.ravel(series["predicted"]), recording.predicted[row, column_], rtol=1e-6)
+    assert np.ravel(series["threshold"]).tolist() == [0.17] * 12
+    assert static(path, "/series/traversability/threshold", "names").tolist() == ["free: mean above"]
+
+
+def test_plans_are_shown_when_they_were_made(tmp_path: Path) -> None:
+    recording = made.recording(40)
+    times, strips = column(written(tmp_path, recording), "/world/plan/samples", "strips")
+    np.testing.assert_allclose(times, [plan.step * 0.1 for plan in recording.plans], atol=1e-6)
+    for plan, shown in zip(recording.plans, strips, strict=True):
+        assert len(shown) == 3  # type: ignore[arg-type]
+        np.testing.assert_allclose(np.array(shown)[..., :2], np.array(plan.lines["samples"]), rtol=1e-6)
+
+
+def test_a_layer_that_stays_is_not_written_again_and_one_that_goes_is_wiped_out(tmp_path: Path) -> None:
+    line, other = np.array([[1.0, 1], [2, 2]], np.float32), np.array([[1.0, 1], [2, 3]], np.float32)
+    layers: list[dict[str, list[np.ndarray]]] = [{"path": [line]}, {"path": [line]}, {"path": [other]}, {}]
+    plans = [DrawnPlan(step=5 * place, lines=lines) for place, lines in enumerate(layers)]
+    times, strips = column(
+        written(tmp_path, made.recording(40, plans=plans)), "/map/overlay/plan/path", "strips"
+    )
+    np.testing.assert_allclose(times, [0, 1.0, 1.5], atol=1e-6)
+    assert [len(shown) for shown in strips] == [1, 1, 0]  # type: ignore[arg-type]
+
+
+def test_maps_are_those_of_the_recording(tmp_path: Path) -> None:
+    recording = made.held_recording()
+    path = written(tmp_path, recording)
+    assert recording.field is not None
+    shown = image(path, "/map/field")
+    np.testing.assert_array_equal(shown, field_colours(recording.field, recording.holding))
+    np.testing.assert_array_equal((shown == HOLDING).all(axis=-1), recording.holding)
+    viridis = matplotlib.colormaps["viridis"]
+    expected = np.round(255 * viridis(recording.true_mean)[..., :3])
+    np.testing.assert_array_equal(image(path, "/map/true_mean"), expected)
+    predicted = np.round(255 * viridis(recording.predicted)[..., :3])
+    shown = image(path, "/map/risk")
+    np.testing.assert_array_equal(shown[recording.free], predicted[recording.free])
+    assert (shown[~recording.free] == 64).all()
+    np.testing.assert_array_equal(image(path, "/map/colour"), np.moveaxis(recording.rgb, 0, -1))
+    again = written(tmp_path, made.recording(10))
+    assert not [e for e in chunks(again) if e.startswith(("/map/field", "/map/soft"))]
+
+
+@pytest.mark.parametrize(
+    ("entity", "region"),
+    [("/map/soft/outline", "soft"), ("/map/soft/hatching", "soft"), ("/map/closed", "free")],
+)
+def test_regions_are_marked_where_they_are(entity: str, region: str, tmp_path: Path) -> None:
+    recording = made.held_recording(field=None)
+    lines = hatching if entity.endswith("hatching") else outline
+    expected = lines(recording.soft if region == "soft" else ~recording.free, 0.5)
+    shown = static(written(tmp_path, recording), entity, "strips")
+    np.testing.assert_allclose(shown[..., 0] * 0.5, expected[..., 0], atol=1e-5)
+    np.testing.assert_allclose((40 - shown[..., 1]) * 0.5, expected[..., 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("outcome", ["success", "out_of_bounds", "immobilised"])
+def test_the_outcome_is_told_where_and_when_the_episode_ended(outcome: str, tmp_path: Path) -> None:
+    recording = made.held_recording(43, about={**made.recording().about, "outcome": outcome})
+    path = written(tmp_path, recording)
+    for entity, place in (("/world/outcome", recording.states[-1, :2]), ("/map/overlay/outcome", None)):
+        times, labels = column(path, entity, "labels")
+        np.testing.assert_allclose(times, [4.3], atol=1e-6)
+        assert labels == [[outcome.replace("_", " ")]]
+        ((position,),) = column(path, entity, "positions")[1]  # type: ignore[misc]
+        expected = place if place is not None else (recording.states[-1, :2] / 0.5) * (1, -1) + (0, 40)
+        np.testing.assert_allclose(position[:2], expected, atol=1e-4)
+    assert any("immobilised" in entity for entity in chunks(path)) == (outcome == "immobilised")
+
+
+def test_an_immobilised_robot_is_crossed_out_from_that_moment_on(tmp_path: Path) -> None:
+    recording = made.held_recording(43)
+    path = written(tmp_path, recording)
+    x, y = recording.states[-1, :2]
+    flat = (x / 0.5, 40 - y / 0.5)
+    for entity, place, size in (
+        ("/world/immobilised", (x, y), 2),
+        ("/map/overlay/immobilised/cross", flat, 4),
+    ):
+        times, ((cross,),) = column(path, entity, "strips")  # type: ignore[misc]
+        np.testing.assert_allclose(times, [4.3], atol=1e-6)
+        np.testing.assert_allclose(np.mean(np.array(cross)[:, :2], axis=0), place, atol=1e-4)
+        np.testing.assert_allclose(np.ptp(np.array(cross)[:, :2], axis=0), size, atol=1e-4)
+
+
+def test_the_driven_path_grows_to_the_end_and_stays(tmp_path: Path) -> None:
+    recording = made.recording(237)
+    path = written(tmp_path, recording)
+    pieces = sorted(entity for entity in chunks(path) if "/overlay/driven/" in entity)
+    assert len(pieces) > 1
+    for time_s in (0.4, 0.5, 9.99, 10.0, 10.5, 23.7):
+        shown: list[object] = []
+        for entity in pieces:
+            times, strips = column(path, entity, "strips")
+            known = [strip for when, strip in zip(times, strips, strict=True) if when < time_s + 1e-6]
+            shown += known[-1] if known else []  # type: ignore[arg-type]
+        # A plan is drawn twice a second, and with it what was driven by then.
+        steps = 237 if time_s == 23.7 else 5 * int(time_s / 0.5 + 1e-6)
+        assert len(shown) == steps
+        if steps:
+            ends = np.array(shown)[:, 1]
+            np.testing.assert_allclose(ends[:, 0] * 0.5, recording.states[1 : steps + 1, 0], rtol=1e-5)
+
+
+def test_a_long_recording_of_a_crowded_planner_is_small(tmp_path: Path) -> None:
+    generator = np.random.default_rng(1)
+    plans = [
+        DrawnPlan(
+            step=step,
+            lines={
+                "tree": list(generator.random((300, 12, 2), np.float32)),
+                "reference": list(generator.random((1, 120, 2), np.float32)),
+                "path": list(generator.random((1, 80, 2), np.float32)),
+            },
+        )
+        for step in range(0, 1000, 5)
+    ]
+    recording = made.held_recording(1000, plans=plans)
+    path = written(tmp_path, recording)
+    recording.save(tmp_path / "a.npz")
+    assert path.stat().st_size + (tmp_path / "a.npz").stat().st_size < 3e6
+    _, strips = column(path, "/map/overlay/plan/tree", "strips")
+    kept = thinned(plans[0]).lines["tree"]
+    assert sum(map(len, kept)) <= MOST_POINTS
+    for line, shown in zip(kept, strips[0], strict=True):  # type: ignore[call-overload]
+        np.testing.assert_allclose(np.array(shown)[:, 0] * 0.5, line[:, 0], rtol=1e-5)
+    for line in (plans[0].lines["tree"][0], plans[0].lines["tree"][-1]):
+        assert any(np.array_equal(line[[0, -1]], other[[0, -1]]) for other in kept)
+
+
+def test_an_episode_that_ended_at_once_can_be_played(tmp_path: Path) -> None:
+    path = written(tmp_path, made.recording(0))
+    verify(path)
+    _, positions = read_path(path)
+    assert len(positions) == 1
+
+
+def test_several_trials_have_paths_colours_and_maps_of_their_own(tmp_path: Path) -> None:
+    recordings = pair()
+    path = written(tmp_path, *recordings)
+    verify(path)
+    colours = []
+    for recording, name in zip(recordings, ("cvar", "mean"), strict=True):
+        times, positions = read_path(path, f"/world/trials/{name}/robot")
+        np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
+        assert times[-1] == pytest.approx(recording.end_s)
+        own = {
+            entity: int(np.ravel(static(path, entity, "colors"))[0])
+            for entity in (f"/world/trials/{name}/robot", f"/map/overlay/trials/{name}/robot",
+                           f"/series/traversability/trials/{name}/met")
+        }  # fmt: skip
+        assert len(set(own.values())) == 1
+        colours += [*set(own.values())]
+        assert static(path, f"/series/traversability/trials/{name}/met", "names").tolist() == [name]
+        assert column(path, f"/world/trials/{name}/outcome", "labels")[1] == [
+            [f"{name}: {recording.outcome}"]
+        ]
+        shown = image(path, f"/map/risk/trials/{name}")
+        assert ((shown == 64).all(axis=-1) == ~recording.free).all()
+    assert colours[0] != colours[1]
+    assert not [
+        entity for entity in chunks(path) if entity.startswith(("/world/robot", "/map/overlay/robot"))
+    ]

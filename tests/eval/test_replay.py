@@ -1,0 +1,142 @@
+"""The command `replay`, and what `run` says of recordings."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import pytest
+from rerun.chunk import RrdReader
+
+from benchnav.eval import cli
+from benchnav.eval.report.playback import web
+from benchnav.eval.report.playback.video import frame_times
+
+SMALL = (
+    "--planners", "[straight,'tests.eval.parts:Faulty']", "--risks", "[mean,cvar:0.5]", "--scenarios", "[std]",
+    "--instances", "2", "--model", "oracle", "--time_budget_s", "5", "--noise", "stored",
+)  # fmt: skip
+
+
+def call(*arguments: str) -> int:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["benchnav-eval", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("replay") / "run"
+    assert call("run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
+    return out
+
+
+def entities(path: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def shown(printed: str) -> Path:
+    """The recording that a command named."""
+    (line,) = [line for line in printed.splitlines() if line.startswith("recording: ")]
+    return Path(line.removeprefix("recording: "))
+
+
+def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ("--planner", "Faulty", "--risk", "cvar:0.5", "--instance", "1")
+    assert call("replay", str(folder), *asked, "--view", "no") == 0
+    printed = capsys.readouterr().out
+    path = shown(printed)
+    assert path.name.startswith("Faulty-cvar_0-5-std")
+    assert path.name.endswith("00001.rrd")
+    assert "/world/robot" in entities(path)
+    assert "rerun" in printed.splitlines()[-1]
+
+
+@pytest.mark.parametrize("risks", ["mean,cvar:0.5", "[mean, 'cvar:0.5']"])
+def test_several_labels_show_their_trials_together(risks: str, folder: Path, capsys: Any) -> None:
+    assert call("replay", str(folder), "--planner", "Faulty", "--risk", risks, "--view", "false") == 0
+    path = shown(capsys.readouterr().out)
+    assert path.name.startswith("together-std")
+    assert {"/world/trials/mean/robot", "/world/trials/cvar\\:0.5/robot"} <= entities(path)
+
+
+def test_other_episodes_together_are_another_file(folder: Path, capsys: Any) -> None:
+    paths = []
+    for more in ((), ("--instance", "1"), ("--planner", "straight,Faulty")):
+        assert (
+            call(
+                "replay", str(folder), "--planner", "Faulty", "--risk", "mean,cvar:0.5", *more, "--view=false"
+            )
+            == 0
+        )
+        paths.append(shown(capsys.readouterr().out))
+    assert len(set(paths)) == 3
+
+
+def test_a_video_shows_trials_side_by_side(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    widths = []
+    for name, risk in (("one", "mean"), ("two", "mean,cvar:0.5")):
+        path = tmp_path / f"{name}.mp4"
+        assert call("replay", str(folder), "--planner", "Faulty", "--risk", risk, "--video", str(path)) == 0
+        assert str(path) in capsys.readouterr().out
+        with av.open(str(path)) as container:
+            widths.append(container.streams.video[0].width)
+            assert sum(1 for _ in container.decode(video=0)) == len(frame_times(5.0))
+    assert widths[1] > 1.8 * widths[0]
+
+
+def test_the_viewer_is_served_with_the_recording(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    served: list[Path] = []
+    monkeypatch.setattr(web, "serve", served.append)
+    assert call("replay", str(folder), "--web") == 0
+    assert served == [shown(capsys.readouterr().out)]
+
+
+def test_run_says_what_it_recorded_and_how_it_is_replayed(
+    dataset_path: Path, tmp_path: Path, capsys: Any
+) -> None:
+    out = tmp_path / "run"
+    assert call("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--record", "failures") == 0
+    printed = capsys.readouterr().out.splitlines()
+    count = len(list((out / "playback").glob("*.rrd")))
+    assert any(
+        line.startswith(f"recorded: failures; {count} files in {out / 'playback'}, ") for line in printed
+    )
+    (line,) = [line for line in printed if line.startswith("replay:  ")]
+    words = shlex.split(line.removeprefix("replay:  "))
+    assert call(*words[1:], "--view", "false") == 0
+    assert (
+        call("run", "--data", str(dataset_path), "--out", str(tmp_path / "none"), *SMALL, "--record", "none")
+        == 0
+    )
+    assert "recorded:" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("replay", "RUN", "--video", "a.avi"), "Expected `video` as a file .mp4, got 'a.avi'"),
+        (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
+        (("replay", "RUN", "--planner", "mpi"), "planners ['straight', 'Faulty']"),
+        (("run", "--recorded", "4"), "It is now `record`: none, failures, first or all."),
+        (("run", "--config", "old.yaml"), "It is now `record`: none, failures, first or all."),
+        (("run", "--record", "some"), "'none' or 'failures' or 'first' or 'all'"),
+        (("run", "--steps", "first"), "'none' or 'recorded' or 'all'"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    arguments: tuple[str, ...], told: str, folder: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old.yaml").write_text("recorded: 4\n")
+    assert call(*(str(folder) if word == "RUN" else word for word in arguments)) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.strip().splitlines()
+    assert told in line
+    assert [path.name for path in tmp_path.iterdir()] == ["old.yaml"]
