@@ -49,7 +49,8 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         every = in_table_order(units(trials, 0), trials)
         found = [(unit, _find(unit, runs)) for unit in every]
         _check_whole([unit for unit, run in found if run is None], runs, of)
-        partial = folder.with_name(f".{folder.name}.partial")
+        target = folder.resolve()
+        partial = target.with_name(f".{target.name}.partial")
         if partial.exists():
             shutil.rmtree(partial)
         about = _about(runs)
@@ -62,7 +63,7 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         for run in runs:
             _copy_rest(run.folder, partial)
         merge_tables(partial, every, about["run_id"])
-        os.replace(partial, folder)
+        os.replace(partial, target)
 
 
 def _check_new(folder: Path) -> None:

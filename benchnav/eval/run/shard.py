@@ -1,6 +1,6 @@
 """Shards: the shares of a run that several machines make apart, to be merged afterwards.
 
-Which shard a unit is in hangs on the unit and the number of shards alone: not on what else is run, in which
+Which shard a unit is in depends on the unit and the number of shards alone: not on what else is run, in which
 order, or what is finished. An extended run therefore leaves every unit where it was.
 """
 
@@ -59,8 +59,8 @@ def read_shard(text: str) -> Shard | None:
 def shard_of(unit: Unit, of: int) -> Shard:
     """The shard that a unit is in, of so many.
 
-    Blocks, realisations and seeds of a trial go round the shards; where a trial begins is told by its id,
-    which is a digest, so that many trials even out.
+    Blocks, realisations and seeds of a trial go to the shards in turn; the shard that a trial begins with is
+    drawn by its id, which is a digest.
     """
     turn = int(unit.trial.id, 16) + unit.seed + unit.realisation + unit.block
     return Shard(index=turn % of + 1, of=of)

@@ -22,6 +22,7 @@ from benchnav.eval.suite import Suite
 distributed = pytest.importorskip("distributed")
 
 ROOT = Path(__file__).parents[3]
+PATIENCE_S = 600  # a busy machine takes its time to start processes
 KEYS = ["trial", "seed", "realisation", "instance"]
 
 
@@ -36,8 +37,12 @@ class Cluster:
         self.scheduler = self._start("scheduler", "--port", str(self.port))
         of_one = ("worker", self.address, "--no-nanny", "--nthreads", "1")
         self.workers = [self._start(*of_one) for _ in range(workers)]
-        with distributed.Client(self.address, timeout=120, set_as_default=False) as client:
-            client.wait_for_workers(workers, timeout=120)
+        try:
+            with distributed.Client(self.address, timeout=PATIENCE_S, set_as_default=False) as client:
+                client.wait_for_workers(workers, timeout=PATIENCE_S)
+        except BaseException:
+            self.stop()
+            raise
 
     def _start(self, role: str, *options: str) -> subprocess.Popen[bytes]:
         words = ["-m", "dask", role, "--host", "127.0.0.1", "--no-dashboard", *options]
@@ -63,9 +68,8 @@ def cluster_of_two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine takes its time to start processes."""
-    monkeypatch.setattr(cluster, "_REACH_S", 120)
-    monkeypatch.setattr(cluster, "_WORKERS_S", 120)
+    monkeypatch.setattr(cluster, "_REACH_S", PATIENCE_S)
+    monkeypatch.setattr(cluster, "_WORKERS_S", PATIENCE_S)
 
 
 def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
