@@ -1,13 +1,17 @@
-"""The command `benchnav-eval`: run suites, list parts, report on runs, replay episodes."""
+"""The command `benchnav-eval`: run suites, merge and repeat runs, list parts, report, replay episodes."""
 
 import json
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from benchnav.command import Command, run
 from benchnav.eval.replay import program, replay
 from benchnav.eval.suite import RENAMED, Suite
+
+if TYPE_CHECKING:
+    from benchnav.eval.runner import Workers
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -18,6 +22,9 @@ def run_command(
     jobs: int = 1,
     overwrite: bool = False,
     planner_limit_s: float = 0.0,
+    shard: str = "",
+    backend: Literal["local", "dask"] = "local",
+    scheduler: str = "",
 ) -> int:
     """Run a suite into a folder, going on with or extending the run that is there.
 
@@ -28,25 +35,76 @@ def run_command(
         overwrite: Drop a run that is there.
         planner_limit_s: Seconds that a planner may take for one answer; planners then run in processes of
             their own. 0 sets no limit.
+        shard: I/N runs the I-th of N shares of the run alone; `merge` makes one run of them.
+        backend: Worker processes on this machine, or those of a Dask cluster.
+        scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
     from benchnav.command import show_progress
     from benchnav.errors import ConfigError
-    from benchnav.eval.report.write import write_report
+    from benchnav.eval.run.shard import read_shard
     from benchnav.eval.runner import run_suite
 
-    if jobs < 1:
-        raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
+    workers = _workers(jobs, backend, scheduler)
+    share = read_shard(shard)
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = Path(out)
     for planner, options in suite.planner_options.items():
         _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
-    show_progress(run_suite(suite, folder, jobs, overwrite, planner_limit_s, _say), "units")
-    write_report(folder)
-    _print(folder)
-    _print_recorded(folder, suite.record)
-    _print_replay(folder)
-    return _failed(folder)
+    steps = run_suite(suite, folder, workers.jobs, overwrite, planner_limit_s, _say, share, workers.scheduler)
+    show_progress(steps, "units")
+    if share is None:
+        return _finish(folder, suite.record)
+    print(f"shard {share} is finished in {folder}")
+    print(f"merge:   {program('benchnav-eval')} merge OUT PART …, when all {share.of} are")
+    return _failed_shard(folder)
+
+
+def merge(out: str, parts: list[str]) -> int:
+    """Make one run of its shards, and report on it.
+
+    Args:
+        out: Run folder to be made.
+        parts: Folders of all the run's shards, in any order.
+    """
+    from benchnav.command import show_progress
+    from benchnav.eval.merge import merge_shards
+    from benchnav.eval.run.folder import open_run
+
+    folder = Path(out)
+    show_progress(merge_shards([Path(part) for part in parts], folder), "units")
+    return _finish(folder, open_run(folder).about["suite"]["record"])
+
+
+def rerun(
+    folder: str,
+    out: str = "",
+    jobs: int = 1,
+    overwrite: bool = False,
+    backend: Literal["local", "dask"] = "local",
+    scheduler: str = "",
+) -> int:
+    """Repeat a run from its provenance, and say whether every row came out the same.
+
+    Args:
+        folder: Run folder of a finished run.
+        out: Run folder of the repeated run; RUN-rerun when not given.
+        jobs: Worker processes.
+        overwrite: Drop a run that is there.
+        backend: Worker processes on this machine, or those of a Dask cluster.
+        scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
+    """
+    from benchnav.command import show_progress
+    from benchnav.eval.rerun import compare
+    from benchnav.eval.rerun import rerun as rerun_all
+
+    workers = _workers(jobs, backend, scheduler)
+    original = Path(folder)
+    repeated = Path(out) if out else original.resolve().with_name(f"{original.resolve().name}-rerun")
+    show_progress(rerun_all(original, repeated, workers, overwrite, _say), "units")
+    comparison = compare(original, repeated)
+    print("\n".join(comparison.lines))
+    return 0 if comparison.same else 1
 
 
 def list_command(kinds: list[str]) -> None:
@@ -118,6 +176,32 @@ def compare(
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
 
 
+def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
+    from benchnav.errors import ConfigError
+    from benchnav.eval.runner import Workers
+
+    if jobs < 1:
+        raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
+    if (backend == "dask") != bool(scheduler):
+        raise ConfigError("Expected `backend` dask and `scheduler` together, got one without the other.")
+    if scheduler and jobs > 1:
+        raise ConfigError(
+            f"Expected no `jobs` with `backend` dask, whose cluster has its own workers, got {jobs}."
+        )
+    return Workers(jobs=jobs, scheduler=scheduler)
+
+
+def _finish(folder: Path, record: str) -> int:
+    """Reports on a finished run; gives the exit status."""
+    from benchnav.eval.report.write import write_report
+
+    write_report(folder)
+    _print(folder)
+    _print_recorded(folder, record)
+    _print_replay(folder)
+    return _failed(folder)
+
+
 def _say(line: str) -> None:
     print(f"benchnav-eval: {line}", file=sys.stderr, flush=True)
 
@@ -165,6 +249,16 @@ def _failed(folder: Path) -> int:
     return 1
 
 
+def _failed_shard(folder: Path) -> int:
+    """Exit status of a finished shard, which has no table yet."""
+    from benchnav.eval.run.folder import ERRORS
+
+    if not (folder / ERRORS).exists():
+        return 0
+    _say(f"some episodes ended by a fault of the code they ran; see {folder / ERRORS}")
+    return 1
+
+
 def main() -> None:
     """Entry point of `benchnav-eval`."""
     commands = {
@@ -173,5 +267,11 @@ def main() -> None:
         "report": Command(report, ("folder",)),
         "compare": Command(compare, ("folders",)),
         "replay": Command(replay, ("folder",)),
+        "merge": Command(merge, ("out", "parts")),
+        "rerun": Command(rerun, ("folder",)),
     }
-    sys.exit(run("benchnav-eval", "Evaluate planners under risk settings; report and replay.", commands))
+    sys.exit(
+        run(
+            "benchnav-eval", "Evaluate planners under risk settings; report, replay, merge, repeat.", commands
+        )
+    )

@@ -9,8 +9,9 @@ import secrets
 import shutil
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import chdir
+from collections.abc import Iterator, Mapping
+from contextlib import chdir, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from benchnav.eval.recorder import Recorder
 from benchnav.eval.run import provenance
 from benchnav.eval.run.changes import changed_options
 from benchnav.eval.run.check import check_suite
+from benchnav.eval.run.check_world import Say
+from benchnav.eval.run.cluster import connected, run_on_cluster
 from benchnav.eval.run.episode import (
     PredictionError,
     build,
@@ -38,9 +41,12 @@ from benchnav.eval.run.folder import (
     has_all,
     merge_tables,
     open_run,
+    write_errors,
     write_unit,
 )
+from benchnav.eval.run.keep import Keep
 from benchnav.eval.run.rows import episode_rows, error_rows
+from benchnav.eval.run.shard import Shard
 from benchnav.eval.run.steps import align_steps, step_table, write_steps
 from benchnav.eval.run.unit import Extent, Unit, in_table_order, units
 from benchnav.eval.suite import Suite
@@ -51,13 +57,52 @@ from benchnav.planning.world.outcome import Outcome
 Trials = dict[str, tuple[Trial, Extent]]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What a command asks of a run.
+
+    Args:
+        suite: as it was written, for `run.json`.
+        trials: by id, with how often each is to be run.
+        keep: what is recorded of episodes, and of which the steps are stored.
+        planner_limit_s: time limit of each call of a planner; 0 for none.
+        shard: which share of the units is run; None for all.
+    """
+
+    suite: Mapping[str, Any]
+    trials: Trials
+    keep: Keep
+    planner_limit_s: float = 0.0
+    shard: Shard | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workers:
+    """Who runs the units.
+
+    Args:
+        jobs: worker processes on this machine.
+        scheduler: address of a Dask cluster's scheduler, whose workers take their place; empty for none.
+    """
+
+    jobs: int = 1
+    scheduler: str = ""
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether units are run in other processes."""
+        return self.jobs > 1 or bool(self.scheduler)
+
+
 def run_suite(
     suite: Suite,
     folder: Path,
     jobs: int = 1,
     overwrite: bool = False,
     planner_limit_s: float = 0.0,
-    say: Callable[[str], None] = lambda line: None,
+    say: Say = lambda line: None,
+    shard: Shard | None = None,
+    scheduler: str = "",
 ) -> Iterator[tuple[int, int]]:
     """Runs what is not finished of a suite, yielding (units done, units in all); to be iterated to the end.
 
@@ -68,32 +113,63 @@ def run_suite(
         overwrite: drop the run that is there.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         say: is told what a user should know, a line at a time.
+        shard: run this share of the units alone; None for all.
+        scheduler: address of a Dask cluster's scheduler, whose workers are used in place of `jobs`.
 
     Raises:
         ConfigError: the folder holds something else or a run of other code, or the suite cannot be run.
         DatasetError: the dataset lacks what the suite asks for.
+        BenchnavError: the cluster cannot be reached, or was lost.
     """
+    workers = Workers(jobs=jobs, scheduler=scheduler)
     with sole_writer(folder, str(folder)):
-        wanted = check_suite(suite, jobs > 1 or planner_limit_s > 0, say)
+        wanted = check_suite(suite, workers.elsewhere or planner_limit_s > 0, say)
+        work = Work(
+            suite=suite.to_dict(),
+            trials=wanted,
+            keep=suite.keep,
+            planner_limit_s=planner_limit_s,
+            shard=shard,
+        )
+        yield from run_work(work, folder, workers, overwrite, say)
+
+
+def run_work(
+    work: Work, folder: Path, workers: Workers, overwrite: bool, say: Say
+) -> Iterator[tuple[int, int]]:
+    """Runs what is not finished of some work in a folder that the caller holds; otherwise as `run_suite`."""
+    reached = connected(workers.scheduler, work.planner_limit_s) if workers.scheduler else nullcontext()
+    with reached as cluster:
         if overwrite:
             _drop(folder)
-        run_id, trials = _begin(suite, folder, wanted, planner_limit_s, say)
-        every = units(trials, suite.keep)
-        known = [(unit, about_unit(folder, unit, run_id)) for unit in every]
-        missing = [unit for unit, about in known if not has_all(about, unit)]
-        done = len(every) - len(missing)
+        about, trials = _begin(work, folder, say)
+        every = units(trials, work.keep)
+        own = [unit for unit in every if work.shard is None or work.shard.has(unit)]
+        known = [(unit, about_unit(folder, unit, about["run_id"])) for unit in own]
+        missing = [unit for unit, found in known if not has_all(found, unit)]
+        done = len(own) - len(missing)
         if done:
-            say(f"{done} of {len(every)} units were there already")
-        if again := sum(about is not None and not has_all(about, unit) for unit, about in known):
+            say(f"{done} of {len(own)} units were there already")
+        if again := sum(found is not None and not has_all(found, unit) for unit, found in known):
             say(f"{again} finished units are run again for recordings or steps that they were not asked for")
-        yield done, len(every)
-        for _ in _run_all(missing, folder, run_id, jobs, planner_limit_s):
+        if own:
+            yield done, len(own)
+        else:
+            say(f"none of the {len(every)} units is in shard {work.shard}")
+        if cluster is None:
+            finished = _run_here(missing, folder, about, workers.jobs)
+        else:
+            finished = run_on_cluster(cluster, missing, folder, about, run_unit)
+        for _ in finished:
             done += 1
-            yield done, len(every)
-        _check_unchanged(folder)
+            yield done, len(own)
+    _check_unchanged(folder)
+    if work.shard is None:
         align_steps(folder, every)
-        merge_tables(folder, in_table_order(every, trials), run_id)
+        merge_tables(folder, in_table_order(every, trials), about["run_id"])
         keep_ground(folder)
+    else:
+        write_errors(folder, in_table_order(own, trials), about["run_id"])
 
 
 def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0) -> None:
@@ -130,12 +206,10 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
     write_unit(folder, unit, rows, about)
 
 
-def _run_all(
-    missing: list[Unit], folder: Path, run_id: str, jobs: int, planner_limit_s: float
-) -> Iterator[None]:
+def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs: int) -> Iterator[None]:
     # Workers may be older than this call, so that they are told where names of files begin.
-    here, target = Path.cwd(), folder.resolve()
-    calls = (joblib.delayed(_run_at)(here, unit, target, run_id, planner_limit_s) for unit in missing)
+    here, target, run_id, limit_s = Path.cwd(), folder.resolve(), about["run_id"], about["planner_limit_s"]
+    calls = (joblib.delayed(_run_at)(here, unit, target, run_id, limit_s) for unit in missing)
     finished = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
     for _ in missing:
         with warnings.catch_warnings():
@@ -158,27 +232,30 @@ def _drop(folder: Path) -> None:
         shutil.rmtree(dropped)
 
 
-def _begin(
-    suite: Suite, folder: Path, wanted: Trials, planner_limit_s: float, say: Callable[[str], None]
-) -> tuple[str, Trials]:
-    """Writes `run.json`, or extends the one that is there; gives the run's id and all its trials."""
+def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
+    """Writes `run.json`, or extends the one that is there; gives what it holds and all trials."""
     if not (folder / RUN).exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ConfigError(
                 f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
             )
-        about = _about(secrets.token_hex(8), suite, wanted, planner_limit_s, [])
+        about = _about(secrets.token_hex(8), work, work.trials, [])
         write_text(folder / RUN, json.dumps(about, indent=1))
-        return about["run_id"], wanted
+        return about, work.trials
     earlier = open_run(folder)
     if earlier.version < FORMAT_VERSION:
         raise ConfigError(
             f"Expected `out` to be new or a run of format version {FORMAT_VERSION}, but {folder} is of version "
             f"{earlier.version}, which can be reported and not gone on with. Choose another `out`."
         )
-    trials = _joined(earlier.trials, wanted)
+    if earlier.shard != work.shard:
+        raise ConfigError(
+            f"Expected `out` to be new or to hold {_share(work.shard)}, but {folder} holds "
+            f"{_share(earlier.shard)}. Choose another `out`."
+        )
+    trials = _joined(earlier.trials, work.trials)
     check_labels(trial for trial, _ in trials.values())
-    now = _about(earlier.about["run_id"], suite, trials, planner_limit_s, earlier.about["commands"])
+    now = _about(earlier.about["run_id"], work, trials, earlier.about["commands"])
     changed = provenance.differences(earlier.about, now)
     if changed:
         raise ConfigError(
@@ -189,7 +266,11 @@ def _begin(
         new = len(trials) - len(earlier.trials)
         say(f"{folder} is extended: {new} new trials" if new else f"{folder} is extended by more episodes")
         write_text(folder / RUN, json.dumps(now, indent=1))
-    return now["run_id"], trials
+    return now, trials
+
+
+def _share(shard: Shard | None) -> str:
+    return "a whole run" if shard is None else f"shard {shard} of one"
 
 
 def _joined(earlier: Trials, wanted: Trials) -> Trials:
@@ -214,9 +295,7 @@ def _check_unchanged(folder: Path) -> None:
         )
 
 
-def _about(
-    run_id: str, suite: Suite, trials: Trials, planner_limit_s: float, commands: list[str]
-) -> dict[str, Any]:
+def _about(run_id: str, work: Work, trials: Trials, commands: list[str]) -> dict[str, Any]:
     entries = {
         trial_id: {"value": trial.value, "labels": trial.labels, **_notes(trial), **extent.to_dict()}
         for trial_id, (trial, extent) in trials.items()
@@ -225,9 +304,10 @@ def _about(
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "run_id": run_id,
-        "suite": suite.to_dict(),
+        **({"shard": work.shard.to_dict()} if work.shard else {}),
+        "suite": dict(work.suite),
         "trials": entries,
-        "planner_limit_s": planner_limit_s,
+        "planner_limit_s": work.planner_limit_s,
         **provenance.describe(trials),
         "machine": provenance.describe_machine(),
         "commands": provenance.command_lines(commands),

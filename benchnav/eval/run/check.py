@@ -1,5 +1,6 @@
 """What is refused, and what a user is told, before anything of a suite is run or dropped."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from benchnav import registry
@@ -69,7 +70,7 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
     check_luck(trials, datasets, suite)
     _check_single_class(trials, datasets)
     if elsewhere:
-        _check_everywhere(trials)
+        check_everywhere(trials)
     for trial in _distinct(trials, ("model",)):
         model = _class_table(trial)
         for data in {other.data for other in trials if other.model == trial.model and not other.blind}:
@@ -168,15 +169,20 @@ def _check_first_plan(trial: Trial) -> None:
         ) from error
 
 
-def _check_everywhere(trials: list[Trial]) -> None:
+def check_everywhere(trials: Iterable[Trial]) -> None:
+    """Refuses parts that other processes would not find.
+
+    Raises:
+        ConfigError: there are such.
+    """
     for trial in trials:
         for kind in PART_KINDS:
             source = getattr(trial, kind).part
             known = kind != "model" or source in registry.names("model") or ":" in source
             if known and not registry.find(kind, source).everywhere:
                 raise ConfigError(
-                    f"Expected {kind} {source!r} to be found by other processes, which `jobs` > 1 and "
-                    "`planner_limit_s` need, but it is registered in this one alone. Name it as "
+                    f"Expected {kind} {source!r} to be found by other processes, which `jobs` > 1, "
+                    "`scheduler` and `planner_limit_s` need, but it is registered in this one alone. Name it as "
                     "path/to/file.py:Name."
                 )
 

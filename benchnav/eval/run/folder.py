@@ -7,7 +7,7 @@ is written under another name first. Version 2 had all steps within the files of
 """
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
 from benchnav.eval.run.keep import Keep
+from benchnav.eval.run.shard import Shard
 from benchnav.eval.run.unit import Extent, Unit
 from benchnav.eval.trial import Trial, trial_from
 from benchnav.files import replacing, write_text
@@ -37,12 +38,14 @@ class Run:
         about: all of `run.json`.
         version: of its format; 1 is that of benchnav 0.1.
         trials: by id, with how often each is run; none in version 1.
+        shard: which share of the run the folder holds; None where it holds all.
     """
 
     folder: Path
     about: dict[str, Any]
     version: int
     trials: dict[str, tuple[Trial, Extent]]
+    shard: Shard | None = None
 
 
 def open_run(folder: Path) -> Run:
@@ -61,6 +64,7 @@ def open_run(folder: Path) -> Run:
             )
         known = {} if version == 1 else about["trials"]
         trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in known.items()}
+        shard = Shard(**about["shard"]) if "shard" in about else None
         if not isinstance(about["suite"], dict):
             raise TypeError("no suite")
     except ConfigError:
@@ -69,17 +73,23 @@ def open_run(folder: Path) -> Run:
         raise ConfigError(
             f"Expected a run folder with {RUN}, got {folder}. Make one with `benchnav-eval run`."
         ) from error
-    return Run(folder=folder, about=about, version=version, trials=trials)
+    return Run(folder=folder, about=about, version=version, trials=trials, shard=shard)
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
     """Reads a table of a finished run.
 
     Raises:
-        ConfigError: the run is not finished.
+        ConfigError: the run is not finished, or the folder holds a shard of it.
     """
     path = folder / name
     if not path.exists():
+        shard = open_run(folder).shard
+        if shard is not None:
+            raise ConfigError(
+                f"Expected a whole run, got {folder}, which is shard {shard} of one and has no tables. Put all "
+                "shards together with `benchnav-eval merge OUT PART …`."
+            )
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Run the same command again to finish it."
         )
@@ -126,6 +136,15 @@ def has_all(about: Mapping[str, Any] | None, unit: Unit) -> bool:
     return about is not None and Keep(**about["keep"]).covers(unit.keep)
 
 
+def copy_unit(source: Path, unit: Unit, folder: Path, run_id: str) -> None:
+    """Copies the file of a finished unit into another run folder, as a unit of that run."""
+    table = pq.read_table(source / unit.path, partitioning=None)
+    metadata = dict(table.schema.metadata)
+    metadata[_METADATA] = json.dumps({**json.loads(metadata[_METADATA]), "run_id": run_id}).encode()
+    with replacing(folder / unit.path) as partial:
+        pq.write_table(table.replace_schema_metadata(metadata), partial)
+
+
 def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
     """Writes `episodes.parquet` of all units, a unit at a time, and `errors.txt`.
 
@@ -133,11 +152,20 @@ def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
         ConfigError: a unit is missing, or of another run.
     """
     finished = list(finished)
+    write_errors(folder, finished, run_id)
+    _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
+
+
+def write_errors(folder: Path, finished: Sequence[Unit], run_id: str) -> None:
+    """Writes `errors.txt` of all units, or removes it where nothing failed.
+
+    Raises:
+        ConfigError: a unit is missing, or of another run.
+    """
     abouts = [about_unit(folder, unit, run_id) for unit in finished]
     for unit, about in zip(finished, abouts, strict=True):
         if about is None:
             raise ConfigError(f"{folder / unit.path} is not of this run. Run the same command again.")
-    _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
     traces = [
         text for unit, about in zip(finished, abouts, strict=True) if about and (text := _trace(unit, about))
     ]
@@ -155,6 +183,11 @@ def _merge(path: Path, tables: Iterable[pa.Table]) -> None:
             writer.write_table(table.cast(writer.schema))
         if writer is not None:
             writer.close()
+
+
+def unit_rows(folder: Path, unit: Unit) -> pd.DataFrame:
+    """Reads the rows of a finished unit."""
+    return _episode_table(folder, unit).to_pandas()
 
 
 def _episode_table(folder: Path, unit: Unit) -> pa.Table:

@@ -1,0 +1,255 @@
+"""Running units on a Dask cluster, through joblib.
+
+Workers write nothing that lasts: the files that a unit makes come back as bytes, and the command that asked for
+them writes them. So workers share no disk with it, and a unit that was begun twice, since a worker died, is
+there once. Before each unit its worker compares what rows depend on with what the run was begun with.
+
+`distributed` is an extra of this package, imported when a cluster is asked for.
+"""
+
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, chdir, contextmanager, nullcontext
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.parse import urlparse
+
+import joblib
+
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.run import provenance
+from benchnav.eval.run.unit import Extent, Unit
+from benchnav.files import replacing
+
+RunUnit = Callable[[Unit, Path, str, float], None]
+
+_REACH_S = 5
+_WORKERS_S = 10
+
+
+@contextmanager
+def connected(scheduler: str, planner_limit_s: float) -> Iterator[Any]:
+    """A client of a cluster whose workers are fit for a run of this code.
+
+    Args:
+        scheduler: address, such as tcp://127.0.0.1:8786.
+        planner_limit_s: time limit of each call of a planner; 0 for none.
+
+    Raises:
+        ConfigError: the scheduler cannot be reached, has no worker, or has one that is not fit.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigError(
+            f"Expected Dask for a cluster, got: {error}. Install it: pip install 'benchnav[dask]'"
+        ) from error
+    _check_address(scheduler)
+    with ExitStack() as stack:
+        stack.enter_context(_quiet())
+        try:
+            client = stack.enter_context(Client(scheduler, timeout=_REACH_S, set_as_default=False))
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"Expected `scheduler` to be the address of a running Dask scheduler, got {scheduler}, which gave "
+                f"no answer within {_REACH_S} s. Start one with `dask scheduler`."
+            ) from error
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError as error:
+            raise ConfigError(
+                f"Expected a cluster with workers, got {scheduler} with none for {_WORKERS_S} s. Start some with "
+                f"`dask worker {scheduler} --nworkers N --nthreads 1`."
+            ) from error
+        own = {
+            "code": provenance.describe_code(),
+            "datasets": {},
+            "parts": {},
+            "planner_limit_s": planner_limit_s,
+        }
+        for address, state in client.run(describe_worker, on_error="return").items():
+            check_worker(address, state, own)
+        yield client
+
+
+def run_on_cluster(
+    client: Any, missing: Sequence[Unit], folder: Path, about: Mapping[str, Any], run_unit: RunUnit
+) -> Iterator[None]:
+    """Runs units on a cluster, yielding as each is in the run folder.
+
+    Args:
+        client: from `connected`.
+        missing: what is run.
+        folder: the run folder.
+        about: its `run.json`.
+        run_unit: runs a unit into a folder, given the run's id and the time limit of planners.
+
+    Raises:
+        ConfigError: a worker is not fit for the run.
+        BenchnavError: the cluster was lost, or a unit ended one worker after another.
+    """
+    if not missing:
+        return
+    calls = (
+        joblib.delayed(_make)(run_unit, Path.cwd(), unit, about["run_id"], _subset(about, unit))
+        for unit in missing
+    )
+    with _told_when_lost(client.scheduler.address):
+        for unit, files in _parallel(client)(calls):
+            _store(folder, unit, files)
+            yield
+
+
+def describe_worker(dask_worker: Any) -> dict[str, Any]:
+    """What is asked of the process that a worker is; Dask gives the worker to a parameter of this name."""
+    return {
+        "code": _code(),
+        "threads": dask_worker.state.nthreads,
+        "starts_processes": not multiprocessing.current_process().daemon,
+    }
+
+
+def check_worker(address: str, state: Mapping[str, Any] | BaseException, about: Mapping[str, Any]) -> None:
+    """Refuses a worker whose rows would not be those of the command's own process.
+
+    Args:
+        address: the worker's.
+        state: from `describe_worker`, perhaps with `datasets` and `parts`; or what was raised there.
+        about: the `run.json` of the run.
+
+    Raises:
+        ConfigError: the worker is not fit; the message names it and says why.
+    """
+    if isinstance(state, BaseException):
+        raise ConfigError(
+            f"Expected workers that have benchnav installed, got {address}, where this was raised: "
+            f"{type(state).__name__}: {state}"
+        )
+    if state["threads"] != 1:
+        raise ConfigError(
+            f"Expected workers of one thread, got {address} with {state['threads']}. Start them with "
+            "`dask worker ADDRESS --nworkers N --nthreads 1`."
+        )
+    if about["planner_limit_s"] and not state["starts_processes"]:
+        raise ConfigError(
+            f"Expected workers that may start processes, which `planner_limit_s` needs, got {address}. Start them "
+            "with `dask worker … --no-nanny`, or with DASK_DISTRIBUTED__WORKER__DAEMON=False."
+        )
+    now = {"datasets": {}, "parts": {}, "planner_limit_s": about["planner_limit_s"], **state}
+    changed = provenance.differences(about, now)
+    if changed:
+        raise ConfigError(
+            f"Expected workers of the same code and data as this command's, but {address} differs in "
+            f"{'; '.join(changed)}. Start it anew from the same environment."
+        )
+
+
+def _parallel(client: Any) -> joblib.Parallel:
+    """Sends all calls at once, so that workers that join later have their share."""
+    from joblib._dask import DaskDistributedBackend
+
+    class Cluster(DaskDistributedBackend):
+        def effective_n_jobs(self, n_jobs: int) -> int:
+            # joblib would make the calls of a cluster of one worker in this process.
+            return max(2, super().effective_n_jobs(n_jobs))
+
+    backend = Cluster(client=client, wait_for_workers_timeout=_WORKERS_S)
+    return joblib.Parallel(
+        n_jobs=-1, backend=backend, return_as="generator_unordered", pre_dispatch="all", batch_size=1
+    )
+
+
+@cache
+def _code() -> dict[str, Any]:
+    # Once a process: what it has imported stays what it was, whatever its files become.
+    return provenance.describe_code()
+
+
+def _make(
+    run_unit: RunUnit, here: Path, unit: Unit, run_id: str, about: Mapping[str, Any]
+) -> tuple[Unit, dict[str, bytes]]:
+    """Runs a unit on a worker; gives what it wrote, by its place in a run folder."""
+    from distributed import get_worker
+
+    # Names of files begin where the command was given, if this machine has that place.
+    with chdir(here) if here.is_dir() else nullcontext():
+        extent = Extent(draws=((unit.seed, unit.realisation, unit.instances[-1] + 1),))
+        trials = {unit.trial.id: (unit.trial, extent)}
+        worker = get_worker()
+        try:
+            state = {
+                **describe_worker(worker),
+                "datasets": provenance.describe_maps(trials),
+                "parts": provenance.describe_parts(trials),
+            }
+        except BenchnavError as error:
+            raise ConfigError(f"Worker {worker.address} lacks what the run needs: {error}") from error
+        check_worker(worker.address, state, about)
+        with TemporaryDirectory(dir=worker.local_directory) as scratch:
+            run_unit(unit, Path(scratch), run_id, about["planner_limit_s"])
+            files = (path for path in Path(scratch).rglob("*") if path.is_file())
+            return unit, {path.relative_to(scratch).as_posix(): path.read_bytes() for path in files}
+
+
+def _subset(about: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
+    """What of `run.json` bears on a unit and is not told by the unit itself."""
+    trial = unit.trial
+    dataset = about["datasets"][trial.data]
+    maps = {trial.split: dataset["maps"][trial.split][: unit.instances[-1] + 1]}
+    return {
+        "code": about["code"],
+        "parts": about["parts"],
+        "planner_limit_s": about["planner_limit_s"],
+        "datasets": {trial.data: {"id": dataset["id"], "maps": maps}},
+    }
+
+
+def _store(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
+    """Writes what a unit made, its own file last, since that says that it is finished."""
+    own = unit.path.as_posix()
+    for name in [*(name for name in sorted(files) if name != own), own]:
+        with replacing(folder / name) as partial:
+            partial.write_bytes(files[name])
+
+
+def _check_address(scheduler: str) -> None:
+    place = urlparse(scheduler)
+    try:
+        known = place.scheme in ("tcp", "tls") and place.hostname and place.port
+    except ValueError:  # a port that is no number
+        known = False
+    if not known:
+        raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
+
+
+@contextmanager
+def _told_when_lost(scheduler: str) -> Iterator[None]:
+    from distributed import CancelledError, KilledWorker
+
+    try:
+        yield
+    except CancelledError as error:
+        raise BenchnavError(
+            f"The scheduler at {scheduler} was lost. What was finished is kept: give the same command again."
+        ) from error
+    except KilledWorker as error:
+        raise BenchnavError(
+            f"A unit was given up, since several workers died over it, the last at {error.last_worker.address}: "
+            "see their logs, perhaps for want of memory. What was finished is kept."
+        ) from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps the library's own log off the terminal; what a user has to know is raised."""
+    levels = {name: logging.getLogger(name).level for name in ("distributed", "distributed.client")}
+    for name in levels:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)

@@ -1,0 +1,250 @@
+"""A run on a real Dask cluster has the rows of one process, whatever happens to workers and scheduler."""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval import cli
+from benchnav.eval.run import cluster, provenance
+from benchnav.eval.run.cluster import check_worker
+from benchnav.eval.run.folder import open_run
+from benchnav.eval.run.steps import read_steps
+from benchnav.eval.runner import run_suite
+from benchnav.eval.suite import Suite
+
+distributed = pytest.importorskip("distributed")
+
+ROOT = Path(__file__).parents[3]
+PATIENCE_S = 600  # a busy machine takes its time to start processes
+KEYS = ["trial", "seed", "realisation", "instance"]
+
+
+class Cluster:
+    """A scheduler and workers of one thread, each a process of its own on this machine."""
+
+    def __init__(self, folder: Path, workers: int) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.folder, self.address = folder, f"tcp://127.0.0.1:{self.port}"
+        self.scheduler = self._start("scheduler", "--port", str(self.port))
+        of_one = ("worker", self.address, "--no-nanny", "--nthreads", "1")
+        self.workers = [self._start(*of_one) for _ in range(workers)]
+        try:
+            with distributed.Client(self.address, timeout=PATIENCE_S, set_as_default=False) as client:
+                client.wait_for_workers(workers, timeout=PATIENCE_S)
+        except BaseException:
+            self.stop()
+            raise
+
+    def _start(self, role: str, *options: str) -> subprocess.Popen[bytes]:
+        words = ["-m", "dask", role, "--host", "127.0.0.1", "--no-dashboard", *options]
+        local = ["--local-directory", str(self.folder)] if role == "worker" else []
+        with open(self.folder / f"{role}.log", "ab") as log:
+            return subprocess.Popen(
+                [sys.executable, *words, *local], cwd=ROOT, stdout=log, stderr=log,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+            )  # fmt: skip
+
+    def stop(self) -> None:
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster_of_two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    made = Cluster(tmp_path_factory.mktemp("cluster"), 2)
+    yield made
+    made.stop()
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_REACH_S", PATIENCE_S)
+    monkeypatch.setattr(cluster, "_WORKERS_S", PATIENCE_S)
+
+
+def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
+    held = {"part": "tests.eval.parts:Held", "label": "held", "options": {"log": str(log)}}
+    given = {
+        "data": str(dataset), "model": "oracle", "planners": (held,), "risks": ("mean", "cvar"),
+        "scenarios": ("std", "hs"), "instances": 2, "seeds": (0, 1), "noise": "stored", "time_budget_s": 30.0,
+    } | changes  # fmt: skip
+    return Suite(**given)  # type: ignore[arg-type]
+
+
+def same(one: Path, other: Path) -> None:
+    """Asserts that two runs have the same rows in the same order, steps and recordings."""
+    first, second = (pd.read_parquet(run / "episodes.parquet") for run in (one, other))
+    assert not second.duplicated(KEYS).any()
+    pd.testing.assert_frame_equal(first.drop(columns="planning_ms"), second.drop(columns="planning_ms"))
+    pd.testing.assert_frame_equal(*(read_steps(run) for run in (one, other)))
+    recordings = [sorted(path.name for path in (run / "playback").glob("*")) for run in (one, other)]
+    assert recordings[0] == recordings[1] != []
+
+
+def test_a_worker_that_is_killed_in_the_middle_loses_nothing_and_doubles_nothing(
+    cluster_of_two: Cluster, dataset_path: Path, tmp_path: Path
+) -> None:
+    log, suite = tmp_path / "log", suite_on(dataset_path, tmp_path / "log")
+    victim, other = cluster_of_two.workers
+    (tmp_path / "log.hold").write_text(f"{victim.pid} 1")
+    steps = run_suite(suite, tmp_path / "cluster", scheduler=cluster_of_two.address)
+    done = 0
+    while done < 2 or str(victim.pid) not in log.read_text().splitlines():
+        done, total = next(steps)
+    assert done < total == 8
+    victim.kill()  # in the middle of a unit
+    assert list(steps)[-1] == (8, 8)
+    begun = log.read_text().splitlines()
+    assert set(begun) == {str(victim.pid), str(other.pid)}
+    assert len(begun) == 8 + 1
+    list(run_suite(suite, tmp_path / "here"))
+    same(tmp_path / "here", tmp_path / "cluster")
+    assert len(list((tmp_path / "cluster").glob("units/*/*"))) == 8
+    assert not list((tmp_path / "cluster").rglob(".*"))
+
+
+def test_a_worker_of_other_code_or_without_the_data_is_named(
+    cluster_of_two: Cluster, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = suite_on(dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,))
+    code = provenance.describe_code()
+    with monkeypatch.context() as patch:
+        patch.setattr(provenance, "describe_code", lambda: {**code, "sources": "0" * 64})
+        with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:\d+ differs in benchnav's own sources"):
+            list(run_suite(suite, tmp_path / "run", scheduler=cluster_of_two.address))
+    assert not (tmp_path / "run").exists()
+    # What only a unit can tell: a part's file, and the maps, that are not there when it begins.
+    mine, data = tmp_path / "mine.py", shutil.copy(dataset_path, tmp_path / "tiny.h5")
+    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    suite = suite_on(data, tmp_path / "log", planners=(f"{mine}:Mine",))
+    for change, expected in (
+        (lambda: mine.write_text(mine.read_text() + "# edited\n"), r"\d+ differs in planner .*mine\.py"),
+        (data.unlink, r"\d+ lacks what the run needs: .*tiny\.h5"),
+    ):
+        steps = run_suite(suite, tmp_path / "run", overwrite=True, scheduler=cluster_of_two.address)
+        next(steps)
+        change()
+        with pytest.raises(ConfigError, match=rf"tcp://127\.0\.0\.1:{expected}"):
+            list(steps)
+        assert not list((tmp_path / "run").glob("units/*/*"))
+
+
+def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Path, tmp_path: Path) -> None:
+    suite = suite_on(dataset_path, tmp_path / "log")
+    lost = Cluster(tmp_path, 1)
+    (tmp_path / "log.hold").write_text(f"{lost.workers[0].pid} 5")
+    try:
+        steps = run_suite(suite, tmp_path / "run", scheduler=lost.address)
+        while next(steps)[0] < 4:
+            pass
+        lost.scheduler.kill()
+        with pytest.raises(BenchnavError, match=r"was lost\. What was finished is kept"):
+            list(steps)
+    finally:
+        lost.stop()
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").glob("units/*/*.parquet")}
+    assert len(kept) == 4
+    list(run_suite(suite, tmp_path / "run"))
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    list(run_suite(suite, tmp_path / "here"))
+    same(tmp_path / "here", tmp_path / "run")
+
+
+def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cluster, "_REACH_S", 0.2)
+    suite = suite_on(dataset_path, tmp_path / "log", scenarios=("std",), risks=("mean",), seeds=(0,))
+    list(run_suite(suite, tmp_path / "run"))
+    before = sorted((tmp_path / "run").rglob("*"))
+    with socket.socket() as free:  # bound, and nobody listens
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+        words = (
+            "run",
+            "--data",
+            str(dataset_path),
+            "--model",
+            "oracle",
+            "--planners",
+            "[straight]",
+            "--overwrite",
+        )
+        words += (
+            "--instances",
+            "1",
+            "--out",
+            str(tmp_path / "run"),
+            "--backend",
+            "dask",
+            "--scheduler",
+            address,
+        )
+        monkeypatch.setattr(sys, "argv", ["benchnav-eval", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    assert ended.value.code == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert address in line
+    assert captured.out == ""
+    assert sorted((tmp_path / "run").rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1:8786", "tcp://127.0.0.1", "http://a:1", "tcp://a:b", "tcp://:1"]
+)
+def test_an_address_is_as_dask_writes_it(address: str, dataset_path: Path, tmp_path: Path) -> None:
+    suite = suite_on(dataset_path, tmp_path / "log")
+    with pytest.raises(ConfigError, match="tcp://HOST:PORT"):
+        list(run_suite(suite, tmp_path / "run", scheduler=address))
+    assert not (tmp_path / "run").exists()
+
+
+def test_parts_of_this_process_alone_are_refused(dataset_path: Path, tmp_path: Path) -> None:
+    from benchnav import registry
+    from tests.eval.parts import Faulty
+
+    registry.register("planner", "only_here", Faulty)
+    suite = suite_on(dataset_path, tmp_path / "log", planners=("only_here",))
+    with pytest.raises(ConfigError, match="scheduler"):
+        list(run_suite(suite, tmp_path / "run", scheduler="tcp://127.0.0.1:1"))
+
+
+def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    list(
+        run_suite(suite_on(dataset_path, tmp_path / "log", scenarios=("std",), seeds=(0,)), tmp_path / "run")
+    )
+    about = open_run(tmp_path / "run").about
+    told = {name: about[name] for name in ("code", "parts", "datasets")}
+    fit = {**told, "threads": 1, "starts_processes": False}
+    check_worker("tcp://w", fit, about)
+    check_worker("tcp://w", {**fit, "starts_processes": True}, {**about, "planner_limit_s": 5.0})
+    code, (data,) = about["code"], about["datasets"]
+    other_maps = {data: {"maps": {"test/std": ["0", "1"]}}}
+    for state, expected in (
+        (ModuleNotFoundError("No module named 'benchnav'"), "benchnav installed"),
+        ({**fit, "threads": 4}, "with 4"),
+        ({**fit, "code": {**code, "sources": "0"}}, "own sources"),
+        ({**fit, "code": {**code, "processor": "ABACUS"}}, "ABACUS"),
+        ({**fit, "code": {**code, "versions": {**code["versions"], "numpy": "9"}}}, r"numpy \(.* to 9\)"),
+        ({**fit, "parts": {"model oracle": {"name": "other"}}}, "model oracle"),
+        ({**fit, "datasets": other_maps}, "maps of"),
+    ):
+        with pytest.raises(ConfigError, match=rf"tcp://w.*{expected}|{expected}.*tcp://w"):
+            check_worker("tcp://w", state, about)
+    with pytest.raises(ConfigError, match="no-nanny"):
+        check_worker("tcp://w", fit, {**about, "planner_limit_s": 5.0})
