@@ -42,8 +42,8 @@ def test_the_whole_map_is_free_and_nothing_else() -> None:
 
 
 def test_slowest_bounds_what_motion_is_given() -> None:
-    vegetated = problem = pose(VEGETATED, ["cvar:0.8"], Setup(slowest=0.3))
-    assert float(vegetated.traversability.min()) == pytest.approx(0.3)
+    problem = pose(VEGETATED, ["cvar:0.8"], Setup(slowest=0.3))
+    assert float(problem.traversability.min()) == pytest.approx(0.3)
     assert float(problem.risk_map.min()) < 0.05
     assert float(pose(VEGETATED, ["cvar:0.8"], Setup()).traversability.min()) < 0.05
 
@@ -79,13 +79,13 @@ def cost_of(actions: np.ndarray, risk_map: np.ndarray, power: int) -> float:
 def test_costs_of_rollouts_are_theirs(power: int) -> None:
     problem = pose(VEGETATED[:1], ["mean"], Setup(distance_power=power))
     noise = np.random.default_rng(0)
-    actions = np.stack((noise.uniform(1.5, 3, (100, 6)), noise.normal(0, 0.2, (100, 6))), axis=1)
+    actions = np.stack((noise.uniform(1.5, 3, (100, 6)), noise.normal(0, 0.02, (100, 6))), axis=1)
     actions[:, 0, 3:] /= 5  # these never arrive
     costs = rollout_cost(
         problem, problem.start, torch.zeros(1, 100, 2), torch.from_numpy(actions).float(), problem.goal_m
     )[0]
     expected = [cost_of(actions[..., k], problem.risk_map[0].numpy(), power) for k in range(6)]
-    assert max(expected[:3]) < 2000 < min(expected[3:]) or power == 2
+    assert 2 * max(expected[:3]) < min(expected[3:])
     start = 0.1 + math.hypot(8, 8) ** power  # counted by us alone, of every rollout
     np.testing.assert_allclose(costs.numpy() - start, expected, rtol=2e-4)
 
