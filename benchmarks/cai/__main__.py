@@ -26,8 +26,8 @@ def make_parser() -> ArgumentParser:
     parser.add_argument(
         "--density", type=float, nargs="+", default=[0.1, 0.4, 0.7, 1.0], help="Of vegetation."
     )
-    parser.add_argument("--risk", type=str, nargs="+", default=list(SETTINGS), help="Settings.")
-    parser.add_argument("--maps", type=int, default=40, help="Maps a density.")
+    parser.add_argument("--risk", type=str, nargs="+", default=list(SETTINGS), help="Risk settings.")
+    parser.add_argument("--maps", type=int, default=40, help="How many.")
     parser.add_argument("--realisations", type=int, default=5, help="Draws of traction a map.")
     parser.add_argument("--seed", type=int, default=0, help="Root of all draws.")
     parser.add_argument("--out", type=Path, help="CSV file of trials to write.")
@@ -35,10 +35,21 @@ def make_parser() -> ArgumentParser:
     return parser
 
 
+def in_order(rows: pd.DataFrame, densities: list[float], settings: list[str]) -> pd.DataFrame:
+    """Rows by density and setting as they were asked for, then by map and realisation."""
+    rank = {"density": densities.index, "setting": settings.index}
+    return rows.sort_values(
+        ["density", "setting", "map", "realisation"],
+        key=lambda column: column.map(rank[column.name]) if column.name in rank else column,
+        ignore_index=True,
+    )
+
+
 def main() -> int:
     parser = make_parser()
-    given = parser.instantiate(parser.parse_args())
+    words = parser.parse_args()
     try:
+        given = parser.instantiate(words)
         units = run_trials(given.density, given.risk, given.maps, given.realisations, given.seed, given.setup)
         rows: list[pd.DataFrame] = []
         total = given.maps * given.realisations
@@ -46,9 +57,7 @@ def main() -> int:
     except ConfigError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return 2
-    trials = pd.concat(rows, ignore_index=True).sort_values(
-        ["density", "setting", "map", "realisation"], kind="stable"
-    )
+    trials = in_order(pd.concat(rows, ignore_index=True), given.density, given.risk)
     if given.out:
         with replacing(given.out) as partial:
             trials.to_csv(partial, index=False)

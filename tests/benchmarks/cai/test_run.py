@@ -1,11 +1,14 @@
 import pandas as pd
 import pytest
 import torch
+from torch import Tensor
 
+from benchmarks.cai import run
 from benchmarks.cai.run import run_trials
 from benchmarks.cai.task import Setup
 from benchnav.errors import ConfigError
 from benchnav.planning.planners.mppi import MPPIConfig
+from benchnav.planning.problem import Problem
 
 QUICK = Setup(mppi=MPPIConfig(horizon=8, samples=16, noise=(2.0, 2.0), temperature=1.0, control_cost=0.0))
 
@@ -49,6 +52,28 @@ def test_realisations_settings_and_seeds_count(rows: pd.DataFrame) -> None:
     assert first != times(rows, realisation=1)
     assert times(rows, setting="mean") != times(rows, setting="cvar:0.8")
     assert first != times(trials(DENSITIES, SETTINGS, seed=1))
+
+
+def test_luck_is_named_by_map_and_realisation(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds, fields = [], []
+
+    def record(planner: object, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:
+        seeds.append(generator.initial_seed())
+        fields.append(traction)
+        return torch.zeros(len(problem))
+
+    monkeypatch.setattr(run, "drive", record)
+    rows = pd.concat(run_trials(DENSITIES, SETTINGS, 2, 2, 0, QUICK))
+    assert len(set(seeds)) == 4
+    for sparse, sparse_again, dense, dense_again in fields:
+        assert torch.equal(sparse, sparse_again)
+        assert torch.equal(dense, dense_again)
+        assert not torch.equal(sparse, dense)
+    assert not torch.equal(fields[0][0], fields[1][0])
+    assert rows["success"].all()
+    assert rows.iloc[:4][["density", "setting"]].to_numpy().tolist() == [
+        [d, s] for d in DENSITIES for s in SETTINGS
+    ]
 
 
 @pytest.mark.parametrize(
