@@ -1,0 +1,71 @@
+"""Repeats the experiment of Cai et al. with our planner and risk settings, beside what they published.
+
+    python -m benchmarks.cai                                       # all of it
+    python -m benchmarks.cai --density 0.4 1.0 --out trials.csv    # some of it
+    python -m benchmarks.cai --setup.risk_map histogram            # with a choice of theirs
+
+What is theirs, what is ours and what differs is said in `docs/validation.md`.
+"""
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+from jsonargparse import ArgumentParser
+
+from benchmarks.cai.run import SETTINGS, run_trials
+from benchmarks.cai.tables import CAUTIOUS, NEUTRAL, tabulate_pairs, tabulate_success
+from benchmarks.cai.task import Setup
+from benchnav.command import show_progress
+from benchnav.errors import ConfigError
+from benchnav.files import replacing
+
+
+def make_parser() -> ArgumentParser:
+    parser = ArgumentParser(prog="python -m benchmarks.cai", description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--density", type=float, nargs="+", default=[0.1, 0.4, 0.7, 1.0], help="Of vegetation."
+    )
+    parser.add_argument("--risk", type=str, nargs="+", default=list(SETTINGS), help="Risk settings.")
+    parser.add_argument("--maps", type=int, default=40, help="How many.")
+    parser.add_argument("--realisations", type=int, default=5, help="Draws of traction a map.")
+    parser.add_argument("--seed", type=int, default=0, help="Root of all draws.")
+    parser.add_argument("--out", type=Path, help="CSV file of trials to write.")
+    parser.add_class_arguments(Setup, "setup")
+    return parser
+
+
+def in_order(rows: pd.DataFrame, densities: list[float], settings: list[str]) -> pd.DataFrame:
+    """Rows by density and setting as they were asked for, then by map and realisation."""
+    rank = {"density": densities.index, "setting": settings.index}
+    return rows.sort_values(
+        ["density", "setting", "map", "realisation"],
+        key=lambda column: column.map(rank[column.name]) if column.name in rank else column,
+        ignore_index=True,
+    )
+
+
+def main() -> int:
+    parser = make_parser()
+    words = parser.parse_args()
+    try:
+        given = parser.instantiate(words)
+        units = run_trials(given.density, given.risk, given.maps, given.realisations, given.seed, given.setup)
+        rows: list[pd.DataFrame] = []
+        total = given.maps * given.realisations
+        show_progress(((len(rows), total) for unit in units if rows.append(unit) is None), "trials a setting")
+    except ConfigError as error:
+        print(f"{parser.prog}: error: {error}", file=sys.stderr)
+        return 2
+    trials = in_order(pd.concat(rows, ignore_index=True), given.density, given.risk)
+    if given.out:
+        with replacing(given.out) as partial:
+            trials.to_csv(partial, index=False)
+    print(tabulate_success(trials))
+    if {CAUTIOUS, NEUTRAL} <= set(given.risk):
+        print(f"\n{tabulate_pairs(trials)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,63 @@
+"""Running the trials of all densities and risk settings, and their table of rows."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+import torch
+
+from benchmarks.cai.drive import ManyTrialsMPPI, drive
+from benchmarks.cai.task import Setup, pose
+from benchmarks.cai.world import draw_traction, draw_vegetation
+from benchnav import rng
+from benchnav.errors import ConfigError
+
+SETTINGS = ("mean", "cvar:0.4", "cvar:0.6", "cvar:0.8")
+
+
+def run_trials(
+    densities: Sequence[float], settings: Sequence[str], maps: int, realisations: int, seed: int, setup: Setup
+) -> Iterator[pd.DataFrame]:
+    """Runs maps × realisations trials of each density and setting.
+
+    The planner's noise is named by (seed, map, realisation), as the world is: trials of one map and
+    realisation share it, and no others do.
+
+    Args:
+        densities: shares of vegetation.
+        settings: risk settings.
+        maps: maps a density.
+        realisations: draws of traction a map.
+        seed: root of all draws.
+        setup: how it is planned.
+
+    Yields:
+        Rows of one map and realisation: `density`, `setting`, `map`, `realisation`, `success`, `time_s`
+        (not a number where there was no arrival).
+
+    Raises:
+        ConfigError: there is nothing to run, or a density or setting that does not exist.
+    """
+    if not all(0 <= density <= 1 for density in densities):
+        raise ConfigError(f"Expected densities in [0, 1], got {list(densities)}.")
+    if maps < 1 or realisations < 1:
+        raise ConfigError(f"Expected `maps` and `realisations` ≥ 1, got {maps} and {realisations}.")
+    planner = ManyTrialsMPPI(setup)
+    labels = pd.MultiIndex.from_product((densities, settings), names=("density", "setting")).to_frame(
+        index=False
+    )
+    for member in range(maps):
+        which = np.array([member])
+        vegetation = np.concatenate([draw_vegetation(seed, which, density) for density in densities])
+        problem = pose(vegetation, settings, setup)
+        for realisation in range(realisations):
+            traction = draw_traction(seed, which.repeat(len(densities)), realisation, vegetation)
+            traction = torch.from_numpy(traction.repeat(len(settings), axis=0)).float()
+            generator = rng.generator(rng.stream_key(seed, "cai", "planner", member, realisation))
+            arrival_s = drive(planner, problem, traction, generator).double().numpy()
+            yield labels.assign(
+                map=member,
+                realisation=realisation,
+                success=np.isfinite(arrival_s),
+                time_s=np.where(np.isfinite(arrival_s), arrival_s.round(1), np.nan),
+            )

@@ -1,0 +1,91 @@
+"""Tables of the trials beside the published ones, as Markdown.
+
+Intervals are Wilson's, 95 %, over trials. Two settings on the same trials are compared by the exact McNemar
+test, ours with theirs by Fisher's exact test.
+"""
+
+import pandas as pd
+from scipy.stats import binomtest, fisher_exact
+
+from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
+from benchnav.eval.stats.intervals import wilson_interval
+
+CAUTIOUS, NEUTRAL = "cvar:0.8", "mean"
+_NONE = "–"
+
+
+def tabulate_success(rows: pd.DataFrame) -> str:
+    """Success and mean time of the successes, ours and theirs.
+
+    Args:
+        rows: trials, from `run_trials`.
+    """
+    lines = []
+    for (density, setting), group in rows.groupby(["density", "setting"], sort=False):
+        arrived, trials = int(group["success"].sum()), len(group)
+        cells = [
+            f"{100 * density:.0f} %",
+            f"`{setting}`",
+            show_share(arrived, trials),
+            show_time(group["time_s"].mean()),
+        ]
+        theirs = PUBLISHED.get((density, setting))
+        if theirs is None:
+            lines.append([*cells, _NONE, _NONE, _NONE])
+            continue
+        table = [[arrived, trials - arrived], [theirs.successes, TRIALS - theirs.successes]]
+        p = fisher_exact(table).pvalue
+        lines.append([*cells, show_share(theirs.successes, TRIALS), show_time(theirs.time_s), show_p(p)])
+    return markdown(
+        ["vegetation", "setting", "success, %", "time, s", "theirs, %", "theirs, s", "p of ours = theirs"],
+        lines,
+    )
+
+
+def tabulate_pairs(rows: pd.DataFrame) -> str:
+    """What caution gains over the mean on the same trials, ours and theirs.
+
+    Args:
+        rows: trials, from `run_trials`; both settings are among them.
+    """
+    lines = []
+    for density, group in rows.groupby("density", sort=False):
+        trials = group.pivot(index=["map", "realisation"], columns="setting", values="success").astype(bool)
+        gained = int((trials[CAUTIOUS] & ~trials[NEUTRAL]).sum())
+        lost = int((trials[NEUTRAL] & ~trials[CAUTIOUS]).sum())
+        theirs = PUBLISHED_PAIRS.get(density)
+        shown = [_NONE] * 3 if theirs is None else show_pair(*theirs, TRIALS)
+        lines.append([f"{100 * density:.0f} %", *show_pair(gained, lost, len(trials)), *shown])
+    ours = ["points", f"`{CAUTIOUS}` alone, `{NEUTRAL}` alone", "p"]
+    return markdown(["vegetation", *ours, *(f"theirs: {name}" for name in ours)], lines)
+
+
+def mcnemar_p(gained: int, lost: int) -> float:
+    """Two-sided p of the exact McNemar test, from the trials that only one of two settings won."""
+    return float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+
+
+def show_pair(gained: int, lost: int, trials: int) -> list[str]:
+    """Difference in points, the counts that make it, and their p."""
+    return [f"{100 * (gained - lost) / trials:+.1f}", f"{gained}, {lost}", show_p(mcnemar_p(gained, lost))]
+
+
+def show_share(successes: int, trials: int) -> str:
+    """A share in per cent with its interval."""
+    low, high = wilson_interval(successes / trials, trials)
+    return f"{100 * successes / trials:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def show_time(seconds: float) -> str:
+    """Seconds, or a dash where there was no arrival."""
+    return _NONE if seconds != seconds else f"{seconds:.1f}"
+
+
+def show_p(p: float) -> str:
+    """A p-value."""
+    return f"{p:.2f}" if p >= 0.1 else f"{p:.1g}"
+
+
+def markdown(header: list[str], lines: list[list[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *lines])

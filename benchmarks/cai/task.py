@@ -1,0 +1,163 @@
+"""The task of Cai et al. as a `Problem`: their robot, cost and rules, and what is predicted of the ground.
+
+Letters in shapes: B trials, K components, *B any leading dimensions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.cai.ground import DIRT, SLICES, VEGETATION
+from benchmarks.cai.world import GRID
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.planning import risk
+from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.objective import Objective, distance
+from benchnav.planning.planners.mppi import MPPIConfig
+from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.robots import Unicycle
+from benchnav.terrain import Observation
+
+START_M = (0.5, 0.5)
+GOAL_M = (8.5, 8.5)
+GOAL_RADIUS_M = 0.5
+STEPS = 150
+THEIR_MPPI = MPPIConfig(horizon=100, samples=1024, noise=(2.0, 2.0), temperature=1.0, control_cost=1.0)
+_LAST_SPEED_MPS = 0.01 + 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rover(Unicycle):
+    """Their unicycle, which stays where it has arrived: a rollout of theirs ends at the goal."""
+
+    speed_mps: tuple[float, float] = (0.0, 3.0)
+    turn_rate_radps: tuple[float, float] = (-np.pi, np.pi)
+
+    def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
+        """Advances one time step; see `Robot`."""
+        away = distance(state, state.new_tensor(GOAL_M)) > GOAL_RADIUS_M
+        return super().__call__(state, action, traversability * away)
+
+
+ROVER = Rover()
+
+
+@dataclass(frozen=True)
+class TimeAndDistance:
+    """Their cost: dt + distance at each step until arrival, and the time for what is left at a crawl.
+
+    They count a step by the state after it. Here the state before it is counted, and the last one at the
+    end, which differs by what the start costs: the same for all rollouts.
+
+    Args:
+        power: of the distance in a step's cost.
+    """
+
+    power: int = 1
+
+    def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+        """Cost of one step; see `Objective`."""
+        away = distance(state, target)
+        return (ROVER.dt_s + away**self.power) * (away > GOAL_RADIUS_M)
+
+    def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
+        """Cost of the last state; see `Objective`."""
+        away = distance(state, target)
+        return ROVER.dt_s + away**self.power + away / _LAST_SPEED_MPS * (away > GOAL_RADIUS_M)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """How it is planned; the defaults are theirs.
+
+    Args:
+        mppi: settings of the planner.
+        average: `clipped`, of samples within the bounds of actions, as ours is, or `drawn`, of samples as
+            drawn, which is clipped then, as theirs is.
+        risk_map: `exact`, by our risk settings, or `histogram`, by their binning and rounding.
+        objective: `theirs`, or one of ours by name.
+        distance_power: of the distance in a step's cost.
+        slowest: least λ̂ that motion is given.
+    """
+
+    mppi: MPPIConfig = THEIR_MPPI
+    average: Literal["clipped", "drawn"] = "clipped"
+    risk_map: Literal["exact", "histogram"] = "exact"
+    objective: str = "theirs"
+    distance_power: int = 1
+    slowest: float = 0.01
+
+
+def predict(vegetation: np.ndarray) -> TraversabilityMixture:
+    """The true distribution of traction in each cell, which planners of both sides are given.
+
+    Args:
+        vegetation: where it grows, bool, shape [B, 9, 9].
+
+    Returns:
+        Point masses, parameters of shape [B, 100, 9, 9].
+    """
+    of_vegetation, of_dirt = (ground.slices()[:, None, None] for ground in (VEGETATION, DIRT))
+    atoms = torch.from_numpy(np.where(vegetation[:, None], of_vegetation, of_dirt)).float()
+    return TraversabilityMixture(torch.full_like(atoms, 1 / SLICES), atoms, torch.zeros_like(atoms))
+
+
+def pose(vegetation: np.ndarray, settings: Sequence[str], setup: Setup) -> Problem:
+    """Poses the trials of some maps under some risk settings.
+
+    Args:
+        vegetation: where it grows on D maps, bool, shape [D, 9, 9].
+        settings: S of them, such as `mean` or `cvar:0.8`.
+        setup: how it is planned.
+
+    Returns:
+        D·S trials, all settings of the first map first.
+    """
+    mixture = predict(vegetation)
+    risk_maps = [infer_risk(setting, vegetation, mixture, setup) for setting in settings]
+    trials = len(vegetation) * len(settings)
+    flat = torch.zeros(trials, *GRID.shape)
+    rules = Rules(
+        free_space=FreeSpace(by="mean", above=0.0), slowest=setup.slowest, goal_radius_m=GOAL_RADIUS_M
+    )
+    return pose_problem(
+        Task(robot=ROVER, objective=choose_objective(setup), rules=rules),
+        Observation(flat[:, None].expand(-1, 3, -1, -1).to(torch.uint8), flat, flat, GRID),
+        mixture.select(torch.arange(len(vegetation)).repeat_interleave(len(settings))),
+        torch.stack(risk_maps, dim=1).flatten(0, 1),
+        torch.tensor(START_M).expand(trials, 2),
+        torch.tensor(GOAL_M).expand(trials, 2),
+        STEPS * ROVER.dt_s,
+    )
+
+
+def infer_risk(setting: str, vegetation: np.ndarray, mixture: TraversabilityMixture, setup: Setup) -> Tensor:
+    """λ̂ of one risk setting, shape [D, 9, 9]."""
+    if setup.risk_map == "exact":
+        return risk.apply(registry.make("risk", setting), mixture)
+    share = tail_share(setting)
+    risk_map = np.where(vegetation, VEGETATION.histogram_cvar(share), DIRT.histogram_cvar(share))
+    return torch.from_numpy(risk_map).float()
+
+
+def tail_share(setting: str) -> float:
+    """Their α, the share of the tail: 1 for `mean`, 1 − level for `cvar:level`."""
+    name, _, level = setting.partition(":")
+    if name == "mean":
+        return 1.0
+    if name == "cvar" and level:
+        return round(1 - float(level), 9)
+    raise ConfigError(f"Expected `mean` or `cvar:LEVEL`, the risk settings that they have, got {setting!r}.")
+
+
+def choose_objective(setup: Setup) -> Objective:
+    """J of a setup."""
+    if setup.objective == "theirs":
+        return TimeAndDistance(setup.distance_power)
+    return registry.make("objective", setup.objective, robot=ROVER)

@@ -1,0 +1,61 @@
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binom
+
+from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
+from benchmarks.cai.tables import mcnemar_p, show_share, tabulate_pairs, tabulate_success
+
+
+def rows(density: float, **success: list[bool]) -> pd.DataFrame:
+    parts = [
+        pd.DataFrame(
+            {
+                "density": density,
+                "setting": setting.replace("_", ":0."),
+                "map": np.arange(len(outcomes)) // 2,
+                "realisation": np.arange(len(outcomes)) % 2,
+                "success": outcomes,
+                "time_s": np.where(outcomes, 10.0, np.nan),
+            }
+        )
+        for setting, outcomes in success.items()
+    ]
+    return pd.concat(parts)
+
+
+def test_published_pairs_agree_with_published_successes() -> None:
+    for density, (gained, lost) in PUBLISHED_PAIRS.items():
+        difference = PUBLISHED[density, "cvar:0.8"].successes - PUBLISHED[density, "mean"].successes
+        assert gained - lost == difference
+
+
+def test_published_intervals_are_those_of_the_source() -> None:
+    assert show_share(138, TRIALS) == "69.0 [62, 75]"
+    assert show_share(40, TRIALS) == "20.0 [15, 26]"
+
+
+@pytest.mark.parametrize(("gained", "lost"), [(60, 6), (3, 0), (5, 5)])
+def test_mcnemar_is_the_binomial_tail(gained: int, lost: int) -> None:
+    tail = 2 * binom.cdf(min(gained, lost), gained + lost, 0.5)
+    assert mcnemar_p(gained, lost) == pytest.approx(min(tail, 1.0))
+    assert mcnemar_p(0, 0) == 1.0
+
+
+def test_success_stands_beside_the_published() -> None:
+    table = tabulate_success(rows(0.4, mean=[True, False, True, False], cvar_7=[True, True, True, False]))
+    header, _, mean, cvar = table.splitlines()
+    assert mean.startswith("| 40 % | `mean` | 50.0 [15, 85] | 10.0 | 69.0 [62, 75] | 9.1 | ")
+    assert cvar == "| 40 % | `cvar:0.7` | 75.0 [30, 95] | 10.0 | – | – | – |"
+    assert header.count("|") == mean.count("|") == cvar.count("|")
+
+
+def test_pairs_are_those_of_one_trial() -> None:
+    mean, cautious = [True, False, False, False], [False, True, True, False]
+    shuffled = rows(1.0, mean=mean, cvar_8=cautious).sample(frac=1, random_state=0)
+    line = tabulate_pairs(shuffled).splitlines()[-1]
+    assert line == "| 100 % | +25.0 | 2, 1 | 1.00 | +79.0 | 159, 1 | 2e-46 |"
+
+
+def test_no_arrival_has_no_time() -> None:
+    assert "| 0.0 [0, 49] | – |" in tabulate_success(rows(0.4, mean=[False] * 4))
