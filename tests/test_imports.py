@@ -24,7 +24,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval": ("eval", "models", "planning", "datagen"),
     "eval/run": ("eval.run", "eval.suite", "eval.trial", "models", "planning", "datagen"),
     "eval/stats": ("eval.stats", "eval.trial", "planning"),
-    "eval/report": ("eval.report", "eval.stats", "eval.run.folder", "eval.suite", "eval.trial", "planning"),
+    "eval/report": (
+        *("eval.report", "eval.stats", "eval.run.folder", "eval.suite", "eval.trial", "planning"),
+        "models.quality_report",  # how scenarios are named that make a ladder
+    ),
 }
 
 
