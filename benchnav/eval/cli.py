@@ -4,9 +4,13 @@ import os
 import shlex
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from benchnav.command import Command, run
 from benchnav.eval.suite import Suite
+
+if TYPE_CHECKING:
+    from benchnav.eval.report.write import Report
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -30,6 +34,7 @@ def run_command(
     """
     from benchnav.command import show_progress
     from benchnav.errors import ConfigError
+    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
     from benchnav.eval.runner import run_suite
 
@@ -41,8 +46,7 @@ def run_command(
     for planner, options in suite.planner_options.items():
         _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     show_progress(run_suite(suite, folder, jobs, overwrite, planner_limit_s, _say), "units")
-    write_report(folder)
-    _print(folder)
+    _print(write_report(folder, ground_of_run(folder)), folder)
     _print_replay(folder)
     return _failed(folder)
 
@@ -59,15 +63,15 @@ def list_command(kinds: list[str]) -> None:
 
 
 def report(folder: str) -> None:
-    """Write tables and figures of a finished run again, and print the table.
+    """Write tables, figures and the page of a finished run again, and print what it says.
 
     Args:
         folder: Run folder.
     """
+    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
 
-    write_report(Path(folder))
-    _print(Path(folder))
+    _print(write_report(Path(folder), ground_of_run(Path(folder))), Path(folder))
 
 
 def compare(
@@ -172,11 +176,11 @@ def _say(line: str) -> None:
     print(f"benchnav-eval: {line}", file=sys.stderr, flush=True)
 
 
-def _print(folder: Path) -> None:
-    from benchnav.eval.report.write import print_report
+def _print(report: "Report", folder: Path) -> None:
+    from benchnav.eval.report.write import PAGE, print_report
 
-    print_report(folder)
-    print(f"report:  {folder / 'summary.md'}")
+    print_report(report)
+    print(f"report:  {folder / PAGE}")
 
 
 def _print_replay(folder: Path) -> None:
