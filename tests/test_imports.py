@@ -27,6 +27,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval/report": (
         *("eval.report", "eval.stats", "eval.run.folder", "eval.run.steps", "eval.suite", "eval.trial"),
         "planning",
+        "models.quality_report",  # how scenarios are named that make a ladder
     ),
 }
 

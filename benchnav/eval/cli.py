@@ -11,6 +11,7 @@ from benchnav.eval.replay import program, replay
 from benchnav.eval.suite import RENAMED, Suite
 
 if TYPE_CHECKING:
+    from benchnav.eval.report.write import Report
     from benchnav.eval.runner import Workers
 
 SUITES = Path(__file__).parent / "suites"
@@ -119,15 +120,15 @@ def list_command(kinds: list[str]) -> None:
 
 
 def report(folder: str) -> None:
-    """Write tables and figures of a finished run again, and print the table.
+    """Write tables, figures and the page of a finished run again, and print what it says.
 
     Args:
         folder: Run folder.
     """
+    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
 
-    write_report(Path(folder))
-    _print(Path(folder))
+    _print(write_report(Path(folder), ground_of_run(Path(folder))), Path(folder))
 
 
 def compare(
@@ -193,10 +194,10 @@ def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
 
 def _finish(folder: Path, record: str) -> int:
     """Reports on a finished run; gives the exit status."""
+    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
 
-    write_report(folder)
-    _print(folder)
+    _print(write_report(folder, ground_of_run(folder)), folder)
     _print_recorded(folder, record)
     _print_replay(folder)
     return _failed(folder)
@@ -206,11 +207,11 @@ def _say(line: str) -> None:
     print(f"benchnav-eval: {line}", file=sys.stderr, flush=True)
 
 
-def _print(folder: Path) -> None:
-    from benchnav.eval.report.write import print_report
+def _print(report: "Report", folder: Path) -> None:
+    from benchnav.eval.report.write import PAGE, print_report
 
-    print_report(folder)
-    print(f"report:  {folder / 'summary.md'}")
+    print_report(report)
+    print(f"report:  {folder / PAGE}")
 
 
 def _print_recorded(folder: Path, record: str) -> None:

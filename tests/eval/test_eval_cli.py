@@ -32,7 +32,7 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert evaluate(monkeypatch, "run", "--data", str(dataset_path), "--out", str(out), *SMALL) == 0
     printed = capsys.readouterr().out
     assert "mppi" in printed
-    assert str(out / "summary.md") in printed
+    assert str(out / "report.html") in printed
     assert f"replay {out}" in printed
     assert evaluate(monkeypatch, "report", str(out)) == 0
     assert evaluate(monkeypatch, "replay", str(out), "--view", "false") == 0

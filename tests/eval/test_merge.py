@@ -131,7 +131,7 @@ def test_shards_that_are_killed_and_extended_are_the_extended_run(suite: Suite, 
 def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
     part = parts[0]
     assert open_run(part).shard == Shard(index=1, of=OF)
-    assert {path.name for path in part.iterdir()} <= {"run.json", "units", "playback", "errors.txt"}
+    assert {path.name for path in part.iterdir()} <= {"run.json", "units", "steps", "playback", "errors.txt"}
     with pytest.raises(ConfigError, match=r"shard 1/3 of one and has no tables.*benchnav-eval merge"):
         read_table(part, "episodes.parquet")
 

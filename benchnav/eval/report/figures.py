@@ -1,8 +1,9 @@
-"""What all figures of a run share: names, the colours of λ, and how they are saved."""
+"""What all figures of a run share: names, sizes, colours, and how they are saved."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+import matplotlib
 from matplotlib.figure import Figure
 
 from benchnav.eval.trial import NOT_USED
@@ -11,6 +12,32 @@ from benchnav.files import replacing
 # As on map sheets and previews; told apart by the colour-blind too.
 TRAVERSABILITY_COLOURS = "viridis"
 
+# Told apart by the colour-blind too; without yellow, which is lost on white. Source: Okabe and Ito (2008).
+OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+# Widths of a journal's column and of a page.
+ONE_COLUMN_IN, TWO_COLUMNS_IN = 88 / 25.4, 180 / 25.4
+
+# For figures at the width of a column.
+STYLE = {
+    **{
+        "font.size": 8,
+        "axes.titlesize": 8,
+        "axes.labelsize": 8,
+        "figure.titlesize": 8,
+        "figure.labelsize": 8,
+    },
+    **{"xtick.labelsize": 7, "ytick.labelsize": 7, "legend.fontsize": 7, "legend.frameon": False},
+    **{"axes.linewidth": 0.6, "xtick.major.width": 0.6, "ytick.major.width": 0.6, "grid.linewidth": 0.5},
+    **{
+        "xtick.major.size": 2.5,
+        "ytick.major.size": 2.5,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+    },
+    **{"figure.constrained_layout.h_pad": 0.03, "figure.constrained_layout.w_pad": 0.03},
+}
+
 _NAMES = {
     "astar_dwa": "A* + DWA",
     "astar_mppi": "A* + MPPI",
@@ -18,6 +45,7 @@ _NAMES = {
     "mppi": "MPPI",
     "straight": "straight",
 }
+_DPI, _MOST_PIXELS = 200, 2000
 
 
 def display_name(planner: str) -> str:
@@ -40,12 +68,16 @@ def trial_name(labels: Mapping[str, str], several: Collection[str]) -> str:
     return ", ".join(word for word in words if word != NOT_USED)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Writes a figure, whole or not at all.
+def save(figure: Figure, path: Path, trim: bool = True) -> None:
+    """Writes a figure as PNG and, beside it, as PDF with its fonts embedded; each whole or not at all.
 
     Args:
         figure: what was drawn.
-        path: file; its suffix says the format.
+        path: of the PNG.
+        trim: cut away white borders; a figure made for a column keeps its width without.
     """
-    with replacing(path) as partial:
-        figure.savefig(partial, dpi=150, format=path.suffix[1:], bbox_inches="tight")
+    box = "tight" if trim else None
+    dpi = min(_DPI, _MOST_PIXELS / figure.get_figwidth())
+    for suffix in (".png", ".pdf"):
+        with replacing(path.with_suffix(suffix)) as partial, matplotlib.rc_context({"pdf.fonttype": 42}):
+            figure.savefig(partial, dpi=dpi, format=suffix[1:], bbox_inches=box)

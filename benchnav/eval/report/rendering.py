@@ -1,6 +1,7 @@
 """Ways of writing a table: Markdown, LaTeX, and text for a terminal."""
 
 import io
+from collections.abc import Iterable
 
 from benchnav.eval.report.tables import ResultTable
 
@@ -11,34 +12,51 @@ _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "±": r"$\pm$", "–": "--", "λ": r"$\lambda$",
-    "ω": r"$\omega$", "θ": r"$\theta$",
+    "ω": r"$\omega$", "θ": r"$\theta$", "≥": r"$\geq$", "×": r"$\times$",
+    "¶": r"\P{}",
 }  # fmt: skip
 _LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
 _LATEX_WORDS = {"λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$"}
 
 
 def to_markdown(table: ResultTable) -> str:
-    """Writes a table in Markdown, with its notes under it."""
-    lines = [_markdown_row(table.headings), "|" + "---|" * len(table.headings)]
-    lines += [_markdown_row(row) for row in table.rows]
-    return "\n".join([*lines, *(f"\n{_markdown(note)}" for note in table.notes), ""])
+    """Writes a table in Markdown, with its notes under it and what its columns hold."""
+    lines = [_markdown_row(map(markdown, table.headings)), "|" + "---|" * len(table.headings)]
+    for place, row in enumerate(table.rows):
+        cells = [
+            f"**{markdown(cell)}**" if (place, column) in table.bold else markdown(cell)
+            for column, cell in enumerate(row)
+        ]
+        lines.append(_markdown_row(cells))
+    notes = [*table.notes, *([f"Bold: {table.bold_note}"] if table.bold_note else [])]
+    lines += [f"\n{markdown(note)}" for note in notes]
+    if table.explained:
+        lines += ["", *(f"- **{markdown(heading)}**: {markdown(text)}" for heading, text in table.explained)]
+    return "\n".join([*lines, ""])
 
 
 def to_latex(table: ResultTable) -> str:
     """Writes a table for LaTeX's `booktabs`, with its notes under it."""
     numbers = len(table.headings) - table.labels - 1
     lines = [r"\begin{tabular}{" + "l" * table.labels + "c" * numbers + "l}", r"\toprule"]
-    lines += [_latex_row(table.headings), r"\midrule", *map(_latex_row, table.rows)]
+    lines += [_latex_row(map(latex, table.headings)), r"\midrule"]
+    for place, row in enumerate(table.rows):
+        cells = [
+            rf"\textbf{{{latex(cell)}}}" if (place, column) in table.bold else latex(cell)
+            for column, cell in enumerate(row)
+        ]
+        lines.append(_latex_row(cells))
     lines += [r"\bottomrule", r"\end{tabular}"]
     return "\n".join([*lines, *(rf"\par{{\footnotesize {latex(note)}}}" for note in table.notes), ""])
 
 
-def to_terminal(table: ResultTable, width: int | None = None) -> str:
+def to_terminal(table: ResultTable, width: int | None = None, styled: bool = False) -> str:
     """Draws a table with lines for a terminal, with its notes under it.
 
     Args:
         table: what to draw.
         width: columns of the terminal; not limited when not given.
+        styled: set bold cells in bold; else a star stands behind them.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -48,10 +66,19 @@ def to_terminal(table: ResultTable, width: int | None = None) -> str:
     drawn = Table()
     for heading in table.headings:
         drawn.add_column(escape(heading), overflow="fold")
-    for row in table.rows:
-        drawn.add_row(*map(escape, row))
-    console = Console(file=io.StringIO(), width=width or _WIDTH, color_system=None)
-    console.print(drawn, *map(escape, table.notes), sep="\n", highlight=False)
+    mark = ("[bold]", "[/bold]") if styled else ("", "*")
+    for place, row in enumerate(table.rows):
+        cells = [
+            f"{mark[0]}{escape(cell)}{mark[1]}" if (place, column) in table.bold else escape(cell)
+            for column, cell in enumerate(row)
+        ]
+        drawn.add_row(*cells)
+    bold = [f"{'Bold' if styled else '*'}: {table.bold_note}"] if table.bold_note else []
+    console = Console(
+        file=io.StringIO(), width=width or _WIDTH, force_terminal=styled,
+        color_system="standard" if styled else None,
+    )  # fmt: skip
+    console.print(drawn, *map(escape, (*table.notes, *bold)), sep="\n", highlight=False)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -64,15 +91,16 @@ def latex(text: str) -> str:
     return "".join(_LATEX.get(character, character) for character in text)
 
 
-def _latex_row(cells: tuple[str, ...]) -> str:
-    return " & ".join(map(latex, cells)) + r" \\"
-
-
-def _markdown_row(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(map(_markdown, cells)) + " |"
-
-
-def _markdown(text: str) -> str:
+def markdown(text: str) -> str:
+    """Escapes text for Markdown."""
     for character in "\\|*<`":
         text = text.replace(character, "\\" + character)
     return text
+
+
+def _latex_row(cells: Iterable[str]) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _markdown_row(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

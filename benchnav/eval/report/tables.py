@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.eval.stats.best import BLOCK, TOLD, competing
 from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 from benchnav.planning.world.outcome import FAILURES
@@ -14,6 +15,30 @@ from benchnav.planning.world.outcome import FAILURES
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
 _ALWAYS = ("scenario", "planner", "risk")
+# What columns hold, by heading; only those that are shown are explained.
+_COLUMNS = {
+    "data": "the dataset.",
+    "scenario": "the kind of ground; a scenario is a test split of the dataset.",
+    "world": "what λ does during an episode, and the rules of the task.",
+    "robot": "how the robot moves.",
+    "objective": "what planners are asked to minimise.",
+    "model": "what predicts λ; ideal, oracle and clairvoyant are told the truth and serve as yardsticks.",
+    "planner": "what chooses the actions.",
+    "risk": "how the predicted distribution of λ becomes the one number λ̂ that the planner is given.",
+    "maps": "number of maps that the trial was run on.",
+    "episodes": "number of episodes of the trial.",
+    "Succ. [%]": "share of episodes that reached the goal.",
+    "95 % interval": "of the success rate: Wilson's, with maps as the unit, so that episodes on one map count as fewer "
+    "the more alike they end.",
+    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval, by bootstrap over "
+    "maps.",
+    "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
+    "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
+    "planning [ms]": "wall time of planning for one step of one robot: median over episodes, in brackets the 95th "
+    "percentile. It is measured over a batch of at most 50 episodes on one thread and holds the planner's preparation; "
+    "¶ marks planners that were compiled.",
+    "failures": "how the other episodes ended.",
+}
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -26,22 +51,28 @@ class ResultTable:
         labels: number of columns that are labels.
         rows: a row a trial.
         notes: what the raised numbers behind the planners' labels refer to, beginning with the number.
+        bold: cells (row, column) that are set in bold.
+        bold_note: what bold means.
+        explained: what columns hold, (heading, sentence).
     """
 
     headings: tuple[str, ...]
     labels: int
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...]
+    bold: frozenset[tuple[int, int]] = frozenset()
+    bold_note: str = ""
+    explained: tuple[tuple[str, str], ...] = ()
 
 
 def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> ResultTable:
-    """Formats a summary: rates and λ̄ in per cent, mean ± standard deviation over episodes.
+    """Formats a summary: rates and λ̄ in per cent; bold what the paired test does not tell from the best.
 
     Columns of labels that are the same for all trials are left out, but for scenario, planner and risk; so
     are the numbers of maps and episodes.
 
     Args:
-        summary: from `summary.summarise`.
+        summary: from `summary.summarise`, joined with `best.against_best` and `planning.planning_times`.
         trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
@@ -55,13 +86,46 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         "T_total [s]",
         "T if success [s]",
         "λ̄ [%]",
+        *(["planning [ms]"] if summary["planning_ms_median"].notna().any() else []),
         "failures",
     )
     rows = []
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
         labels = [str(row[name]) + (mark if name == "planner" else "") for name in shown]
-        rows.append((*labels, *(str(row[name]) for name in counts), *_results(row)))
-    return ResultTable(headings=headings, labels=len(shown), rows=tuple(rows), notes=tuple(notes))
+        results = _results(row)
+        if "planning [ms]" not in headings:
+            results = (*results[:-2], results[-1])
+        rows.append((*labels, *(str(row[name]) for name in counts), *results))
+    rate = headings.index("Succ. [%]")
+    alike = [place for place, value in enumerate(summary["best_alike"]) if value]
+    return ResultTable(
+        headings=headings,
+        labels=len(shown),
+        rows=tuple(rows),
+        notes=tuple(notes),
+        bold=frozenset((place, rate) for place in alike) if len(summary) > 1 else frozenset(),
+        bold_note=bold_note(summary) if len(summary) > 1 else "",
+        explained=tuple((heading, _COLUMNS[heading]) for heading in headings),
+    )
+
+
+def bold_note(summary: pd.DataFrame) -> str:
+    """Says what bold means in a table of a run.
+
+    Args:
+        summary: as in `result_table`.
+    """
+    words = ["the highest success rate of its block, and all that the paired test does not tell from it"]
+    words.append("(sign-flip test by map, Holm's correction over the block, p ≥ 0.05)")
+    left_out = {
+        model
+        for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)
+        for model in rows.loc[~competing(rows), "model"]
+    }
+    out = [model for model in TOLD if model in left_out]
+    if out:
+        words.append(f"; what is told the truth ({', '.join(out)}) does not compete")
+    return " ".join(words).replace(" ;", ";") + "."
 
 
 def failures_in_words(row: Mapping[Any, Any]) -> str:
@@ -83,11 +147,23 @@ def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
     return (
         f"{100 * row['success_rate']:.0f}",
         f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}",
-        _spread(row["total_time_mean_s"], row["total_time_std_s"]),
+        _with_interval(row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]),
         _spread(row["success_time_mean_s"], row["success_time_std_s"]),
         met,
+        _planning(row),
         failures_in_words(row),
     )
+
+
+def _planning(row: Mapping[Any, Any]) -> str:
+    if np.isnan(row["planning_ms_median"]):
+        return NOT_USED
+    compiled = "¶" if row["compiled_share"] > 0 else ""
+    return f"{row['planning_ms_median']:.2g} ({row['planning_ms_p95']:.2g}){compiled}"
+
+
+def _with_interval(mean: float, low: float, high: float) -> str:
+    return f"{mean:.1f}" if np.isnan(low) else f"{mean:.1f} ({low:.1f}–{high:.1f})"
 
 
 def _spread(mean: float, std: float) -> str:

@@ -1,31 +1,55 @@
-"""The report of a run: its table, where its rows come from, and its figures."""
+"""The report of a run: what it says, its table, where its rows come from, and its figures."""
 
 import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pandas as pd
+from matplotlib.figure import Figure
 
+from benchnav.eval.report.charts.curves import curve_figure, sweep_name
+from benchnav.eval.report.charts.distributions import distribution_figure
+from benchnav.eval.report.charts.failure_sheet import failure_sheet
+from benchnav.eval.report.charts.outcomes import outcome_figure
+from benchnav.eval.report.charts.success import success_figure
+from benchnav.eval.report.charts.sweeps import find_sweeps
 from benchnav.eval.report.driven import write_driven
-from benchnav.eval.report.figures import save
+from benchnav.eval.report.failures import failures_table
+from benchnav.eval.report.figures import STYLE, save
+from benchnav.eval.report.findings import Finding, findings
+from benchnav.eval.report.page import Drawn, write_page
+from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recording import read_snapshots
-from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
-from benchnav.eval.report.success import success_figure
+from benchnav.eval.report.rendering import markdown, to_markdown, to_terminal
+from benchnav.eval.report.sheets import GroundOf, Sheets, collect_sheets
 from benchnav.eval.report.tables import NOT_USED, ResultTable, result_table
 from benchnav.eval.report.trajectories import choose, trajectory_figure
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.run.folder import ERRORS, open_run, read_table
+from benchnav.eval.stats.best import against_best
+from benchnav.eval.stats.planning import planning_times
 from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
 
-_LEGEND = (
-    "T_total counts a failure as T. Mean ± standard deviation over episodes; λ̄ is the mean λ met. The interval "
-    "is Wilson's, with maps as the unit: episodes on one map count as fewer the more alike they end."
+PAGE = "report.html"
+
+_SUCCESS = (
+    "Success rates with their 95 % intervals; filled: not told from the best of its panel by the paired test; grey: "
+    "planners that look at nothing predicted."
 )
-_SUCCESS = "Success rates with their 95 % intervals; grey: planners that look at nothing predicted."
+_OUTCOMES = "How episodes ended."
+_DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean λ met."
+_SWEEP = "Success and T_total over {}, with their 95 % intervals."
+_FAILURES = (
+    "Failures of the highest success rate and of the lowest, {}: what the planner was told (colour), the path driven, "
+    "and where it ended. Of each outcome one is shown before any other twice; met λ: mean of the last 2 s."
+)
 _TRAJECTORIES = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
 _TO_THE_END = "Below, the whole driven path on λ as it was."
 
@@ -36,24 +60,33 @@ class Report:
 
     Args:
         header: lines on where the rows come from.
+        findings: what the run says.
         table: a row a trial.
-        warnings: lines on what went wrong.
+        warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
-        commands: that made the run.
+        episodes: the rows behind the summary.
+        failures: a row a failed episode.
+        sheets: failures on their ground.
+        about: all of `run.json`, with what that of format version 2 has.
     """
 
     header: tuple[str, ...]
+    findings: tuple[Finding, ...]
     table: ResultTable
     warnings: tuple[str, ...]
     summary: pd.DataFrame
-    commands: tuple[str, ...]
+    episodes: pd.DataFrame
+    failures: pd.DataFrame
+    sheets: Sheets
+    about: Mapping[str, Any]
 
 
-def read_report(folder: Path) -> Report:
+def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     """Makes the report of a finished run, of either format version, and writes nothing.
 
     Args:
         folder: a finished run.
+        ground_of: gives the ground of failures; without it they are not shown on maps.
 
     Raises:
         ConfigError: the folder is no run folder, or its run is not finished.
@@ -64,51 +97,103 @@ def read_report(folder: Path) -> Report:
         episodes = convert_rows(episodes, about)
         about = {**about, **convert_about(about, episodes)}
     summary = summarise(episodes)
+    for more in (planning_times(episodes), against_best(episodes, summary)):
+        summary = summary.merge(more, on="trial", how="left", validate="1:1")
+    failures = failures_table(folder, episodes)
+    sheets = collect_sheets(folder, summary, failures, ground_of)
+    left_out = [sheets.left_out] if sheets.left_out else []
     return Report(
         header=(*_header(summary, about), *_redrawn(episodes, about["trials"])),
+        findings=tuple(findings(summary, failures, sheets.told)),
         table=result_table(summary, about["trials"]),
-        warnings=tuple(_warnings(summary, folder)),
+        warnings=(*_warnings(summary, folder), *left_out),
         summary=summary,
-        commands=tuple(about["commands"]),
+        episodes=episodes,
+        failures=failures,
+        sheets=sheets,
+        about=about,
     )
 
 
-def write_report(folder: Path) -> pd.DataFrame:
-    """Writes `summary.{csv,md,tex}` and `figures/` of a run from its tables and snapshots.
+def write_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
+    """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
     Args:
         folder: a finished run.
+        ground_of: gives the ground of failures; without it they are not shown on maps.
 
     Returns:
-        The summary, a row a trial; see `summary.summarise`.
+        What was written of.
     """
-    report = read_report(folder)
+    report = read_report(folder, ground_of)
+    name = folder.resolve().name
     write_text(folder / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
-    write_text(folder / "summary.tex", _as_latex(report))
-    figures = {"success": _SUCCESS} | _trajectories(folder, report.summary) | write_driven(folder)
-    save(success_figure(report.summary), folder / "figures" / "success.png")
+    write_text(folder / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
+    write_text(folder / "summary.tex", _as_latex(report, name))
+    figures = [*_charts(folder, report), *_trajectories(folder, report.summary), *_driven(folder)]
     write_text(folder / "summary.md", _as_markdown(report, figures))
-    return report.summary
+    page = write_page(
+        name, report.header, report.warnings, report.findings, report.table, figures, report.about
+    )
+    write_text(folder / PAGE, page)
+    return report
 
 
-def print_report(folder: Path) -> None:
-    """Prints the header and the table of a finished run, as wide as the terminal, or unbroken where none is."""
-    report = read_report(folder)
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-    print("\n".join([*report.header, to_terminal(report.table, width).rstrip(), *report.warnings]))
+def print_report(report: Report) -> None:
+    """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
+    is_terminal = sys.stdout.isatty()
+    width = shutil.get_terminal_size().columns if is_terminal else None
+    table = to_terminal(report.table, width, styled=is_terminal).rstrip()
+    said = [line for finding in report.findings for line in (f"{finding.title}:", *finding.sentences)]
+    print("\n".join([*report.header, table, *said, *report.warnings]))
 
 
-def _trajectories(folder: Path, summary: pd.DataFrame) -> dict[str, str]:
-    """Draws the trajectories of recorded episodes; a caption by name, none where nothing was recorded."""
+def _charts(folder: Path, report: Report) -> list[Drawn]:
+    """Draws the figures at the width of a column."""
+    summary = report.summary
+    alike = set(summary.loc[summary["best_alike"], "trial"])
+    made: list[tuple[str, str, Callable[[], Figure]]] = [
+        ("success", _SUCCESS, partial(success_figure, summary, alike))
+    ]
+    sweeps = find_sweeps(report.about["trials"])
+    names = Counter(sweep_name(sweep.number) for sweep in sweeps)
+    for sweep in sweeps:
+        short = sweep_name(sweep.number)
+        name = short if names[short] == 1 else sweep.number.replace(".", "-")
+        made.append((f"over-{name}", _SWEEP.format(name), partial(curve_figure, sweep, summary)))
+    made.append(("outcomes", _OUTCOMES, partial(outcome_figure, summary)))
+    made.append(("distributions", _DISTRIBUTIONS, partial(distribution_figure, summary, report.episodes)))
+    for place, (title, lines) in enumerate(report.sheets.shown):
+        name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place + 1}"
+        made.append((name, _FAILURES.format(title), partial(failure_sheet, lines)))
+    drawn = []
+    with matplotlib.rc_context(STYLE):
+        for name, caption, make in made:
+            path = folder / "figures" / f"{name}.png"
+            save(make(), path, trim=False)
+            drawn.append(Drawn(path=path, caption=caption))
+    return drawn
+
+
+def _trajectories(folder: Path, summary: pd.DataFrame) -> list[Drawn]:
+    """Draws the trajectories of recorded episodes; none where nothing was recorded."""
     recorded = read_snapshots(folder)
     chosen = choose(recorded, list(summary["trial"]))
     if not chosen:
-        return {}
-    save(trajectory_figure(chosen), folder / "figures" / "trajectories.png")
+        return []
+    path = folder / "figures" / "trajectories.png"
+    save(trajectory_figure(chosen), path)
     words = [_TRAJECTORIES, f"{len(chosen)} of {len(recorded)} recorded episodes."]
     if any(snapshot.field is not None for snapshot in chosen):
         words.insert(1, _TO_THE_END)
-    return {"trajectories": " ".join(words)}
+    return [Drawn(path=path, caption=" ".join(words))]
+
+
+def _driven(folder: Path) -> list[Drawn]:
+    return [
+        Drawn(path=folder / "figures" / f"{name}.png", caption=caption)
+        for name, caption in write_driven(folder).items()
+    ]
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
@@ -168,13 +253,24 @@ def _list(values: Iterable[Any]) -> str:
     return ", ".join(dict.fromkeys(str(value) for value in values if value != NOT_USED)) or NOT_USED
 
 
-def _as_markdown(report: Report, figures: Mapping[str, str]) -> str:
-    lines = ["# Run summary", "", *(f"- {line}" for line in (*report.header, *report.warnings)), "", _LEGEND]
-    lines += ["", to_markdown(report.table)]
-    for name, caption in figures.items():
-        lines += [f"![{name}](figures/{name}.png)", "", caption, ""]
-    return "\n".join([*lines, "Commands:", "", *(f"    {command}" for command in report.commands), ""])
+def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
+    lines = ["# Run summary", "", "## What the run says", ""]
+    for finding in report.findings:
+        lines += [
+            f"**{markdown(finding.title)}**",
+            "",
+            *(f"- {markdown(said)}" for said in finding.sentences),
+            "",
+        ]
+    lines += ["## Results", "", *(f"- {line}" for line in (*report.header, *report.warnings)), ""]
+    lines += [to_markdown(report.table)]
+    for drawn in figures:
+        lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", drawn.caption, ""]
+    return "\n".join(
+        [*lines, "Commands:", "", *(f"    {command}" for command in report.about["commands"]), ""]
+    )
 
 
-def _as_latex(report: Report) -> str:
-    return "".join(f"% {line}\n" for line in report.header) + to_latex(report.table)
+def _as_latex(report: Report, name: str) -> str:
+    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes))
+    return comments + paper_table(report.summary, name)

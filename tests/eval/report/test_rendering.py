@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 from rich.cells import cell_len
 
@@ -9,6 +11,12 @@ TABLE = ResultTable(
     labels=1,
     rows=(("my_planner¹", "5.0 ± 1.0", "2 stuck"), ("[bold] a|b & 50%", "–", "–")),
     notes=("¹ follows λ̂ & C:\\{x}",),
+)
+BOLD = replace(
+    TABLE,
+    bold=frozenset({(1, 1)}),
+    bold_note="the best | all",
+    explained=(("failures", "how <it> ended."),),
 )
 
 
@@ -23,6 +31,7 @@ TABLE = ResultTable(
         ("λ̄ and λ̂ and λ", r"$\bar{\lambda}$ and $\hat{\lambda}$ and $\lambda$"),
         ("mppi¹,²", r"mppi\textsuperscript{1},\textsuperscript{2}"),
         ("T_total [s]", r"$T_\mathrm{total}$ {[}s]"),
+        ("p ≥ 0.05 ¶", r"p $\geq$ 0.05 \P{}"),
     ],
 )
 def test_latex_escapes(text: str, expected: str) -> None:
@@ -64,3 +73,18 @@ def test_terminal_shows_brackets_and_notes_and_breaks_only_where_it_has_to() -> 
     assert "…" not in narrow
     wide = ResultTable(headings=("x" * 150,), labels=1, rows=(("y",),), notes=("n" * 300,))
     assert "n" * 300 in to_terminal(wide)
+
+
+def test_bold_cells_and_what_bold_means() -> None:
+    lines = to_markdown(BOLD).splitlines()
+    assert lines[3] == r"| [bold] a\|b & 50% | **–** | – |"
+    assert lines[-3:] == [r"Bold: the best \| all", "", r"- **failures**: how \<it> ended."]
+    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex(BOLD)
+    plain = to_terminal(BOLD)
+    assert "–*" in plain
+    assert plain.count("*") == 2
+    assert "*: the best | all" in plain
+    styled = to_terminal(BOLD, styled=True)
+    assert "\x1b[1m–\x1b[0m" in styled
+    assert "Bold: the best | all" in styled
+    assert "\x1b" not in plain

@@ -3,37 +3,84 @@ import pytest
 
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.tables import failures_in_words, result_table
-from benchnav.eval.stats.summary import summarise
+from benchnav.eval.stats.best import against_best
+from benchnav.eval.stats.planning import planning_times
+from benchnav.eval.stats.summary import LABELS, summarise
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
 
 
 def table_of(episodes, **notes):  # type: ignore[no-untyped-def]
-    return result_table(summarise(episodes), made.trials(episodes, **notes))
+    summary = summarise(episodes)
+    for more in (planning_times(episodes), against_best(episodes, summary)):
+        summary = summary.merge(more, on="trial")
+    return result_table(summary, made.trials(episodes, **notes))
 
 
 def test_golden_table() -> None:
-    quick = [made.row(made.trial("mppi"), i, time, traversability=0.7) for i, time in enumerate((20.0, 30.0))]
+    quick = [
+        made.row(made.trial("mppi"), i, time, traversability=0.7, planning_ms=2.0 * i)
+        for i, time in enumerate((20.0, 30.0))
+    ]
     slow = [
-        made.row(made.trial("cl_rrt", "mean"), 0, 40.0, traversability=0.9),
-        made.row(made.trial("cl_rrt", "mean"), 1, None, outcome="stuck", traversability=0.5),
+        made.row(made.trial("cl_rrt", "mean"), 0, 40.0, traversability=0.9, compiled=False),
+        made.row(made.trial("cl_rrt", "mean"), 1, None, outcome="stuck", traversability=0.5, compiled=False),
     ]
     blind = [
-        made.row(made.trial(**BLIND), 0, None, outcome="out_of_bounds"),
-        made.row(made.trial(**BLIND), 1, None, outcome="planner_failure", traversability=np.nan),
+        made.row(made.trial(**BLIND), 0, None, outcome="out_of_bounds", planning_ms=np.nan),
+        made.row(
+            made.trial(**BLIND), 1, None, outcome="planner_failure", traversability=np.nan, planning_ms=np.nan
+        ),
     ]
     notes = {"cl_rrt": {"follows": "its own time", "remarks": ["limits 0.5 m/s²"]}}
-    assert to_markdown(table_of(made.rows(quick, slow, blind), **notes)) == (
+    table = table_of(made.rows(quick, slow, blind), **notes)
+    assert to_markdown(table).partition("\n\n- **")[0] == (
         "| scenario | planner | risk | Succ. [%] | 95 % interval | T_total [s] | T if success [s] | λ̄ [%] "
-        "| failures |\n"
-        "|---|---|---|---|---|---|---|---|---|\n"
-        "| std | mppi | cvar | 100 | 34–100 | 25.0 ± 7.1 | 25.0 ± 7.1 | 70.0 ± 0.0 | – |\n"
-        "| std | cl_rrt¹,² | mean | 50 | 9–91 | 70.0 ± 42.4 | 40.0 | 70.0 ± 28.3 | 1 stuck |\n"
-        "| std | straight | – | 0 | 0–66 | 100.0 ± 0.0 | – | 80.0 (n = 1) | 1 out of bounds, 1 planner failure |\n"
+        "| planning [ms] | failures |\n"
+        "|---|---|---|---|---|---|---|---|---|---|\n"
+        "| std | mppi | cvar | **100** | 34–100 | 25.0 (20.0–30.0) | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (1.9)¶ | – |\n"
+        "| std | cl_rrt¹,² | mean | **50** | 9–91 | 70.0 (40.0–100.0) | 40.0 | 70.0 ± 28.3 | 1 (1) | 1 stuck |\n"
+        "| std | straight | – | **0** | 0–66 | 100.0 (100.0–100.0) | – | 80.0 (n = 1) | – | 1 out of bounds, "
+        "1 planner failure |\n"
         "\n¹ objective: its own time\n"
         "\n² limits 0.5 m/s²\n"
+        "\nBold: the highest success rate of its block, and all that the paired test does not tell from it (sign-flip "
+        "test by map, Holm's correction over the block, p ≥ 0.05)."
     )
+
+
+def test_only_columns_that_are_shown_are_explained_each_in_one_sentence() -> None:
+    table = table_of(made.rows(made.row(made.trial())))
+    assert tuple(heading for heading, _ in table.explained) == table.headings
+    assert all(text.endswith(".") for _, text in table.explained)
+    without = table_of(made.rows(made.row(made.trial(), planning_ms=np.nan)))
+    assert "planning [ms]" not in without.headings
+    assert {len(row) for row in without.rows} == {len(without.headings)}
+    assert without.rows[0][-1] == "–"
+    others = [(name, value, n) for name in LABELS for n, value in enumerate("abc", 1)]
+    every = made.rows(
+        *([made.row(made.trial(**{name: value}), i) for i in range(n)] for name, value, n in others),
+        (made.row(made.trial(), 0, seed=seed) for seed in (0, 1)),
+    )
+    assert {*LABELS, "maps", "episodes"} <= {heading for heading, _ in table_of(every).explained}
+
+
+def test_what_is_not_told_from_the_best_is_bold_at_its_success_alone() -> None:
+    rates = {"mean": 10, "var": 28, "cvar": 30}
+    rows = made.rows(
+        *(
+            [made.row(made.trial(risk=r), i, 20.0 if i < n else None) for i in range(30)]
+            for r, n in rates.items()
+        ),
+        (made.row(made.trial(model="oracle"), i) for i in range(30)),
+    )
+    table = table_of(rows)
+    rate = table.headings.index("Succ. [%]")
+    assert table.bold == {(1, rate), (2, rate)}
+    assert table.bold_note.endswith("p ≥ 0.05); what is told the truth (oracle) does not compete.")
+    alone = table_of(made.rows(made.row(made.trial())))
+    assert (alone.bold, alone.bold_note) == (frozenset(), "")
 
 
 def test_labels_that_differ_are_shown_and_others_are_not() -> None:

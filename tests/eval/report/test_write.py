@@ -50,8 +50,10 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
 
 def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", episodes())
-    summary = write_report(folder)
-    pd.testing.assert_frame_equal(summary, summarise(episodes()))
+    summary = write_report(folder).summary
+    known = summarise(episodes())
+    pd.testing.assert_frame_equal(summary[list(known.columns)], known)
+    assert {"planning_ms_p95", "best_difference", "best_p_holm", "best_alike"} <= set(summary.columns)
     again = pd.read_csv(folder / "summary.csv")
     assert list(again.columns) == list(summary.columns)
     np.testing.assert_allclose(again["success_low"], summary["success_low"], rtol=1e-5)
@@ -64,11 +66,29 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "    benchnav-eval run --seeds '[0,7]'",
     ):
         assert line in text.splitlines()
-    assert "| std | cl_rrt¹ | cvar | 100 |" in text
+    assert "| std | cl_rrt¹ | cvar | **100** |" in text
+    assert "The highest success rate is that of " in text.partition("## Results")[0]
     assert "figures/success.png" in text
     assert "trajectories" not in text
     assert r"\begin{tabular}" in (folder / "summary.tex").read_text()
-    assert [path.name for path in (folder / "figures").iterdir()] == ["success.png"]
+    names = ("success", "outcomes", "distributions")
+    assert {path.name for path in (folder / "figures").iterdir()} == {
+        f"{n}.{s}" for n in names for s in ("png", "pdf")
+    }
+    for name in names:
+        assert f"![{name}](figures/{name}.png)" in text
+        fonts = (folder / "figures" / f"{name}.pdf").read_bytes()
+        assert b"/Type3" not in fonts
+        assert b"/FontFile2" in fonts or b"/Type /ObjStm" in fonts
+    assert len(pd.read_csv(folder / "failures.csv")) == 4
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == len(names)
+    for part in (
+        "The highest success rate is that of ",
+        "benchnav-eval run --seeds &#39;[0,7]&#39;",
+        "sign-flip",
+    ):
+        assert part in page
     assert not list(folder.rglob("*partial*"))
 
 
@@ -121,7 +141,7 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
 def test_tracebacks_are_pointed_at(outcome: str, tmp_path: Path) -> None:
     rows = made.rows(made.row(made.trial(), 0), made.row(made.trial(), 1, None, outcome=outcome))
     folder = run_folder(tmp_path / "run", rows)
-    (warning,) = read_report(folder).warnings
+    warning = read_report(folder).warnings[0]
     assert warning.startswith("In 1 episode a planner or model failed")
     assert str(folder / "errors.txt") in warning
     write_report(folder)
@@ -129,15 +149,19 @@ def test_tracebacks_are_pointed_at(outcome: str, tmp_path: Path) -> None:
 
 
 def test_without_faults_there_is_nothing_to_point_at(tmp_path: Path) -> None:
-    assert read_report(run_folder(tmp_path / "run", episodes())).warnings == ()
+    rows = episodes()
+    folder = run_folder(tmp_path / "run", rows[rows["success"]])
+    assert read_report(folder).warnings == ()
 
 
 def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    print_report(run_folder(tmp_path / "run", episodes()))
+    print_report(read_report(run_folder(tmp_path / "run", episodes())))
     printed = capsys.readouterr().out
     assert printed.startswith("World paper: λ resampled, T = 100 s")
     assert "T if success [s]" in printed
     assert "¹ objective: its own time" in printed
+    assert "\nstd:\nThe highest success rate is that of " in printed
+    assert "\x1b" not in printed
 
 
 def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:
@@ -152,7 +176,7 @@ def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:
 def test_a_run_of_0_1_is_reported(tmp_path: Path) -> None:
     folder = tmp_path / "run-1"
     shutil.copytree(VERSION_1, folder)
-    (row,) = write_report(folder).to_dict("records")
+    (row,) = write_report(folder).summary.to_dict("records")
     assert (row["data"], row["model"], row["planner"], row["risk"]) == ("paper-v1", "oracle", "mppi", "mean")
     assert (row["robot"], row["objective"], row["world"]) == (
         "unicycle", "goal_distance", "paper time_budget_s=30"
@@ -168,7 +192,7 @@ def test_a_run_of_0_1_is_reported(tmp_path: Path) -> None:
     text = (folder / "summary.md").read_text()
     assert "- World paper time_budget_s=30: λ resampled, T = 30 s." in text
     assert "mppi samples = 64" in text
-    assert "| std | mppi¹ | mean | 50 | 9–91 | 29.8 ± 0.4 | 29.5 | 82.8 ± 6.6 | 1 timeout |" in text
+    assert "| std | mppi¹ | mean | 50 | 9–91 | 29.8 (29.5–30.0) | 29.5 | 82.8 ± 6.6 | 1 timeout |" in text
     assert "benchnav-eval run --model oracle" in text
     assert (folder / "figures" / "success.png").stat().st_size > 1000
 
@@ -190,3 +214,18 @@ def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_faile
     assert line.startswith("Of the draws of λ 50.0 %")
     assert write._redrawn(rows[rows["trial"] == "c"], trials) == []
     assert write._redrawn(rows.drop(columns="redrawn"), trials) == []
+
+
+def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
+    rows = made.rows(
+        made.row(made.trial(risk=f"cvar:{level}"), i) for level in (0.5, 0.8, 0.9) for i in range(2)
+    )
+    folder = run_folder(tmp_path / "run", rows)
+    about = json.loads((folder / "run.json").read_text())
+    for trial in about["trials"].values():
+        part, _, level = trial["labels"]["risk"].partition(":")
+        trial["value"]["risk"] = {"part": part, "options": {"level": float(level)}}
+    (folder / "run.json").write_text(json.dumps(about))
+    write_report(folder)
+    assert (folder / "figures" / "over-level.pdf").stat().st_size > 1000
+    assert "![over-level](figures/over-level.png)" in (folder / "summary.md").read_text()

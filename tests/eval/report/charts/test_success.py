@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.success import success_figure
+from benchnav.eval.report.charts.success import success_figure
 from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
@@ -109,3 +109,17 @@ def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_bl
 def points_by_height(panel: Axes) -> list[float]:
     marked = [line for line in panel.lines if line.get_marker() == "o"]
     return [float(line.get_xdata()[0]) for line in sorted(marked, key=lambda line: line.get_ydata()[0])]
+
+
+def test_points_are_filled_where_the_test_does_not_tell_them_from_the_best() -> None:
+    summary = summarise(made.rows(shares(made.trial(risk="a"), 9), shares(made.trial(risk="b"), 2)))
+    (panel,) = panels(success_figure(summary, {summary["trial"][0]}))
+    marked = [line for line in panel.lines if line.get_marker() == "o"]
+    assert [to_rgb(line.get_markerfacecolor()) == (1, 1, 1) for line in marked] == [False, True]
+
+
+def test_figures_have_the_width_of_a_column_or_a_page() -> None:
+    one = summarise(made.rows(shares(made.trial(), 5)))
+    assert success_figure(one).get_figwidth() * 25.4 == pytest.approx(88)
+    two = summarise(made.rows(*(shares(made.trial(scenario=name), 5) for name in ("std", "hg"))))
+    assert success_figure(two).get_figwidth() * 25.4 == pytest.approx(180)

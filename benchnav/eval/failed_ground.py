@@ -1,0 +1,100 @@
+"""The ground on which episodes of a finished run failed: what the planner was told of it, and what it was."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.report.charts.failure_sheet import Ground
+from benchnav.eval.report.sheets import GroundOf
+from benchnav.eval.run import provenance
+from benchnav.eval.run.episode import build, one_thread
+from benchnav.eval.run.folder import Run, open_run
+from benchnav.eval.run.unit import Unit
+from benchnav.eval.trial import Trial
+from benchnav.sources import digest_of
+
+
+def ground_of_run(folder: Path) -> GroundOf:
+    """Gives a function that reads and predicts the ground of some failures of one trial again.
+
+    Args:
+        folder: a finished run.
+
+    Returns:
+        From rows of `failures.failures_table`, of one trial, the ground of each. It raises a `BenchnavError`
+        that says why where the ground cannot be had.
+    """
+    run = open_run(folder)
+
+    def ground_of(failures: pd.DataFrame) -> Ground:
+        parts = [
+            (rows.index.to_numpy(), _ground(run, rows))
+            for _, rows in failures.reset_index(drop=True).groupby(["seed", "realisation"], sort=False)
+        ]
+        back = np.argsort(np.concatenate([index for index, _ in parts]))
+        grounds = [ground for _, ground in parts]
+        return Ground(
+            predicted=np.concatenate([one.predicted for one in grounds])[back],
+            holding=np.concatenate([one.holding for one in grounds])[back],
+            resolution_m=grounds[0].resolution_m,
+            goal_m=np.concatenate([one.goal_m for one in grounds])[back],
+        )
+
+    return ground_of
+
+
+def _ground(run: Run, rows: pd.DataFrame) -> Ground:
+    """The ground under one seed and realisation."""
+    trial_id = rows["trial"].iloc[0]
+    if trial_id not in run.trials:
+        raise ConfigError(
+            f"Expected a run of this version, got {run.folder} of format version {run.version}."
+        )
+    trial, extent = run.trials[trial_id]
+    instances = tuple(int(i) for i in rows["instance"])
+    _check_maps(run, trial, instances)
+    for part, about in provenance.describe_parts({trial_id: (trial, extent)}).items():
+        if _identity(run.about["parts"].get(part)) != _identity(about):
+            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
+    unit = Unit(
+        trial=trial,
+        seed=int(rows["seed"].iloc[0]),
+        realisation=int(rows["realisation"].iloc[0]),
+        instances=instances,
+    )
+    with one_thread():
+        problem, simulation = build(unit, run.about["run_id"])
+    holding = np.zeros(problem.risk_map.shape, dtype=bool)
+    if simulation.field is not None and trial.world.immobile is not None:
+        holding = (simulation.field < trial.world.immobile.below).cpu().numpy()
+    return Ground(
+        predicted=problem.risk_map.cpu().numpy(),
+        holding=holding,
+        resolution_m=problem.grid.resolution_m,
+        goal_m=problem.goal_m.cpu().numpy(),
+    )
+
+
+def _check_maps(run: Run, trial: Trial, instances: Sequence[int]) -> None:
+    """Refuses other maps than those that the run was on."""
+    dataset = TerrainDataset(find_dataset(trial.data))
+    count = dataset.map_count(trial.split)
+    if count <= max(instances):
+        raise BenchnavError(
+            f"Expected {trial.data} with the {max(instances) + 1} maps of {trial.split} or more that the run was on, "
+            f"got {count}. Make them with `benchnav-datagen create`."
+        )
+    digests = run.about["datasets"][trial.data]["maps"][trial.split]
+    now = [digest_of([entry.tobytes()])[:16] for entry in dataset.entry_digests(trial.split, instances)]
+    if now != [digests[i] for i in instances]:
+        raise BenchnavError(f"Expected {trial.data} with the maps that {run.folder} was on, got others.")
+
+
+def _identity(about: Any) -> Any:
+    """What is known of a part, without the version of ours that it came with."""
+    return {k: v for k, v in about.items() if k != "origin"} if isinstance(about, dict) else about

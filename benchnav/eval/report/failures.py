@@ -1,0 +1,69 @@
+"""The table of failures: how, when and where each failed episode ended, and what ground it met there."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.dataset as ds
+
+_KEYS = ["trial", "seed", "realisation", "instance"]
+_LAST_S = 2.0
+
+
+def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
+    """Tabulates the failed episodes of a run.
+
+    Args:
+        folder: the run folder, of which the steps are read.
+        episodes: its rows.
+
+    Returns:
+        A row a failure: `trial`, `planner`, `risk`, `model`, `scenario`, `world`, `seed`, `realisation`,
+        `instance`, `outcome`, `end_time_s`; `x_m`, `y_m`, where it ended; `end_traversability`, the λ met in the
+        last step; and `last_traversability`, the mean of λ met in the last 2 s. The last four are NaN where
+        steps were not kept.
+    """
+    labels = ["planner", "risk", "model", "scenario", "world"]
+    columns = ["trial", *labels, *_KEYS[1:], "outcome", "end_time_s"]
+    failed = episodes.loc[~episodes["success"].astype(bool), columns]
+    ends = _ends(read_steps(folder, list(failed["trial"].unique())))
+    return failed.merge(ends, on=_KEYS, how="left").reset_index(drop=True)
+
+
+def read_steps(folder: Path, trials: list[str]) -> pd.DataFrame:
+    """Reads the steps of some trials, of one table or of one part a trial; no rows where none were kept.
+
+    Args:
+        folder: the run folder.
+        trials: ids.
+
+    Returns:
+        `trial`, `seed`, `realisation`, `instance`, `time_s`, `x_m`, `y_m`, `traversability`, by time.
+    """
+    columns = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
+    whole, parts = folder / "steps.parquet", folder / "steps"
+    if whole.exists():
+        source = ds.dataset(whole)
+    elif any(parts.glob("*/*.parquet")):
+        source = ds.dataset(parts, partitioning="hive")
+    else:
+        return pd.DataFrame({name: pd.Series(dtype=object if name == "trial" else float) for name in columns})
+    if not trials:
+        return source.head(0, columns=columns).to_pandas()
+    return source.to_table(columns=columns, filter=ds.field("trial").isin(trials)).to_pandas()
+
+
+def _ends(steps: pd.DataFrame) -> pd.DataFrame:
+    """The last place of each episode, and λ at its end; the last state of an episode has no λ of its own."""
+    groups = steps.groupby(_KEYS, sort=False)
+    last = groups[["x_m", "y_m"]].last()
+    met = steps[steps["traversability"].notna()]
+    end = met.groupby(_KEYS, sort=False)["traversability"].last().rename("end_traversability")
+    from_s = groups["time_s"].transform("max") - _LAST_S
+    late = met[met["time_s"] >= from_s.loc[met.index] - 1e-9]
+    mean = late.groupby(_KEYS, sort=False)["traversability"].mean().rename("last_traversability")
+    return (
+        last.join([end, mean])
+        .reset_index()
+        .astype({"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64})
+    )

@@ -1,0 +1,155 @@
+"""What a run says, in sentences made from its numbers; whether one setting beats another is for the tests to say."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.eval.report.charts.panels import blocks
+from benchnav.eval.report.figures import trial_name
+from benchnav.eval.stats.best import TOLD, competing
+from benchnav.eval.trial import NOT_USED
+from benchnav.planning.world.outcome import FAILURES
+
+_MOST_NAMED = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """What the run says of one block.
+
+    Args:
+        title: names the block.
+        sentences: in order.
+    """
+
+    title: str
+    sentences: tuple[str, ...]
+
+
+def findings(
+    summary: pd.DataFrame, failures: pd.DataFrame, told: Mapping[str, np.ndarray] | None = None
+) -> list[Finding]:
+    """Says of each block which setting is best, by how much, how sure that is, and how the failures failed.
+
+    Args:
+        summary: from `summary.summarise`, joined with `best.against_best`.
+        failures: from `failures.failures_table`.
+        told: by trial the λ̂ where its failed episodes ended, where that is known.
+    """
+    several = ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
+    rows = ({str(name): value for name, value in row.items()} for row in summary.to_dict("records"))
+    names = {row["trial"]: trial_name(row, several) for row in rows}
+    return [
+        Finding(title=title, sentences=tuple(_sentences(block, names, failures, told or {})))
+        for title, block in blocks(summary)
+    ]
+
+
+def p_in_words(p: float) -> str:
+    """Writes a p-value."""
+    return "p < 0.0001" if p < 1e-4 else f"p = {p:.2g}"
+
+
+def _sentences(
+    rows: pd.DataFrame, names: Mapping[str, str], failures: pd.DataFrame, told: Mapping[str, np.ndarray]
+) -> Iterable[str]:
+    rivals = rows[competing(rows)]
+    best = rivals[rivals["trial"] == rivals["best"].iloc[0]].to_dict("records")[0]
+    others = rivals[rivals["trial"] != best["trial"]].sort_values(
+        "success_rate", ascending=False, kind="stable"
+    )
+    yield (
+        f"The highest success rate is that of {names[best['trial']]}: {_rate(best)} of its episodes reached the goal "
+        f"(95 % interval {100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
+    )
+    yield from _rank(best, others, names)
+    yield from _why(best, names, failures, told)
+    count = int(rivals["n_episodes"].sum())
+    failed = count - round(float((rivals["success_rate"] * rivals["n_episodes"]).sum()))
+    if failed and len(rivals) > 1:
+        outcomes = rivals[[f"{outcome.name.lower()}_count" for outcome in FAILURES]].sum()
+        yield (
+            f"All {len(rivals)} compared settings together failed in {failed} of {count} episodes: {_shares(outcomes)}."
+        )
+    yardsticks = rows[~rows["trial"].isin(rivals["trial"])]
+    for model in [model for model in reversed(TOLD) if (yardsticks["model"] == model).any()]:
+        most = yardsticks[yardsticks["model"] == model].sort_values("success_rate", kind="stable").iloc[-1]
+        yield f"With the model {model}, which is told the truth, {names[most['trial']]} reached {_rate(most)}."
+
+
+def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str]) -> Iterable[str]:
+    if others.empty:
+        yield "There is no other setting to compare it with."
+        return
+    alike, apart = others[others["best_alike"]], others[~others["best_alike"]]
+    if alike.empty:
+        other = "the other setting" if len(apart) == 1 else f"each of the {len(apart)} other settings"
+        yield f"It is told apart from {other}: it is the best of this run."
+    elif len(alike) == 1:
+        yield f"One other setting cannot be told from it (p ≥ 0.05): {names[alike['trial'].iloc[0]]}."
+    else:
+        listed = [names[trial] for trial in alike["trial"]]
+        more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
+        yield (
+            f"{len(listed)} other settings cannot be told from it (p ≥ 0.05): "
+            f"{'; '.join(listed[:_MOST_NAMED])}{more}."
+        )
+    comparisons = "1 comparison" if len(others) == 1 else f"{len(others)} comparisons"
+    if apart.empty:
+        shown = others["best_shown"].min()
+        seen = (
+            ""
+            if np.isnan(shown)
+            else f" So many maps show a difference from about {100 * shown:.0f} points on."
+        )
+        yield f"No setting is told apart from it, so the run does not say which is best.{seen}"
+        return
+    following = apart.iloc[0]
+    place = "The next" if alike.empty else "The next that is told apart"
+    yield (
+        f"{place} is {names[following['trial']]} with {_rate(following)}: the difference is "
+        f"{100 * following['best_difference']:.1f} points (95 % interval {100 * following['best_low']:.1f} to "
+        f"{100 * following['best_high']:.1f}), {p_in_words(following['best_p_holm'])} after Holm's correction over "
+        f"{comparisons}."
+    )
+
+
+def _why(
+    best: Mapping[Any, Any], names: Mapping[str, str], failures: pd.DataFrame, told: Mapping[str, np.ndarray]
+) -> Iterable[str]:
+    """How the best setting's failures failed, and on what ground."""
+    outcomes = pd.Series({f"{o.name.lower()}_count": best[f"{o.name.lower()}_count"] for o in FAILURES})
+    if not outcomes.sum():
+        yield "It never failed."
+        return
+    yield f"It failed in {int(outcomes.sum())} of {best['n_episodes']} episodes: {_shares(outcomes)}."
+    met = failures.loc[failures["trial"] == best["trial"], "last_traversability"].median()
+    known = told.get(best["trial"], np.empty(0))
+    known = known[~np.isnan(known)]  # an end outside the map has none
+    if np.isnan(met):
+        return
+    if len(known):
+        yield (
+            f"At the place where they ended, the planner had been told λ̂ = {np.median(known):.2f}, and in the last 2 s "
+            f"the robot met λ = {met:.2f} (medians)."
+        )
+    else:
+        yield f"In their last 2 s the robot met λ = {met:.2f} (median)."
+
+
+def _rate(row: Mapping[Any, Any]) -> str:
+    return f"{100 * row['success_rate']:.0f} %"
+
+
+def _shares(outcomes: pd.Series) -> str:
+    """Counts of outcomes with their shares of all failures, the most frequent first."""
+    counted = outcomes[outcomes > 0].sort_values(ascending=False, kind="stable")
+    total = counted.sum()
+    words = []
+    for name, count in counted.items():
+        share = f"{100 * count / total:.0f}" if count / total >= 0.005 else "< 1"
+        words.append(f"{count} {str(name).removesuffix('_count').replace('_', ' ')} ({share} %)")
+    return ", ".join(words)

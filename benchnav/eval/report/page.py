@@ -1,0 +1,110 @@
+"""The report as one HTML page, which needs no other file and no network."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+import benchnav
+from benchnav.eval.report.findings import Finding
+from benchnav.eval.report.tables import ResultTable
+
+# Of a figure's own pixels; fine enough for screens of twice the density.
+_SCREEN = 0.6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """A figure of a report.
+
+    Args:
+        path: of its PNG.
+        caption: what it shows.
+    """
+
+    path: Path
+    caption: str
+
+
+def write_page(
+    name: str,
+    header: Sequence[str],
+    warnings: Sequence[str],
+    findings: Sequence[Finding],
+    table: ResultTable,
+    figures: Sequence[Drawn],
+    about: Mapping[str, Any],
+) -> str:
+    """Writes the page; all text is escaped.
+
+    Args:
+        name: of the run.
+        header: lines on where the rows come from.
+        warnings: lines on what went wrong.
+        findings: what the run says.
+        table: a row a trial.
+        figures: in order.
+        about: all of `run.json`.
+
+    Returns:
+        HTML.
+    """
+    environment = Environment(
+        loader=PackageLoader("benchnav.eval.report", "templates"), autoescape=True,
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    return environment.get_template("report.html").render(
+        name=name,
+        header=header,
+        warnings=warnings,
+        findings=findings,
+        table=table,
+        figures=[(one.path.stem, one.caption, _inline(one.path), _width(one.path)) for one in figures],
+        provenance=provenance_lines(about),
+        commands=about["commands"],
+        version=benchnav.__version__,
+    )
+
+
+def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Says where a run came from, (what, value), as far as `run.json` tells.
+
+    Args:
+        about: all of `run.json`, of either format version.
+    """
+    code, machine = about.get("code", {}), about.get("machine", {})
+    versions = code.get("versions", about.get("versions", {}))
+    lines = [("run", about.get("run_id", "")), ("sources of benchnav", code.get("sources", ""))]
+    lines += [(f"version of {name}", str(version)) for name, version in versions.items()]
+    lines.append(("processor", f"{machine.get('processor', '')} {code.get('processor', '')}".strip()))
+    lines += [("cores", str(machine["cores"]))] if "cores" in machine else []
+    lines += [("compiler", "yes" if code["compiles"] else "no")] if "compiles" in code else []
+    for data, known in about.get("datasets", {}).items():
+        maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
+        lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
+    for part, identity in about.get("parts", {}).items():
+        lines.append((part, _identity(identity)))
+    seeds = dict.fromkeys(seed for trial in about.get("trials", {}).values() for seed in trial["seeds"])
+    lines.append(("seeds", ", ".join(map(str, seeds))))
+    return [(name, value) for name, value in lines if value]
+
+
+def _identity(identity: Any) -> str:
+    if not isinstance(identity, Mapping):
+        return str(identity)
+    files = [f"{name} {digest}" for name, digest in identity.get("files", {}).items()]
+    return "; ".join([*files, *(str(identity[key]) for key in ("origin", "digest") if identity.get(key))])
+
+
+def _inline(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _width(path: Path) -> int:
+    """Width that a figure is shown at, in pixels of the page."""
+    with open(path, "rb") as file:
+        pixels = int.from_bytes(file.read(20)[16:], "big")  # of a PNG's header
+    return round(pixels * _SCREEN)

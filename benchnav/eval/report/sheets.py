@@ -1,0 +1,106 @@
+"""Which failures the sheets show: of each block those of the best setting and those of the worst."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from benchnav.errors import BenchnavError
+from benchnav.eval.report.charts.failure_sheet import Ground, Shown, choose
+from benchnav.eval.report.charts.panels import blocks
+from benchnav.eval.report.failures import read_steps
+from benchnav.eval.report.figures import trial_name
+from benchnav.eval.stats.best import competing
+from benchnav.eval.trial import NOT_USED
+
+GroundOf = Callable[[pd.DataFrame], Ground]
+
+_MOST_BLOCKS = 6
+# Failures of one trial whose ground is predicted again.
+_MOST_FAILURES = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheets:
+    """What is shown of failures.
+
+    Args:
+        shown: of each block its title and the lines of its sheet.
+        told: by trial λ̂ where its failed episodes ended, shape [N].
+        left_out: why there is no sheet; empty where there is one, or nothing failed.
+    """
+
+    shown: tuple[tuple[str, tuple[Shown, ...]], ...]
+    told: dict[str, np.ndarray]
+    left_out: str
+
+
+def collect_sheets(
+    folder: Path, summary: pd.DataFrame, failures: pd.DataFrame, ground_of: GroundOf | None
+) -> Sheets:
+    """Collects the sheets of a run.
+
+    Args:
+        folder: the run folder.
+        summary: from `summary.summarise`, joined with `best.against_best`.
+        failures: from `failures.failures_table`.
+        ground_of: gives the ground of some failures of one trial; it may raise a `BenchnavError`. None where no sheet
+            is asked for.
+    """
+    placed = failures[failures["x_m"].notna()]
+    if ground_of is None or placed.empty:
+        asked = ground_of is not None and not failures.empty
+        why = "No sheet of failures: the run kept no steps of them." if asked else ""
+        return Sheets(shown=(), told={}, left_out=why)
+    several = ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
+    shown, told = [], {}
+    try:
+        for title, rows in blocks(summary)[:_MOST_BLOCKS]:
+            lines = []
+            for row in _looked_at(rows):
+                own = placed[placed["trial"] == row["trial"]].head(_MOST_FAILURES).reset_index(drop=True)
+                if own.empty:
+                    continue
+                ground = ground_of(own)
+                told[row["trial"]] = ground.told(own[["x_m", "y_m"]].to_numpy())
+                count = int((failures["trial"] == row["trial"]).sum())
+                lines.append(_line(folder, trial_name(row, several), own, ground, count))
+            if lines:
+                shown.append((title, tuple(lines)))
+    except (BenchnavError, OSError) as error:
+        return Sheets(shown=(), told={}, left_out=f"No sheet of failures: {error}")
+    return Sheets(shown=tuple(shown), told=told, left_out="")
+
+
+def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
+    """The best of a block, and the worst that looks at a prediction."""
+    best = rows["best"].iloc[0]
+    seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
+    worst = seeing.sort_values("success_rate", kind="stable")["trial"].head(1)
+    for trial in dict.fromkeys([best, *worst]):
+        (row,) = rows[rows["trial"] == trial].to_dict("records")
+        yield {str(name): value for name, value in row.items()}
+
+
+def _line(folder: Path, name: str, failures: pd.DataFrame, ground: Ground, among: int) -> Shown:
+    chosen = choose(failures)
+    steps = read_steps(folder, [chosen["trial"].iloc[0]])
+    tracks = []
+    for row in chosen.to_dict("records"):
+        own = np.logical_and.reduce([steps[key] == row[key] for key in ("seed", "realisation", "instance")])
+        tracks.append(steps.loc[own, ["x_m", "y_m"]].to_numpy())
+    places = chosen.index.to_numpy()
+    return Shown(
+        name=name,
+        failures=chosen.reset_index(drop=True),
+        ground=Ground(
+            predicted=ground.predicted[places],
+            holding=ground.holding[places],
+            resolution_m=ground.resolution_m,
+            goal_m=ground.goal_m[places],
+        ),
+        tracks=tracks,
+        among=among,
+    )

@@ -1,0 +1,106 @@
+"""The best trial of each block of a run, and which others the paired test does not tell from it."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from statsmodels.stats.multitest import multipletests
+
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.difference import sign_flip_p, standard_deviation, success_interval
+from benchnav.eval.stats.power import smallest_difference
+from benchnav.eval.trial import NOT_USED
+
+# Trials of a block met the same maps and the same luck, and were asked the same.
+BLOCK = ("data", "scenario", "world", "robot", "objective")
+# Models that are told the truth, the one that knows most first.
+TOLD = ("clairvoyant", "oracle", "ideal")
+
+_LUCK = ["seed", "realisation", "instance"]
+
+
+def competing(rows: pd.DataFrame, told: Collection[str] = TOLD) -> pd.Series:
+    """Tells which trials of a block compete for the best.
+
+    What is told the truth is a yardstick and no rival, unless nothing else is there that looks at a prediction.
+
+    Args:
+        rows: of the summary, of one block.
+        told: labels of models that are told the truth.
+
+    Returns:
+        Bool, by the index of `rows`.
+    """
+    for out in (list(told), list(told)[:1]):
+        left = ~rows["model"].isin(out)
+        if (left & (rows["model"] != NOT_USED)).any():
+            return left
+    return pd.Series(True, index=rows.index)
+
+
+def against_best(episodes: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
+    """Compares the best trial of each block with all others that compete, map by map.
+
+    The best has the highest success rate and, of several, the least mean T_total. Holm's correction is over
+    the others of its block.
+
+    Args:
+        episodes: rows of episodes.
+        summary: of them, from `summary.summarise`.
+
+    Returns:
+        A row a trial, in the order of the summary: `trial`; `best`, the trial that is the best of its block;
+        `best_rivals`, how many others compete; `best_difference`, by how much the best's success rate is higher,
+        with its 95 % interval `_low`, `_high`; `best_p_holm`; `best_shown`, the smallest difference that so many
+        maps show with a chance of 80 %; and `best_alike`, true where the best is not told from it. NaN and false
+        where a trial does not compete, NaN and true for the best itself.
+    """
+    groups = dict(list(episodes.groupby("trial", sort=False)))
+    found: list[dict[str, Any]] = []
+    for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
+        rivals = rows[competing(rows)]
+        order = rivals.sort_values(
+            ["success_rate", "total_time_mean_s"], ascending=[False, True], kind="stable"
+        )
+        best, *others = order["trial"]
+        alpha = ALPHA / max(len(others), 1)
+        compared = [_compare(groups[best], groups[other], alpha) for other in others]
+        p = [one["best_p_holm"] for one in compared]
+        corrected = multipletests(p, ALPHA, method="holm")[1] if p else []
+        for other, one, value in zip(others, compared, corrected, strict=True):
+            found.append({"trial": other, **one, "best_p_holm": value, "best_alike": bool(value >= ALPHA)})
+        left_out = rows.loc[~rows["trial"].isin(order["trial"]), "trial"]
+        found += [
+            {"trial": best, "best_alike": True},
+            *({"trial": one, "best_alike": False} for one in left_out),
+        ]
+        for one in found[-len(rows) :]:
+            one |= {"best": best, "best_rivals": len(others)}
+    columns = ["trial", "best", "best_rivals", "best_difference", "best_low", "best_high"]
+    columns += ["best_p_holm", "best_shown", "best_alike"]
+    table = pd.DataFrame(found).reindex(columns=columns)
+    return summary[["trial"]].merge(table, on="trial", how="left", validate="1:1")
+
+
+def _compare(best: pd.DataFrame, other: pd.DataFrame, alpha: float) -> dict[str, float]:
+    """Success of the best less that of another; p is not corrected yet."""
+    columns = [*_LUCK, "success"]
+    both = best[columns].merge(other[columns], on=_LUCK, suffixes=("", "_other"))
+    if both.empty:
+        return {"best_p_holm": 1.0}  # no map in common: nothing tells them apart
+    draws = both.groupby("instance")["success"].transform("size")
+    both = both[draws == draws.max()]
+    gain = both["success"].astype(int) - both["success_other"].astype(int)
+    by_map, count = gain.groupby(both["instance"]).sum().to_numpy(), int(draws.max())
+    if len(by_map) < 2:
+        return {"best_difference": float(by_map.mean()) / count, "best_p_holm": sign_flip_p(by_map)}
+    difference, low, high = (float(value) for value in success_interval(by_map, count))
+    shown = smallest_difference(float(np.asarray(standard_deviation(by_map, count))), len(by_map), alpha)
+    return {
+        "best_difference": difference,
+        "best_low": low,
+        "best_high": high,
+        "best_p_holm": sign_flip_p(by_map),
+        "best_shown": shown,
+    }

@@ -1,0 +1,112 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchnav.eval.report.charts.curves import curve_figure, sweep_name
+from benchnav.eval.report.charts.sweeps import find_sweeps
+from benchnav.eval.stats.summary import summarise
+from tests.eval.report import made
+
+LEVELS = (0.5, 0.8, 0.9)
+
+
+def values(labels: dict[str, str], **changes: Any) -> dict[str, Any]:
+    """What `run.json` says of a trial with these labels."""
+    part, _, level = labels["risk"].partition(":")
+    risk = {"part": part, "options": {"level": float(level)} if level else {}}
+    world = {"name": labels["world"], **changes}
+    parts = {name: {"part": labels[name].split(" ")[0], "options": {}} for name in ("model", "planner")}
+    value = {
+        "data": labels["data"],
+        "split": f"test/{labels['scenario']}",
+        "risk": risk,
+        **parts,
+        "world": world,
+    }
+    return {"value": value}
+
+
+def drawn(*trials: tuple[dict[str, str], int], **changes: Any) -> Figure:
+    rows = made.rows(
+        *([made.row(labels, i, 20.0 if i < count else None) for i in range(10)] for labels, count in trials)
+    )
+    known = {
+        "+".join(made.row(labels)["trial"].split("+")): values(labels, **changes) for labels, _ in trials
+    }
+    (sweep,) = find_sweeps(known)
+    return curve_figure(sweep, summarise(rows))
+
+
+def shown(figure: Figure) -> list[Axes]:
+    return [panel for panel in figure.axes if panel.get_visible()]
+
+
+def curves(panel: Axes) -> list[list[float]]:
+    return [list(line.get_ydata()) for line in panel.lines if line.get_marker() not in ("None", None)]
+
+
+def test_success_and_time_stand_at_their_levels_with_their_bands() -> None:
+    figure = drawn(
+        *((made.trial(risk=f"cvar:{level}"), n) for level, n in zip(LEVELS, (2, 6, 4), strict=True))
+    )
+    above, below = shown(figure)
+    assert curves(above) == [pytest.approx([20, 60, 40])]
+    assert curves(below) == [pytest.approx([84, 52, 68])]
+    (line,) = above.lines
+    np.testing.assert_allclose(line.get_xdata(), -np.log(1 - np.array(LEVELS)))
+    assert [label.get_text() for label in below.get_xticklabels()] == ["0.5", "0.8", "0.9"]
+    band = above.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.min() < 20 < 60 < band.max()
+
+
+def test_other_settings_of_the_same_planner_are_lines_across_and_blind_ones_grey() -> None:
+    levels = [(made.trial(risk=f"cvar:{level}"), 5) for level in LEVELS]
+    figure = drawn(
+        *levels,
+        (made.trial(risk="mean"), 3),
+        (made.trial("cl_rrt", "mean"), 9),  # no line of its planner is there
+        (made.trial("straight", "–", model="–"), 1),
+    )
+    above, _ = shown(figure)
+    across = {float(np.asarray(line.get_ydata())[0]) for line in above.lines if line.get_marker() == "None"}
+    assert across == {30, 10}
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["MPPI, cvar", "mean", "straight"]
+
+
+def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:
+    places: tuple[dict[str, str], ...] = ({"scenario": "hg"}, {"world": "stakes"}, {"model": "mdn"})
+    for other in places:
+        figure = drawn(
+            *((made.trial(risk=f"cvar:{level}"), 5) for level in LEVELS),
+            *((made.trial(risk=f"cvar:{level}", **other), 7) for level in LEVELS),
+        )
+        panels = shown(figure)
+        assert len(panels) == 4
+        titles = [panel.get_title() for panel in panels if panel.get_title()]
+        assert titles[1] == next(iter(other.values()))
+        # One measure has one range, so that heights can be compared.
+        ranges = {tuple(np.round(panel.get_ylim(), 6)) for panel in panels}
+        assert len(ranges) == 2
+
+
+def test_many_lines_are_told_apart_by_panels() -> None:
+    planners = [f"planner_{i}" for i in range(9)]
+    figure = drawn(*((made.trial(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
+    assert len(shown(figure)) == 18
+    assert all(len(curves(panel)) == 1 for panel in shown(figure))
+
+
+def test_figures_have_the_width_of_a_column_or_a_page() -> None:
+    one = drawn(*((made.trial(risk=f"cvar:{level}"), 5) for level in LEVELS))
+    assert one.get_figwidth() * 25.4 == pytest.approx(88)
+    two = drawn(*((made.trial(risk=f"cvar:{level}", world=w), 5) for level in LEVELS for w in ("a", "b")))
+    assert two.get_figwidth() * 25.4 == pytest.approx(180)
+
+
+def test_a_number_goes_by_its_last_word() -> None:
+    assert sweep_name("planner.options.dwa.horizon") == "horizon"
+    assert sweep_name("severity") == "severity"

@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+from benchnav.eval.report.charts.distributions import distribution_figure
+from benchnav.eval.stats.summary import summarise
+from tests.eval.report import made
+
+
+def dots(panel: Axes) -> list[np.ndarray]:
+    return [np.sort(np.asarray(group.get_offsets())[:, 0]) for group in panel.collections]
+
+
+def medians(panel: Axes) -> list[float]:
+    return [float(np.asarray(line.get_xdata())[0]) for line in panel.lines if line.get_marker() == "|"]
+
+
+def test_every_episode_is_a_dot_under_its_quantity_and_its_trial() -> None:
+    rows = made.rows(
+        (
+            made.row(made.trial("a"), i, time, traversability=0.1 * i)
+            for i, time in enumerate((20.0, 30.0, None))
+        ),
+        (made.row(made.trial("b"), i, 50.0, traversability=0.9) for i in range(2)),
+    )
+    figure = distribution_figure(summarise(rows), rows)
+    times, met = figure.axes
+    np.testing.assert_allclose(np.concatenate(dots(times)), [20, 30, 100, 50, 50])
+    np.testing.assert_allclose(np.concatenate(dots(met)), [0, 0.1, 0.2, 0.9, 0.9], atol=1e-12)
+    assert medians(times) == [30, 50]
+    assert medians(met) == pytest.approx([0.1, 0.9])
+    quartiles = next(line for line in times.lines if line.get_marker() == "None")
+    assert list(quartiles.get_xdata()) == [25, 65]
+    # Successes and failures differ in colour.
+    colours = {tuple(colour) for colour in times.collections[0].get_facecolors()}
+    assert len(colours) == 2
+    assert figure.get_figwidth() * 25.4 == pytest.approx(180)
+
+
+def test_each_scenario_has_a_line_of_panels() -> None:
+    rows = made.rows(made.row(made.trial(scenario=name), 0, 20.0 + n) for n, name in enumerate(("std", "hg")))
+    figure = distribution_figure(summarise(rows), rows)
+    assert [panel.get_title() for panel in figure.axes] == ["std", "std", "hg", "hg"]
+    assert [medians(panel) for panel in figure.axes] == [[20], [0.8], [21], [0.8]]
+
+
+def test_an_episode_that_met_nothing_is_no_dot() -> None:
+    rows = made.rows(made.row(made.trial(), 0, None, traversability=np.nan))
+    _, met = distribution_figure(summarise(rows), rows).axes
+    assert not met.collections

@@ -1,0 +1,124 @@
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.eval.report.findings import findings, p_in_words
+from benchnav.eval.stats.best import against_best
+from benchnav.eval.stats.summary import summarise
+from tests.eval.report import made
+
+NONE = pd.DataFrame({"trial": [], "last_traversability": []})
+
+
+def trial(count: int, of: int = 100, outcome: str = "immobilised", **labels: str) -> list[dict[str, Any]]:
+    """A trial that succeeds on the first maps."""
+    own = made.trial(**labels)
+    failed = [made.row(own, i, None, outcome=outcome) for i in range(count, of)]
+    return [*(made.row(own, i) for i in range(count)), *failed]
+
+
+def said(*trials: list[dict[str, Any]], failures: pd.DataFrame = NONE, told: Any = None) -> list[str]:
+    (finding,) = findings(summary_of(*trials), failures, told)
+    return list(finding.sentences)
+
+
+def summary_of(*trials: list[dict[str, Any]]) -> pd.DataFrame:
+    rows = made.rows(*trials)
+    summary = summarise(rows)
+    return summary.merge(against_best(rows, summary), on="trial")
+
+
+def test_a_best_that_is_told_apart_from_all_others() -> None:
+    sentences = said(trial(90, risk="cvar:0.9"), trial(40, risk="mean"), trial(30, risk="var"))
+    assert sentences[0] == (
+        "The highest success rate is that of MPPI, cvar:0.9: 90 % of its episodes reached the goal (95 % interval "
+        "83 to 94 %)."
+    )
+    assert sentences[1] == "It is told apart from each of the 2 other settings: it is the best of this run."
+    assert sentences[2].startswith(
+        "The next is MPPI, mean with 40 %: the difference is 50.0 points (95 % interval "
+    )
+    assert sentences[2].endswith(", p < 0.0001 after Holm's correction over 2 comparisons.")
+    assert sentences[3] == "It failed in 10 of 100 episodes: 10 immobilised (100 %)."
+    assert sentences[4] == (
+        "All 3 compared settings together failed in 140 of 300 episodes: 140 immobilised (100 %)."
+    )
+    assert len(sentences) == 5
+
+
+def test_one_that_cannot_be_told_from_it_and_the_next_that_can() -> None:
+    sentences = said(trial(40, risk="mean"), trial(88, risk="var"), trial(90, risk="cvar"))
+    assert sentences[1] == "One other setting cannot be told from it (p ≥ 0.05): MPPI, var."
+    assert sentences[2].startswith(
+        "The next that is told apart is MPPI, mean with 40 %: the difference is 50.0 points"
+    )
+
+
+def test_several_that_cannot_be_told_from_it_are_named_up_to_six() -> None:
+    sentences = said(*(trial(90 - n, risk=f"r{n}") for n in range(9)))
+    assert sentences[1] == (
+        "8 other settings cannot be told from it (p ≥ 0.05): "
+        "MPPI, r1; MPPI, r2; MPPI, r3; MPPI, r4; MPPI, r5; MPPI, r6 and 2 more."
+    )
+    assert sentences[2].startswith("No setting is told apart from it, so the run does not say which is best.")
+    assert "So many maps show a difference from about " in sentences[2]
+
+
+def test_a_single_setting_and_two() -> None:
+    alone = said(trial(100))
+    assert alone[1:] == ["There is no other setting to compare it with.", "It never failed."]
+    two = said(trial(90, risk="a"), trial(10, risk="b"))
+    assert two[1] == "It is told apart from the other setting: it is the best of this run."
+    assert two[2].endswith("after Holm's correction over 1 comparison.")
+
+
+def test_failures_are_counted_by_outcome_the_most_frequent_first() -> None:
+    rows = trial(90, of=96, outcome="stuck")
+    own = made.trial()
+    rows += [made.row(own, i, None, outcome="out_of_bounds") for i in (96, 97)]
+    assert said(rows)[2] == "It failed in 8 of 98 episodes: 6 stuck (75 %), 2 out of bounds (25 %)."
+    many = [made.row(own, i, None, outcome="stuck") for i in range(98, 500)]
+    assert said([*rows, *many])[2].endswith("408 stuck (100 %), 2 out of bounds (< 1 %).")
+
+
+def test_the_ground_of_failures_is_that_of_the_best_alone() -> None:
+    best, other = trial(60, risk="a"), trial(50, risk="b")
+    failures = pd.DataFrame(
+        {
+            "trial": [best[0]["trial"]] * 3 + [other[0]["trial"]] * 3,
+            "last_traversability": [0.02, 0.04, 0.3, 0.7, 0.8, 0.9],
+        }
+    )
+    without = said(best, other, failures=failures)
+    assert "In their last 2 s the robot met λ = 0.04 (median)." in without
+    told = {best[0]["trial"]: np.array([0.5, np.nan, 0.6, 0.9]), other[0]["trial"]: np.array([0.1])}
+    assert (
+        "At the place where they ended, the planner had been told λ̂ = 0.60, and in the last 2 s the robot met λ = 0.04 "
+        "(medians)."
+    ) in said(best, other, failures=failures, told=told)
+
+
+def test_what_is_told_the_truth_is_set_beside_it() -> None:
+    sentences = said(
+        trial(50, planner="astar_dwa"), trial(70, planner="astar_dwa", model="oracle", risk="mean"),
+        trial(80, planner="astar_dwa", model="oracle"), trial(99, planner="astar_dwa", model="clairvoyant", risk="–"),
+    )  # fmt: skip
+    assert sentences[0].startswith("The highest success rate is that of A* + DWA, paper-v1, cvar: 50 %")
+    assert sentences[1] == "There is no other setting to compare it with."
+    assert sentences[-2:] == [
+        "With the model oracle, which is told the truth, A* + DWA, oracle, cvar reached 80 %.",
+        "With the model clairvoyant, which is told the truth, A* + DWA, clairvoyant reached 99 %.",
+    ]
+
+
+def test_each_block_has_its_own_finding() -> None:
+    summary = summary_of(*(trial(n, scenario=s, world=w) for n, s, w in ((90, "std", "a"), (20, "hg", "b"))))
+    found = findings(summary, NONE)
+    assert [finding.title for finding in found] == ["std, a", "hg, b"]
+    assert "90 %" in found[0].sentences[0]
+    assert "20 %" in found[1].sentences[0]
+
+
+def test_p_in_words() -> None:
+    assert [p_in_words(p) for p in (0.00001, 0.0123, 1.0)] == ["p < 0.0001", "p = 0.012", "p = 1"]

@@ -1,0 +1,104 @@
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from benchnav.eval.report.findings import Finding
+from benchnav.eval.report.page import Drawn, provenance_lines, write_page
+from benchnav.eval.report.tables import ResultTable
+
+EVIL = "<script>alert(1)</script> & \"quoted\" 'too'"
+
+
+class Page(HTMLParser):
+    """What a browser would find: tags, and text outside of scripts and styles."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text: list[str] = []
+        self.inside: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "img"):
+            self.inside.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.inside.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.inside and self.inside[-1] not in ("script", "style"):
+            self.text.append(data.strip())
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Page:
+    picture = tmp_path / "success.png"
+    matplotlib.image.imsave(picture, np.zeros((20, 1000, 3)))
+    table = ResultTable(
+        headings=("planner", EVIL), labels=1, rows=(("a", "1"), (EVIL, "2")), notes=(EVIL,),
+        bold=frozenset({(1, 1)}), bold_note="the best", explained=(("planner", EVIL),),
+    )  # fmt: skip
+    about = {"commands": [EVIL], "parts": {EVIL: {"origin": EVIL}}}
+    text = write_page(
+        EVIL, [EVIL], [EVIL], [Finding(title=EVIL, sentences=(EVIL,))], table, [Drawn(path=picture, caption=EVIL)],
+        about,
+    )  # fmt: skip
+    return Page(text)
+
+
+def test_text_of_users_is_text(page: Page) -> None:
+    assert [tag for tag, _ in page.tags].count("script") == 1
+    assert sum(EVIL in text for text in page.text) >= 11
+    assert not page.inside
+
+
+def test_it_needs_nothing_else(page: Page) -> None:
+    sources = [
+        attributes[name] or ""
+        for _, attributes in page.tags
+        for name in ("src", "href")
+        if name in attributes
+    ]
+    assert sources
+    assert all(source.startswith(("data:image/png;base64,", "#")) for source in sources)
+    assert not [tag for tag, _ in page.tags if tag in ("link", "iframe")]
+
+
+def test_the_table_has_its_cells_and_bold_where_it_belongs(page: Page) -> None:
+    tags = [tag for tag, _ in page.tags]
+    assert (tags.count("th"), tags.count("td")) == (2, 4)
+    cells = [place for place, tag in enumerate(tags) if tag == "td"]
+    assert [tags[place + 1] == "b" for place in cells] == [False, False, False, True]
+    assert page.text[page.text.index("Bold") + 1].endswith("the best")
+
+
+def test_figures_keep_their_size_on_the_page(page: Page) -> None:
+    (image,) = [attributes for tag, attributes in page.tags if tag == "img"]
+    assert image["width"] == "600"
+    assert image["alt"] == "success"
+
+
+def test_provenance_of_a_run() -> None:
+    about = {
+        "run_id": "r1",
+        "code": {"sources": "abc", "versions": {"torch": "2.0"}, "processor": "AVX2", "compiles": False},
+        "machine": {"processor": "x86_64", "cores": 2},
+        "datasets": {"paper-v1": {"id": "paper-v1", "maps": {"test/std": ["d"] * 20}}},
+        "parts": {
+            "model m": {"files": {"a.bin": "1f"}},
+            "risk r.py:f": {"origin": "r.py", "digest": "9e"},
+            "x": "y",
+        },
+        "trials": {"t": {"seeds": [0, 7]}},
+    }
+    assert provenance_lines(about) == [
+        ("run", "r1"), ("sources of benchnav", "abc"), ("version of torch", "2.0"), ("processor", "x86_64 AVX2"),
+        ("cores", "2"), ("compiler", "no"), ("dataset paper-v1", "paper-v1; maps: test/std 20"),
+        ("model m", "a.bin 1f"), ("risk r.py:f", "r.py; 9e"), ("x", "y"), ("seeds", "0, 7"),
+    ]  # fmt: skip
+    assert provenance_lines({}) == []

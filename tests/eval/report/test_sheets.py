@@ -1,0 +1,84 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.errors import BenchnavError
+from benchnav.eval.report.charts.failure_sheet import Ground
+from benchnav.eval.report.failures import failures_table
+from benchnav.eval.report.sheets import Sheets, collect_sheets
+from benchnav.eval.stats.best import against_best
+from benchnav.eval.stats.summary import summarise
+from tests.eval.report import made
+
+RATES = {"mean": 2, "var": 5, "cvar": 8}
+
+
+def ground_of(failures: pd.DataFrame) -> Ground:
+    """λ̂ is a hundredth of the instance; the goal's x is the instance."""
+    count = len(failures)
+    instance = failures["instance"].to_numpy(dtype=float)
+    return Ground(
+        predicted=np.ones((count, 8, 8)) * instance[:, None, None] / 100,
+        holding=np.zeros((count, 8, 8), bool),
+        resolution_m=1.0,
+        goal_m=np.stack((instance, instance), axis=1),
+    )
+
+
+def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, dict[str, str]]:
+    """Ten maps; robots fail on the last ones, and end at x = 1."""
+    blind = made.trial("straight", "–", model="–")
+    rows = made.rows(
+        *(
+            [made.row(made.trial(risk=r), i, 20.0 if i < n else None) for i in range(10)]
+            for r, n in RATES.items()
+        ),
+        (made.row(blind, i, None) for i in range(10)),
+    )
+    if steps:
+        same = {"seed": 0, "realisation": 0, "step": [0, 1], "time_s": [0.0, 0.1], "x_m": [0.5, 1.0]}
+        parts = [
+            pd.DataFrame(
+                {"trial": row["trial"], "instance": row["instance"], "y_m": 0.1 * row["instance"], **same}
+            ).assign(traversability=[0.2, np.nan])
+            for row in rows.to_dict("records")
+        ]
+        pd.concat(parts).to_parquet(folder / "steps.parquet", index=False)
+    summary = summarise(rows)
+    summary = summary.merge(against_best(rows, summary), on="trial")
+    sheets = collect_sheets(folder, summary, failures_table(folder, rows), ground)
+    return sheets, dict(zip(summary["risk"], summary["trial"], strict=True))
+
+
+def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
+    sheets, trials = collected(tmp_path, ground_of)
+    ((title, (best, worst)),) = sheets.shown
+    assert title == "std"
+    assert (best.name, best.among, list(best.failures["instance"])) == ("MPPI, cvar", 2, [8, 9])
+    assert (worst.name, worst.among, list(worst.failures["instance"])) == ("MPPI, mean", 8, [2, 3, 4, 5])
+    assert sheets.left_out == ""
+    for line in (best, worst):
+        np.testing.assert_array_equal(line.ground.goal_m[:, 0], line.failures["instance"])
+        for track, instance in zip(line.tracks, line.failures["instance"], strict=True):
+            np.testing.assert_allclose(track, [[0.5, 0.1 * instance], [1, 0.1 * instance]])
+    # What the planner was told is that of all failures, shown or not.
+    assert set(sheets.told) == {trials["cvar"], trials["mean"]}
+    np.testing.assert_allclose(sheets.told[trials["mean"]], np.arange(2, 10) / 100)
+
+
+def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:
+    def gone(failures: pd.DataFrame) -> Ground:
+        raise BenchnavError("Expected a dataset, got none.")
+
+    sheets, _ = collected(tmp_path, gone)
+    assert (sheets.shown, sheets.told) == ((), {})
+    assert sheets.left_out == "No sheet of failures: Expected a dataset, got none."
+    assert collected(tmp_path, None)[0].left_out == ""
+
+
+def test_without_steps_there_is_no_sheet(tmp_path: Path) -> None:
+    sheets, _ = collected(tmp_path, ground_of, steps=False)
+    assert sheets.shown == ()
+    assert sheets.left_out == "No sheet of failures: the run kept no steps of them."

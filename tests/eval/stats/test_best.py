@@ -1,0 +1,115 @@
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from benchnav.eval.stats.best import against_best, competing
+from benchnav.eval.stats.summary import summarise
+from tests.eval.report import made
+
+BLIND = {"planner": "straight", "risk": "–", "model": "–"}
+MAPS = 30
+
+
+def episodes(labels: dict[str, str], successes: range, **changes: object) -> list[dict]:  # type: ignore[type-arg]
+    return [made.row(labels, i, 30.0 if i in successes else None, **changes) for i in range(MAPS)]
+
+
+def compared(*trials: list[dict]) -> pd.DataFrame:  # type: ignore[type-arg]
+    rows = made.rows(*trials)
+    summary = summarise(rows)
+    found = against_best(rows, summary)
+    assert list(found["trial"]) == list(summary["trial"])
+    return found.assign(risk=summary["risk"], model=summary["model"]).set_index("risk")
+
+
+def test_the_best_is_compared_with_all_others_and_corrected_over_them() -> None:
+    found = compared(
+        episodes(made.trial(risk="low"), range(10)),
+        episodes(made.trial(risk="best"), range(29)),
+        episodes(made.trial(risk="near"), range(27)),
+    )
+    assert set(found["best"]) == {found.loc["best", "trial"]}
+    assert list(found["best_rivals"]) == [2, 2, 2]
+    # With one episode a map the test is McNemar's; Holm's first step doubles the smaller of two p.
+    exact = {"low": binomtest(0, 19).pvalue, "near": binomtest(0, 2).pvalue}
+    assert found.loc["low", "best_p_holm"] == pytest.approx(2 * exact["low"])
+    assert found.loc["near", "best_p_holm"] == pytest.approx(exact["near"])
+    assert found["best_alike"].to_dict() == {"low": False, "best": True, "near": True}
+    assert found.loc["low", "best_difference"] == pytest.approx(19 / 30)
+    assert found.loc["low", "best_low"] < 19 / 30 < found.loc["low", "best_high"]
+    assert np.isnan(found.loc["best", "best_difference"])
+
+
+def test_of_equal_rates_the_faster_is_the_best() -> None:
+    slow = [made.row(made.trial(risk="slow"), i, 40.0) for i in range(5)]
+    found = compared(slow, [made.row(made.trial(risk="fast"), i, 20.0) for i in range(5)])
+    assert set(found["best"]) == {found.loc["fast", "trial"]}
+    assert found["best_alike"].all()
+
+
+def test_each_block_has_a_best_of_its_own() -> None:
+    for name in ("data", "scenario", "world", "robot", "objective"):
+        found = compared(
+            *(
+                episodes(made.trial(risk=f"{risk} {place}", **{name: place}), range(count))
+                for place, counts in (("here", (20, 5)), ("there", (4, 25)))
+                for risk, count in zip("ab", counts, strict=True)
+            )
+        )
+        assert found.loc["a here", "best"] == found.loc["b here", "best"] == found.loc["a here", "trial"]
+        assert found.loc["a there", "best"] == found.loc["b there", "trial"]
+        assert (found["best_rivals"] == 1).all()
+
+
+def test_maps_are_paired_under_the_same_luck() -> None:
+    """The same rates on the same maps, but under seeds of which each has its own successes."""
+    one = [made.row(made.trial(risk="one"), i, 30.0, seed=s) for i in range(9) for s in (0, 1)]
+    other = [
+        made.row(made.trial(risk="two"), i, None if s else 31.0, seed=s) for i in range(9) for s in (0, 1)
+    ]
+    found = compared(one, other)
+    assert found.loc["two", "best_difference"] == pytest.approx(0.5)
+    assert found.loc["two", "best_p_holm"] == pytest.approx(2 / 2**9)
+    few = [made.row(made.trial(risk="three"), i, None) for i in range(4)]  # only under the first seed
+    assert compared(one, few).loc["three", "best_difference"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("models", "left"),
+    [
+        (["paper-v1", "oracle", "clairvoyant", "–"], ["paper-v1", "–"]),
+        (["oracle", "ideal", "clairvoyant", "–"], ["oracle", "ideal", "–"]),
+        (["clairvoyant", "–"], ["clairvoyant", "–"]),
+        (["–"], ["–"]),
+        (["a", "b"], ["a", "b"]),
+    ],
+)
+def test_what_is_told_the_truth_competes_only_where_nothing_else_does(
+    models: list[str], left: list[str]
+) -> None:
+    rows = pd.DataFrame({"model": models})
+    assert list(rows["model"][competing(rows)]) == left
+
+
+def test_yardsticks_are_not_compared() -> None:
+    found = compared(
+        episodes(made.trial(risk="mine"), range(5)),
+        episodes(made.trial(risk="told", model="oracle"), range(30)),
+        episodes(made.trial(**BLIND), range(2)),
+    )
+    assert set(found["best"]) == {found.loc["mine", "trial"]}
+    assert list(found["best_rivals"]) == [1, 1, 1]
+    assert np.isnan(found.loc["told", "best_p_holm"])
+    assert not found.loc["told", "best_alike"]
+
+
+def test_trials_without_a_map_in_common_and_with_one_map_are_not_told_apart() -> None:
+    apart = compared(
+        [made.row(made.trial(risk="a"), i, 30.0) for i in range(9)],
+        [made.row(made.trial(risk="b"), i, None) for i in range(9, 18)],
+    )
+    assert apart["best_alike"].all()
+    single = compared([made.row(made.trial(risk="a"), 0)], [made.row(made.trial(risk="b"), 0, None)])
+    assert single["best_alike"].all()
+    assert single.loc["b", "best_difference"] == 1
