@@ -82,7 +82,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     path = folder / name
     if not path.exists():
         raise ConfigError(
-            f"Expected a finished run, got {folder} without {name}. Run the same command again to finish it."
+            f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to finish it."
         )
     try:
         return pd.read_parquet(path)
@@ -137,7 +137,9 @@ def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
     abouts = [about_unit(folder, unit, run_id) for unit in finished]
     for unit, about in zip(finished, abouts, strict=True):
         if about is None:
-            raise ConfigError(f"{folder / unit.path} is not of this run. Run the same command again.")
+            raise ConfigError(
+                f"{folder / unit.path} is not of this run. Give its `benchnav-eval run` command again."
+            )
     schemas = [pq.read_schema(folder / unit.path) for unit in finished]
     names = dict.fromkeys(name for schema in schemas for name in schema.names)
     layers = [name.removeprefix(_STEP_COLUMN) for name in names if name.startswith(_STEP_COLUMN)]
