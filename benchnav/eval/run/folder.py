@@ -82,7 +82,8 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
     path = folder / name
     if not path.exists():
         raise ConfigError(
-            f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to finish it."
+            f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
+            "finish it."
         )
     try:
         return pd.read_parquet(path)
