@@ -24,9 +24,8 @@ def variants(pairs: Sequence[Pair]) -> dict[str, list[Pair]]:
     several = [name for name in NAMES if len({pair.shared[name] for pair in pairs}) > 1]
     found: dict[str, list[Pair]] = {}
     for pair in pairs:
-        found.setdefault(", ".join(Path(pair.shared[name]).name for name in several) or "all", []).append(
-            pair
-        )
+        shared = {**pair.shared, "data": Path(pair.shared["data"]).name}
+        found.setdefault(", ".join(shared[name] for name in several) or "all", []).append(pair)
     return found
 
 

@@ -237,6 +237,15 @@ def test_a_unit_of_another_run_does_not_count(dataset_path: Path, tmp_path: Path
     assert said == []  # nothing was there: the unit was run anew
 
 
+@pytest.mark.parametrize("risk", ["cvar:1.5", "var:-0.1", "expected-time:-1", "chance:2", "single-class:1"])
+def test_options_that_a_risk_measure_cannot_take_are_refused_before_the_run(
+    dataset_path: Path, tmp_path: Path, risk: str
+) -> None:
+    with pytest.raises(ConfigError, match=r"Expected .* in [\[(]0, 1[\])], got"):
+        finish(quick(dataset_path, scenarios=("std",), risks=("mean", risk)), tmp_path / "run")
+    assert not (tmp_path / "run" / "units").exists()
+
+
 def test_a_run_with_another_time_limit_or_compiler_is_refused(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

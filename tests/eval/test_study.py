@@ -73,3 +73,14 @@ def test_each_variant_has_a_row(tmp_path: Path, monkeypatch, capsys) -> None:  #
     assert [line.split(" |")[0] for line in lines[3:5]] == ["| paper-v1", "| oracle"]
     assert "| 100.0 | 50.0 |" in lines[3]
     assert "| 100.0 | 100.0 |" in lines[4]
+
+
+def test_variants_are_told_apart_by_the_whole_label(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
+    worlds = [
+        episodes.assign(world=label, trial=episodes["trial"] + label, success=won)
+        for label, won in (("stakes immobile=0.05/2s", True), ("stakes immobile=0.2/2s", False))
+    ]
+    lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", pd.concat(worlds)))
+    assert lines[3].startswith("| stakes immobile=0.05/2s | 100.0 | 100.0 |")
+    assert lines[4].startswith("| stakes immobile=0.2/2s | 0.0 | 0.0 |")

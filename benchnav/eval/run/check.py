@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from typing import Any
 
+import torch
+
 from benchnav import registry
 from benchnav.datagen.scenario import load_recipe, shipped_recipes
 from benchnav.datagen.store import TerrainDataset, find_dataset
@@ -11,6 +13,7 @@ from benchnav.eval.run.check_world import Say, check_budgets, check_luck
 from benchnav.eval.run.unit import Extent
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
+from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint, predict
 from benchnav.options import one_line
@@ -64,8 +67,8 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
         _check_members(trial)
         check_steers(trial.make_planner(), trial.make_task().robot, trial.planner.label)
         _check_first_plan(trial)
-    for trial in trials:
-        trial.make_risk()
+    for trial in _distinct(trials, ("risk",)):
+        _check_risk(trial)
     check_budgets(trials, datasets, suite.instances, say)
     check_luck(trials, datasets, suite)
     _check_single_class(trials, datasets)
@@ -115,6 +118,14 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     if whole is None or whole.maps < maps:
         return ""
     return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
+
+
+def _check_risk(trial: Trial) -> None:
+    """Lets a shipped risk measure refuse its options, on the distribution of one cell."""
+    measure = trial.make_risk()
+    if registry.find("risk", trial.risk.part).shipped:
+        cell = torch.full((1, 1, 1, 1), 0.5)
+        measure(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
 
 
 def _check_single_class(trials: list[Trial], datasets: dict[str, TerrainDataset]) -> None:

@@ -91,7 +91,8 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
                 "shards together with `benchnav-eval merge OUT PART …`."
             )
         raise ConfigError(
-            f"Expected a finished run, got {folder} without {name}. Run the same command again to finish it."
+            f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
+            "finish it."
         )
     try:
         return pd.read_parquet(path)
@@ -165,7 +166,9 @@ def write_errors(folder: Path, finished: Sequence[Unit], run_id: str) -> None:
     abouts = [about_unit(folder, unit, run_id) for unit in finished]
     for unit, about in zip(finished, abouts, strict=True):
         if about is None:
-            raise ConfigError(f"{folder / unit.path} is not of this run. Run the same command again.")
+            raise ConfigError(
+                f"{folder / unit.path} is not of this run. Give its `benchnav-eval run` command again."
+            )
     traces = [
         text for unit, about in zip(finished, abouts, strict=True) if about and (text := _trace(unit, about))
     ]
