@@ -246,6 +246,11 @@ def find_dataset(source: str | Path) -> Path:
         for name in (f"{source}.h5", f"{source}-test.h5"):
             if (folder / name).is_file():
                 return folder / name
+    if Path(source).suffix == ".h5":
+        raise DatasetError(
+            f"Expected a dataset, got {str(source)!r}, which is not there. "
+            "Make one with `benchnav-datagen create`."
+        )
     raise DatasetError(
         f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
         f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."

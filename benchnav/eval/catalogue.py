@@ -1,10 +1,10 @@
-"""What can be named in a suite: the parts of each kind with their purpose and options, and checkpoints."""
+"""What can be named in a suite: parts of each kind and worlds, with purpose and options; and checkpoints."""
 
 import inspect
 import json
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from benchnav import registry
@@ -21,6 +21,7 @@ TITLES = {
     "risk": "risk measures",
     "robot": "robots",
     "objective": "objectives",
+    "world": "worlds, with the rules of a task that go with each",
 }
 HELP = (
     "More by package.module:Name and path/to/file.py:Name. NAME:VALUE sets the first option, "
@@ -49,14 +50,17 @@ def print_catalogue(*kinds: str) -> None:
     """Prints what can be named in a suite: as tables in a terminal, as plain lines elsewhere.
 
     Args:
-        kinds: some of the registry's; all of them when none is named.
+        kinds: some of the keys of `TITLES`; all of them when none is named.
 
     Raises:
         ConfigError: there is no such kind.
     """
-    chosen = [kind for kind in kinds if kind] or list(registry.KINDS)
+    chosen = [kind for kind in kinds if kind] or list(TITLES)
     for kind in chosen:
-        registry.names(kind)  # refuses an unknown one before anything is printed
+        if kind not in TITLES:
+            raise ConfigError(
+                f"Expected a kind among {', '.join(TITLES)}, got {kind!r}.{registry.hint(kind, TITLES)}"
+            )
     if not sys.stdout.isatty():
         print("\n".join(line for kind in chosen for line in plain_lines(kind)))
         return
@@ -69,7 +73,9 @@ def print_catalogue(*kinds: str) -> None:
 
 
 def list_entries(kind: str) -> list[Entry]:
-    """Lists the parts of a kind that are known by name; for models also the checkpoints found."""
+    """Lists the parts of a kind that are known by name, for models also the checkpoints found; or worlds."""
+    if kind == "world":
+        return list(_worlds())
     found = [_describe(kind, name) for name in registry.names(kind)]
     return found + list(_checkpoints()) if kind == "model" else found
 
@@ -149,6 +155,24 @@ def _default(value: Any) -> str:
         return f" = {json.dumps(plain(value), ensure_ascii=False)}"
     except ConfigError:
         return f" = {type(value).__name__}"
+
+
+def _worlds() -> Iterator[Entry]:
+    """Worlds with their settings, each as a flag or a suite names it."""
+    from benchnav.planning.world.world import PRESETS
+
+    for name, preset in PRESETS.items():
+        settings = {f"world.{key}": value for key, value in preset.world.to_dict().items()}
+        settings |= {f"task.{key}": value for key, value in asdict(preset.rules).items()}
+        yield Entry(name=name, purpose=preset.purpose, options=tuple(_setting_lines(settings)))
+
+
+def _setting_lines(settings: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from _setting_lines({f"{name}.{key}": inner for key, inner in value.items()})
+        else:
+            yield f"{name}{_default(value)}"
 
 
 def _checkpoints() -> Iterator[Entry]:

@@ -109,10 +109,10 @@ def rerun(
 
 
 def list_command(kinds: list[str]) -> None:
-    """List planners, models, risk measures, robots and objectives with their options.
+    """List planners, models, risk measures, robots, objectives and worlds with their options.
 
     Args:
-        kinds: Some of planner, model, risk, robot and objective; all when none is named.
+        kinds: Some of planner, model, risk, robot, objective and world; all when none is named.
     """
     from benchnav.eval.catalogue import print_catalogue
 

@@ -2,8 +2,10 @@
 
     python docs/risk/figure.py runs/stakes runs/control docs/figures/risk.png
 
-A column a world, success above and time below, a colour a planner; `mean` and `expected-time` as lines. Bands and
-bars are 95 % intervals: Wilson's of success, of time a bootstrap over maps. A failure counts as T.
+A column a planner, success above and time below, a colour a world; `mean`, `expected-time` and the blind straight
+line as lines across. Bars are 95 % intervals: Wilson's of success, of time a bootstrap over maps. A failure counts
+as T. A level stands at −log(1 − level), so that each halving of the tail is one step. Of a run with several models
+the first is drawn.
 """
 
 import argparse
@@ -18,8 +20,9 @@ from scipy.stats import binomtest
 
 from benchnav.eval.report.figures import display_name
 
-COLOURS = {"astar_dwa": "#0072B2", "cl_rrt": "#D55E00", "mppi": "#009E73"}  # told apart by colour-blind eyes
-LINES = {"mean": "--", "expected-time": ":"}
+PLANNERS = ("astar_dwa", "cl_rrt", "mppi")
+COLOURS = ("#0072B2", "#D55E00")  # told apart by colour-blind eyes
+LINES = {"mean": (0, (5, 2)), "expected-time": (0, (1, 1.5)), "straight": "-."}
 DRAWS = 10_000
 
 
@@ -37,24 +40,17 @@ def time_s(rows: pd.DataFrame) -> tuple[float, float, float]:
     return times.mean(), *np.percentile(draws, (2.5, 97.5))
 
 
-def draw(panel: Any, rows: pd.DataFrame, measure: Any) -> None:
-    """Draws one measure of one world."""
+def draw(panel: Any, rows: pd.DataFrame, measure: Any, colour: str, shift: float) -> None:
+    """Draws one measure of one planner in one world."""
     levels = sorted({float(risk.split(":")[1]) for risk in rows["risk"] if risk.startswith("cvar:")})
-    places = np.arange(len(levels))  # levels crowd toward 1
-    for (planner, colour), shift in zip(COLOURS.items(), (-0.06, 0.0, 0.06), strict=True):
-        mine = rows[rows["planner"] == planner]
-        if mine.empty:
-            continue
-        points = np.array([measure(mine[mine["risk"] == f"cvar:{level:g}"]) for level in levels])
-        errors = np.abs(points[:, 1:] - points[:, :1]).T
-        panel.errorbar(
-            places + shift, points[:, 0], errors, color=colour, marker="o", ms=4, lw=1.5, capsize=2
-        )
-        for risk, style in LINES.items():
-            panel.axhline(measure(mine[mine["risk"] == risk])[0], color=colour, ls=style, lw=1.2)
-    blind = rows[rows["planner"] == "straight"]
-    if not blind.empty:
-        panel.axhline(measure(blind)[0], color="0.5", lw=1.2)
+    places = -np.log2(1 - np.array(levels))
+    points = np.array([measure(rows[rows["risk"] == f"cvar:{level:g}"]) for level in levels])
+    errors = np.abs(points[:, 1:] - points[:, :1]).T
+    panel.errorbar(places + shift, points[:, 0], errors, color=colour, marker="o", ms=4, lw=1.5, capsize=2)
+    for name, style in LINES.items():
+        one = rows[(rows["risk"] == name) | (rows["planner"] == name)]
+        if not one.empty:
+            panel.axhline(measure(one)[0], color=colour, ls=style, lw=1, alpha=0.9)
     panel.set_xticks(places, [f"{level:g}" for level in levels])
     panel.grid(axis="y", color="0.9")
 
@@ -62,27 +58,32 @@ def draw(panel: Any, rows: pd.DataFrame, measure: Any) -> None:
 def main() -> None:
     """Writes the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="+", help="one a world, and the picture to write")
+    parser.add_argument(
+        "runs", type=Path, nargs="+", help="one or two, one a world, and the picture to write"
+    )
     *runs, out = parser.parse_args().runs
-    figure = Figure(figsize=(4.2 * len(runs), 6.2), layout="constrained")
-    panels = figure.subplots(2, len(runs), squeeze=False, sharex="col", sharey="row")
-    for column, run in enumerate(runs):
+    figure = Figure(figsize=(9.6, 6.4), layout="constrained")
+    panels = figure.subplots(2, len(PLANNERS), squeeze=False, sharex="col", sharey="row")
+    handles, named = [], []
+    for run, colour, shift in zip(runs, COLOURS, (-0.04, 0.04), strict=False):
         rows = pd.read_parquet(run / "episodes.parquet")
-        models = rows.loc[rows["model"] != "–", "model"]
-        rows = rows[rows["model"].isin(("–", models.iloc[0]))]
-        panels[0, column].set_title(f"world {rows['world'].iloc[0]}")
-        draw(panels[0, column], rows, success)
-        draw(panels[1, column], rows, time_s)
+        model = rows.loc[rows["model"] != "–", "model"].iloc[0]
+        rows = rows[rows["model"].isin(("–", model))]
+        named.append(model)
+        label = f"world {rows['world'].iloc[0]}"
+        handles.append(Line2D([], [], color=colour, marker="o", ms=4, label=f"{label}, CVaR"))
+        for column, planner in enumerate(PLANNERS):
+            mine = rows[rows["planner"].isin((planner, "straight"))]
+            draw(panels[0, column], mine, success, colour, shift)
+            draw(panels[1, column], mine, time_s, colour, shift)
+    for column, planner in enumerate(PLANNERS):
+        panels[0, column].set_title(display_name(planner))
         panels[1, column].set_xlabel("level of CVaR")
     panels[0, 0].set_ylabel("success [%]")
     panels[1, 0].set_ylabel("T_total [s], a failure counts as T")
-    handles = [
-        Line2D([], [], color=colour, marker="o", ms=4, label=display_name(name))
-        for name, colour in COLOURS.items()
-    ]
-    handles += [Line2D([], [], color="0.3", ls=style, label=name) for name, style in LINES.items()]
-    handles += [Line2D([], [], color="0.5", label="straight")]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    handles += [Line2D([], [], color="0.3", ls=style, lw=1, label=name) for name, style in LINES.items()]
+    title = f"model {', '.join(dict.fromkeys(named))}"
+    figure.legend(handles=handles, title=title, loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(out, dpi=150)
 
 

@@ -79,6 +79,24 @@ def test_every_known_part_is_listed_with_a_purpose_and_all_its_options(kind: str
         assert all(option in options for option in registry.options_of(kind, target))
 
 
+def test_worlds_are_listed_by_the_names_that_flags_and_suites_have() -> None:
+    paper, stakes = list_entries("world")
+    assert (paper.name, stakes.name) == ("paper", "stakes")
+    assert "drawn anew" in paper.purpose
+    assert "holds" in stakes.purpose
+    assert {'world.noise = "resampled"', "world.time_budget_s = 100.0", "task.slowest = 0.3"} <= set(
+        paper.options
+    )
+    assert not any("immobile" in option for option in paper.options)
+    assert {
+        'world.noise = "frozen"',
+        "world.correlation_m = 1.5",
+        "world.immobile.below = 0.1",
+        "world.time_budget_ratio = 3.0",
+        'task.free_space.by = "mean"',
+    } <= set(stakes.options)
+
+
 def test_a_dataclass_without_a_docstring_has_no_made_up_purpose() -> None:
     registry.register("robot", "bare", Follower)
     (entry,) = [entry for entry in list_entries("robot") if entry.name == "bare"]
@@ -124,7 +142,7 @@ def test_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out.splitlines() == [*plain_lines("risk"), *plain_lines("robot")]
     print_catalogue("")
     kinds = [line.split()[0] for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
-    assert list(dict.fromkeys(kinds)) == list(registry.KINDS)
+    assert list(dict.fromkeys(kinds)) == [*registry.KINDS, "world"]
 
 
 def test_a_table_where_there_is_one(
@@ -140,7 +158,7 @@ def test_a_table_where_there_is_one(
 
 
 @pytest.mark.parametrize("width", [100, 130])
-@pytest.mark.parametrize("kind", registry.KINDS)
+@pytest.mark.parametrize("kind", [*registry.KINDS, "world"])
 def test_tables_fit_and_break_no_option(kind: str, width: int) -> None:
     console = Console(width=width, record=True, file=io.StringIO())
     console.print(make_table(kind))

@@ -62,7 +62,7 @@ def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
         _range(100 * row["success_low"], 100 * row["success_high"]),
         _p(row["success_p_holm"]),
         "yes" if row["success_p_holm"] < ALPHA else "no",
-        f"{100 * row['success_shown']:.0f}",
+        f"{100 * row['success_shown']:.0f}" if row["success_shown"] <= 1 else NOT_USED,
         _signed(row["time_difference_s"]),
         _range(row["time_low_s"], row["time_high_s"]),
         _p(row["time_p_holm"]),
@@ -81,7 +81,8 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
         "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
         "interval of Bonett and Price. T_total: a failure counts as T; Wilcoxon's signed-rank test, bootstrap over "
         "maps.",
-        "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %. "
+        "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %; "
+        "a dash where they are too few to show any. "
         f"A difference of {points} needs {maps} maps.",
     )
 

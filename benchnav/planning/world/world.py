@@ -132,17 +132,24 @@ class Preset:
     """A world, and the rules of a task that go with it.
 
     Args:
+        purpose: one line.
         world: what λ does.
         rules: free space, least λ̂, goal radius.
     """
 
+    purpose: str
     world: World
     rules: Rules
 
 
 PRESETS: Mapping[str, Preset] = {
-    "paper": Preset(world=World(), rules=Rules()),
+    "paper": Preset(
+        purpose="The paper's: λ is drawn anew at each step; low λ slows a robot and ends nothing.",
+        world=World(),
+        rules=Rules(),
+    ),
     "stakes": Preset(
+        purpose="λ stays what it is at a place, and soft ground holds a robot for good.",
         world=World(noise="frozen", immobile=Immobile(), time_budget_s=None, time_budget_ratio=3.0),
         rules=Rules(free_space=FreeSpace(by="mean", above=0.1), slowest=0.05),
     ),

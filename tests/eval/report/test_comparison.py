@@ -59,3 +59,11 @@ def test_labels_that_differ_have_a_column_and_notes_name_the_family() -> None:
     assert "Family: 2 pairs" in notes
     needed = np.unique(table["maps_needed"])
     assert f"A difference of 20 points needs {needed[0]} maps" in notes
+
+
+def test_maps_too_few_to_show_any_difference_say_so() -> None:
+    table = compare([pair(A[:4], B[:4]), pair(A * 10, B * 10)])
+    few, many = cells(table)
+    assert table["success_shown"][0] > 1
+    assert few["shows from"] == "–"
+    assert many["shows from"] == f"{100 * table['success_shown'][1]:.0f}"
