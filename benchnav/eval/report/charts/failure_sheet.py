@@ -133,5 +133,6 @@ def _legend(lines: Sequence[Shown]) -> list[Line2D | Patch]:
     ]
     marks.append(Line2D([], [], color="black", lw=1.1, label="driven"))
     if any(line.ground.holding.any() for line in lines):
-        marks.append(Patch(color=[value / 255 for value in HOLDING], label="ground that holds a robot"))
+        red, green, blue = (value / 255 for value in HOLDING)
+        marks.append(Patch(color=(red, green, blue), label="ground that holds a robot"))
     return marks
