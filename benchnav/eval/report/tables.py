@@ -34,9 +34,9 @@ _COLUMNS = {
     "maps.",
     "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
     "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
-    "planning [ms]": "wall time of planning for one step of one robot: median over episodes, in brackets the 95th "
-    "percentile. It is measured over a batch of at most 50 episodes on one thread and holds the planner's preparation; "
-    "¶ marks planners that were compiled.",
+    "planning [ms]": "wall time of planning one step of one robot, from the second step on: the median over an "
+    "episode's steps and in brackets their 95th percentile, each as its median over episodes. It is measured over a "
+    "batch of at most 50 episodes on one thread and divided by their number; ¶ marks planners that were compiled.",
     "failures": "how the other episodes ended.",
 }
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -72,7 +72,7 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
     are the numbers of maps and episodes.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best` and `planning.planning_times`.
+        summary: from `summary.summarise`, joined with `best.against_best`.
         trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
@@ -159,7 +159,9 @@ def _planning(row: Mapping[Any, Any]) -> str:
     if np.isnan(row["planning_ms_median"]):
         return NOT_USED
     compiled = "¶" if row["compiled_share"] > 0 else ""
-    return f"{row['planning_ms_median']:.2g} ({row['planning_ms_p95']:.2g}){compiled}"
+    if np.isnan(row["planning_ms_p95_median"]):  # of an earlier version
+        return f"{row['planning_ms_median']:.2g}{compiled}"
+    return f"{row['planning_ms_median']:.2g} ({row['planning_ms_p95_median']:.2g}){compiled}"
 
 
 def _with_interval(mean: float, low: float, high: float) -> str:

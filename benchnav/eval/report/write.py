@@ -33,7 +33,6 @@ from benchnav.eval.report.trajectories import choose, trajectory_figure
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.run.folder import ERRORS, open_run, read_table
 from benchnav.eval.stats.best import against_best
-from benchnav.eval.stats.planning import planning_times
 from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
 
@@ -97,8 +96,7 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
         episodes = convert_rows(episodes, about)
         about = {**about, **convert_about(about, episodes)}
     summary = summarise(episodes)
-    for more in (planning_times(episodes), against_best(episodes, summary)):
-        summary = summary.merge(more, on="trial", how="left", validate="1:1")
+    summary = summary.merge(against_best(episodes, summary), on="trial", how="left", validate="1:1")
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(folder, summary, failures, ground_of)
     left_out = [sheets.left_out] if sheets.left_out else []

@@ -35,7 +35,8 @@ class Episodes:
         turn_rate_radps: turn rate that each action would give on ground of λ = 1, shape [B, N].
         outcome: `Outcome`, shape [B].
         steps: steps to the end, shape [B].
-        planning_s: wall time spent in the planner.
+        begin_s: wall time of what the planner prepared for the whole batch.
+        planning_s: wall time of each step's plan for the whole batch, shape [N].
         errors: one line for each episode that ended by a fault of its planner, empty for the others, B of
             them.
         traceback: where the planner raised; empty where it did not.
@@ -47,7 +48,8 @@ class Episodes:
     turn_rate_radps: Tensor
     outcome: Tensor
     steps: Tensor
-    planning_s: float
+    begin_s: float
+    planning_s: Tensor
     errors: tuple[str, ...]
     traceback: str = ""
 
@@ -62,6 +64,8 @@ class _Log:
         self.met: list[Tensor] = []
         self.driven_m: list[Tensor] = []
         self.turned: list[Tensor] = []
+        self.begin_s = 0.0
+        self.planning_s: list[float] = []
         self.errors = [""] * len(start.state)
 
     def blame(self, which: Tensor, reason: str) -> None:
@@ -75,7 +79,7 @@ class _Log:
         self.driven_m.append(distance(free, before[:, :2]))
         self.turned.append((free[:, 2] - before[:, 2]) / self.dt_s)
 
-    def episodes(self, now: SimulationState, actions: int, planning_s: float, traceback_: str) -> Episodes:
+    def episodes(self, now: SimulationState, actions: int, traceback_: str) -> Episodes:
         track = torch.stack(self.states, dim=1)
         none = track.new_zeros(len(track), 0)
         driven = torch.stack(self.driven_m, dim=1) if self.actions else none
@@ -88,7 +92,9 @@ class _Log:
             turn_rate_radps=torch.stack(self.turned, dim=1) if self.actions else none,
             outcome=tell_standstill(now.outcome, now.step, track[..., :2], driven, self.dt_s),
             steps=now.step,
-            planning_s=planning_s,
+            begin_s=self.begin_s,
+            # A planner that raised has no step for its last plan.
+            planning_s=torch.tensor(self.planning_s[: len(self.actions)], dtype=torch.float64),
             errors=tuple(self.errors),
             traceback=traceback_,
         )
@@ -121,18 +127,18 @@ def run_episodes(
     now = simulation.init(problem.start)
     log = _Log(now, problem.dt_s)
     felt = torch.full_like(now.state[:, 0], torch.nan)
-    planning_s, trace = 0.0, ""
+    trace = ""
     began = time.perf_counter()
     try:
         plan_state = begin(planner, problem, generator)
-        planning_s = time.perf_counter() - began
+        log.begin_s = time.perf_counter() - began
         while bool(now.running.any()):
             count = len(log.actions)
             watched = watch is not None and count % watch_every == 0
             step = Step(state=now.state, felt=felt, time_s=count * problem.dt_s, draw=watched)
             began = time.perf_counter()
             answer = act(planner, step, plan_state, problem)
-            planning_s += time.perf_counter() - began
+            log.planning_s.append(time.perf_counter() - began)
             plan_state = answer.plan_state
             if watched and watch is not None:
                 watch(count, answer.plan)
@@ -148,7 +154,7 @@ def run_episodes(
         trace = traceback.format_exc()
         log.blame(now.running, fault(error))
         now = end(now, now.running, Outcome.PLANNER_ERROR)
-    return log.episodes(now, len(problem.robot.action_low), planning_s, trace)
+    return log.episodes(now, len(problem.robot.action_low), trace)
 
 
 class RobotError(BenchnavError):

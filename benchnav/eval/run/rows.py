@@ -41,11 +41,10 @@ def episode_rows(
         `traversability`, the mean of the λ met; `reference_time_s`; `time_ratio`, over the reference time at
         the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
         `stuck_share`, share of steps with λ at most λ_stuck; `roughness_radps2`, the mean change of the
-        commanded turn rate; `planning_ms` a step and episode; `redrawn`; `compiled`; `error`. What an episode that
-        ended at once does not have is NaN.
+        commanded turn rate; wall times of planning as of `planning_times`; `redrawn`; `compiled`; `error`.
+        What an episode that ended at once does not have is NaN.
     """
     top_speed = problem.robot.top_speed_mps
-    steps_planned = max(int(episodes.steps.max()), 1) * len(unit.instances)
     rows = []
     for b, instance in enumerate(unit.instances):
         steps = int(episodes.steps[b])
@@ -76,7 +75,7 @@ def episode_rows(
                 "path_length_m": path_length_m(track) if steps else np.nan,
                 "stuck_share": float(stuck.double().mean()) if steps else np.nan,
                 "roughness_radps2": np.abs(np.diff(turn)).mean() / problem.dt_s if steps > 1 else np.nan,
-                "planning_ms": 1e3 * episodes.planning_s / steps_planned,
+                **planning_times(episodes, b),
                 "redrawn": redrawn[b],
                 "compiled": compiled,
                 "error": episodes.errors[b],
@@ -106,6 +105,8 @@ def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
             "stuck_share": np.nan,
             "roughness_radps2": np.nan,
             "planning_ms": np.nan,
+            "planning_ms_p95": np.nan,
+            "planning_start_ms": np.nan,
             "redrawn": 0,
             "compiled": False,
             "error": error,
@@ -113,6 +114,28 @@ def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
         for instance, budget in zip(unit.instances, time_budget_s.tolist(), strict=True)
     ]
     return pd.DataFrame(rows)
+
+
+def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
+    """Wall times of planning for one robot: those of the batch over its number of episodes.
+
+    Args:
+        episodes: what happened.
+        member: which episode.
+
+    Returns:
+        `planning_ms` a step, the median over the episode's own steps but the first, and its 95th percentile
+        `planning_ms_p95`; `planning_start_ms`, what is prepared and the first step, compilation among it.
+        NaN where there is no such step.
+    """
+    share_ms = 1e3 / len(episodes.steps)
+    own = share_ms * episodes.planning_s[: int(episodes.steps[member])].numpy()
+    warm = own[1:]
+    return {
+        "planning_ms": float(np.median(warm)) if len(warm) else np.nan,
+        "planning_ms_p95": float(np.percentile(warm, 95)) if len(warm) else np.nan,
+        "planning_start_ms": share_ms * episodes.begin_s + float(own[0]) if len(own) else np.nan,
+    }
 
 
 def path_length_m(track: np.ndarray) -> float:

@@ -109,7 +109,8 @@ def summarise(episodes: pd.DataFrame) -> pd.DataFrame:
         `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
         counted as T; time of the successes alone; λ met; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
-        a bootstrap over maps. `planning_ms_median`; `compiled_share`; and `OUTCOME_count` of each failure.
+        a bootstrap over maps. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`, which
+        runs of earlier versions do not have; `compiled_share`; and `OUTCOME_count` of each failure.
     """
     groups = [group for _, group in episodes.groupby("trial", sort=False)]
     summary = pd.DataFrame([_summarise_trial(group) for group in groups])
@@ -151,7 +152,8 @@ def _summarise_trial(group: pd.DataFrame) -> dict[str, object]:
         values = columns[column]
         row |= {f"{name}_mean{unit}": values.mean(), f"{name}_std{unit}": values.std()}
         row[f"{name}_n"] = int(values.notna().sum())
-    row["planning_ms_median"] = group["planning_ms"].median()
+    for name in ("planning_ms", "planning_ms_p95", "planning_start_ms"):
+        row[f"{name}_median"] = group[name].median() if name in group else np.nan
     row["compiled_share"] = group["compiled"].astype(float).mean()
     outcomes = [outcome.name.lower() for outcome in FAILURES]
     return row | {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}

@@ -37,7 +37,8 @@ def row(
         "total_time_s": time_s if success else 100.0, "end_time_s": time_s if success else 100.0,
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
-        "roughness_radps2": 2.0, "planning_ms": 1.0, "compiled": True, "error": "",
+        "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
+        "compiled": True, "error": "",
     }  # fmt: skip
     return made | changes
 

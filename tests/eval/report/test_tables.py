@@ -4,7 +4,6 @@ import pytest
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.tables import failures_in_words, result_table
 from benchnav.eval.stats.best import against_best
-from benchnav.eval.stats.planning import planning_times
 from benchnav.eval.stats.summary import LABELS, summarise
 from tests.eval.report import made
 
@@ -13,14 +12,15 @@ BLIND = {"planner": "straight", "risk": "–", "model": "–"}
 
 def table_of(episodes, **notes):  # type: ignore[no-untyped-def]
     summary = summarise(episodes)
-    for more in (planning_times(episodes), against_best(episodes, summary)):
-        summary = summary.merge(more, on="trial")
+    summary = summary.merge(against_best(episodes, summary), on="trial")
     return result_table(summary, made.trials(episodes, **notes))
 
 
 def test_golden_table() -> None:
     quick = [
-        made.row(made.trial("mppi"), i, time, traversability=0.7, planning_ms=2.0 * i)
+        made.row(
+            made.trial("mppi"), i, time, traversability=0.7, planning_ms=2.0 * i, planning_ms_p95=4.0 * i
+        )
         for i, time in enumerate((20.0, 30.0))
     ]
     slow = [
@@ -39,8 +39,8 @@ def test_golden_table() -> None:
         "| scenario | planner | risk | Succ. [%] | 95 % interval | T_total [s] | T if success [s] | λ̄ [%] "
         "| planning [ms] | failures |\n"
         "|---|---|---|---|---|---|---|---|---|---|\n"
-        "| std | mppi | cvar | **100** | 34–100 | 25.0 (20.0–30.0) | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (1.9)¶ | – |\n"
-        "| std | cl_rrt¹,² | mean | **50** | 9–91 | 70.0 (40.0–100.0) | 40.0 | 70.0 ± 28.3 | 1 (1) | 1 stuck |\n"
+        "| std | mppi | cvar | **100** | 34–100 | 25.0 (20.0–30.0) | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (2)¶ | – |\n"
+        "| std | cl_rrt¹,² | mean | **50** | 9–91 | 70.0 (40.0–100.0) | 40.0 | 70.0 ± 28.3 | 1 (3) | 1 stuck |\n"
         "| std | straight | – | **0** | 0–66 | 100.0 (100.0–100.0) | – | 80.0 (n = 1) | – | 1 out of bounds, "
         "1 planner failure |\n"
         "\n¹ objective: its own time\n"
@@ -54,6 +54,8 @@ def test_only_columns_that_are_shown_are_explained_each_in_one_sentence() -> Non
     table = table_of(made.rows(made.row(made.trial())))
     assert tuple(heading for heading, _ in table.explained) == table.headings
     assert all(text.endswith(".") for _, text in table.explained)
+    earlier = made.rows(made.row(made.trial())).drop(columns=["planning_ms_p95", "planning_start_ms"])
+    assert "1¶" in table_of(earlier).rows[0]
     without = table_of(made.rows(made.row(made.trial(), planning_ms=np.nan)))
     assert "planning [ms]" not in without.headings
     assert {len(row) for row in without.rows} == {len(without.headings)}

@@ -31,7 +31,8 @@ def made(**changes: object) -> tuple:  # type: ignore[type-arg]
         turn_rate_radps=torch.tensor([[0.0, 0.5, 9, 9], [0.0, 0.1, 0.0, 0.1]]),
         outcome=torch.tensor([Outcome.SUCCESS, Outcome.STUCK]),
         steps=torch.tensor([2, 4]),
-        planning_s=1.6,
+        begin_s=0.6,
+        planning_s=torch.tensor([1.0, 0.2, 0.4, 0.1], dtype=torch.float64),
         errors=("", "late"),
     )
     return problem, episodes
@@ -51,7 +52,10 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
     assert first["path_length_m"] == pytest.approx(7.0)
     assert first["stuck_share"] == pytest.approx(0.5)
     assert first["roughness_radps2"] == pytest.approx(5.0)
-    assert first["planning_ms"] == pytest.approx(1e3 * 1.6 / 8)
+    # Of two robots, one's share; from the second of its own steps on.
+    assert (first["planning_ms"], first["planning_ms_p95"]) == (pytest.approx(100), pytest.approx(100))
+    assert (second["planning_ms"], second["planning_ms_p95"]) == (pytest.approx(100), pytest.approx(190))
+    assert first["planning_start_ms"] == second["planning_start_ms"] == pytest.approx(800)
     assert (first["compiled"], first["error"]) == (True, "")
     assert (second["instance"], second["outcome"], second["success"]) == (9, "stuck", False)
     assert second["total_time_s"] == 70.0

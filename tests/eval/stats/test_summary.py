@@ -165,9 +165,14 @@ def test_a_row_a_trial_in_order_of_appearance() -> None:
 
 def test_planning_time_is_the_median_and_compilation_a_share() -> None:
     found = summary_of(
-        *(row(trial(), i, planning_ms=ms, compiled=i > 0) for i, ms in enumerate((1.0, 2.0, 9.0, 3.0)))
+        *(
+            row(trial(), i, planning_ms=ms, planning_ms_p95=10 * ms, planning_start_ms=-ms, compiled=i > 0)
+            for i, ms in enumerate((1.0, 2.0, 9.0, 3.0))
+        )
     )
     assert found["planning_ms_median"] == 2.5
+    assert found["planning_ms_p95_median"] == 25
+    assert found["planning_start_ms_median"] == -2.5
     assert found["compiled_share"] == 0.75
 
 
