@@ -20,6 +20,8 @@ from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 from benchnav.files import write_text
 
+_CAPTION = "Differences of success and of time between trials that met the same maps under the same luck."
+
 
 def compare_runs(
     folders: Sequence[Path], by: str, against: str, asked: Mapping[str, str], difference: float
@@ -65,7 +67,7 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: ResultTable) -> lis
     texts = {
         ".csv": table.to_csv(index=False, float_format="%.6g"),
         ".md": to_markdown(shown),
-        ".tex": to_latex(shown),
+        ".tex": to_latex(shown, _CAPTION, stem.name),
     }
     paths = [stem.with_name(stem.name + suffix) for suffix in texts]
     for path, text in zip(paths, texts.values(), strict=True):

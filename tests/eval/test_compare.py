@@ -136,7 +136,9 @@ def test_command_prints_and_writes(tmp_path: Path, monkeypatch, capsys) -> None:
     numbers = pd.read_csv(out.with_suffix(".csv"))
     assert list(numbers["one"]) == ["cvar", "var"] * 2
     assert out.with_suffix(".md").read_text().count("\n| ") == 4
-    assert r"\toprule" in out.with_suffix(".tex").read_text()
+    paper = out.with_suffix(".tex").read_text()
+    assert r"\toprule" in paper
+    assert rf"\label{{tab:{out.name}}}" in paper
 
 
 @pytest.mark.parametrize(

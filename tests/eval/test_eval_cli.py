@@ -97,7 +97,7 @@ def test_list_names_every_part_with_its_options(monkeypatch, capsys) -> None:  #
 
 def test_shipped_suites_are_found_by_name_and_have_the_blind_baseline(monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     names = [path.stem for path in SUITES.glob("*.yaml")]
-    assert {"demo", "paper", "stakes"} <= set(names)
+    assert {"demo", "paper", "risk", "severity", "full"} == set(names)
     for name in names:
         assert evaluate(monkeypatch, "run", "--config", name, "--print_config") == 0
         printed = yaml.safe_load(capsys.readouterr().out)

@@ -4,7 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pyarrow.dataset as ds
+
+from benchnav.eval.run.steps import open_steps
 
 _KEYS = ["trial", "seed", "realisation", "instance"]
 _LAST_S = 2.0
@@ -41,16 +44,12 @@ def read_steps(folder: Path, trials: list[str]) -> pd.DataFrame:
         `trial`, `seed`, `realisation`, `instance`, `time_s`, `x_m`, `y_m`, `traversability`, by time.
     """
     columns = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
-    whole, parts = folder / "steps.parquet", folder / "steps"
-    if whole.exists():
-        source = ds.dataset(whole)
-    elif any(parts.glob("*/*.parquet")):
-        source = ds.dataset(parts, partitioning="hive")
-    else:
+    source = open_steps(folder)
+    if source is None:
         return pd.DataFrame({name: pd.Series(dtype=object if name == "trial" else float) for name in columns})
-    if not trials:
-        return source.head(0, columns=columns).to_pandas()
-    return source.to_table(columns=columns, filter=ds.field("trial").isin(trials)).to_pandas()
+    return source.to_table(
+        columns=columns, filter=ds.field("trial").isin(pa.array(trials, pa.string()))
+    ).to_pandas()
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:

@@ -1,6 +1,7 @@
 """Ways of writing a table: Markdown, LaTeX, and text for a terminal."""
 
 import io
+import re
 from collections.abc import Iterable
 
 from benchnav.eval.report.tables import ResultTable
@@ -12,10 +13,11 @@ _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "±": r"$\pm$", "–": "--", "λ": r"$\lambda$",
-    "ω": r"$\omega$", "θ": r"$\theta$", "≥": r"$\geq$", "×": r"$\times$",
+    "ω": r"$\omega$", "θ": r"$\theta$", "≥": r"$\geq$", "×": r"$\times$", "Δ": r"$\Delta$", "−": "$-$",
     "¶": r"\P{}",
 }  # fmt: skip
 _LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
+_MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 _LATEX_WORDS = {"λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$"}
 
 
@@ -35,19 +37,36 @@ def to_markdown(table: ResultTable) -> str:
     return "\n".join([*lines, ""])
 
 
-def to_latex(table: ResultTable) -> str:
-    """Writes a table for LaTeX's `booktabs`, with its notes under it."""
-    numbers = len(table.headings) - table.labels - 1
-    lines = [r"\begin{tabular}{" + "l" * table.labels + "c" * numbers + "l}", r"\toprule"]
-    lines += [_latex_row(map(latex, table.headings)), r"\midrule"]
+def to_latex(table: ResultTable, caption: str, label: str) -> str:
+    """Writes a complete `table*` environment, as wide as the page, with its notes under the table.
+
+    Args:
+        table: labels are set left, all else centred. Needs LaTeX's `booktabs` and nothing else.
+        caption: what the table shows.
+        label: what it is referred to by.
+    """
+    numbers = len(table.headings) - table.labels
+    lines = [
+        r"\begin{table*}[t]",
+        r"  \centering",
+        rf"  \caption{{{latex(caption)}}}",
+        rf"  \label{{tab:{label}}}",
+        r"  \scriptsize",
+        r"  \setlength{\tabcolsep}{3pt}",
+        r"  \begin{tabular}{" + "l" * table.labels + "c" * numbers + "}",
+        r"    \toprule",
+        f"    {_latex_row(map(latex, table.headings))}",
+        r"    \midrule",
+    ]
     for place, row in enumerate(table.rows):
         cells = [
             rf"\textbf{{{latex(cell)}}}" if (place, column) in table.bold else latex(cell)
             for column, cell in enumerate(row)
         ]
-        lines.append(_latex_row(cells))
-    lines += [r"\bottomrule", r"\end{tabular}"]
-    return "\n".join([*lines, *(rf"\par{{\footnotesize {latex(note)}}}" for note in table.notes), ""])
+        lines.append(f"    {_latex_row(cells)}")
+    lines += [r"    \bottomrule", r"  \end{tabular}"]
+    lines += [rf"  \par\smallskip\raggedright {latex(note)}" for note in table.notes]
+    return "\n".join([*lines, r"\end{table*}", ""])
 
 
 def to_terminal(table: ResultTable, width: int | None = None, styled: bool = False) -> str:
@@ -83,7 +102,8 @@ def to_terminal(table: ResultTable, width: int | None = None, styled: bool = Fal
 
 
 def latex(text: str) -> str:
-    """Escapes text for LaTeX."""
+    """Escapes text for LaTeX; a hyphen before a number of its own is a minus."""
+    text = _MINUS.sub("−", text)
     for word, written in _LATEX_WORDS.items():
         before, found, after = text.partition(word)
         if found:

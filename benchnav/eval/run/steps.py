@@ -99,6 +99,21 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
             pq.write_table(pa.table(full), partial, compression="zstd")
 
 
+def open_steps(folder: Path) -> ds.Dataset | None:
+    """Opens the steps of a run, of this or an earlier format version; None where none were kept.
+
+    Args:
+        folder: the run folder.
+    """
+    if (folder / "steps.parquet").exists():
+        return ds.dataset(folder / "steps.parquet")
+    if not any((folder / STEPS).glob("*/*.parquet")):
+        return None
+    # By its type, since an id of digits alone would be taken for a number.
+    parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
+    return ds.dataset(folder / STEPS, partitioning=parts)
+
+
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     """Reads steps of a run, those of earlier format versions too.
 
@@ -118,16 +133,11 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     wanted = {name: _several(value) for name, value in filters.items()}
     if run.trials:
         wanted = _by_trial({i: trial.labels for i, (trial, _) in run.trials.items()}, wanted)
-    earlier, place = folder / "steps.parquet", folder / STEPS
-    if not earlier.exists() and not place.is_dir():
+    source = open_steps(folder)
+    if source is None:
         raise ConfigError(
             f"Expected a run with steps, got {folder} without any. Make them with `--steps all`."
         )
-    if earlier.exists():
-        source = ds.dataset(earlier)
-    else:
-        parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
-        source = ds.dataset(place, partitioning=parts)
     unknown = [name for name in wanted if name not in source.schema.names]
     if unknown:
         raise ConfigError(f"Expected filters among {', '.join(source.schema.names)}, got {unknown[0]!r}.")

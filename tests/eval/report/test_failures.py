@@ -40,6 +40,9 @@ def test_where_and_on_what_failures_ended(parts: bool, tmp_path: Path) -> None:
     rows = made.rows(
         made.row(a, 0), made.row(a, 1, None, outcome="immobilised", end_time_s=3.0), made.row(b, 1, None)
     )
+    rows["trial"] = rows["trial"].where(
+        rows["trial"] != rows["trial"].iloc[0], "0123456789012345"
+    )  # not a number
     names = list(dict.fromkeys(rows["trial"]))
     keep(
         tmp_path,

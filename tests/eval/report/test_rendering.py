@@ -31,6 +31,7 @@ BOLD = replace(
         ("λ̄ and λ̂ and λ", r"$\bar{\lambda}$ and $\hat{\lambda}$ and $\lambda$"),
         ("mppi¹,²", r"mppi\textsuperscript{1},\textsuperscript{2}"),
         ("T_total [s]", r"$T_\mathrm{total}$ {[}s]"),
+        ("Δ -2.7 to +1.0, N-1, cvar-0.5", r"$\Delta$ $-$2.7 to +1.0, N-1, cvar-0.5"),
         ("p ≥ 0.05 ¶", r"p $\geq$ 0.05 \P{}"),
     ],
 )
@@ -39,16 +40,23 @@ def test_latex_escapes(text: str, expected: str) -> None:
 
 
 def test_latex() -> None:
-    assert to_latex(TABLE).splitlines() == [
-        r"\begin{tabular}{lcl}",
-        r"\toprule",
-        r"planner & $\bar{\lambda}$ {[}\%] & failures \\",
-        r"\midrule",
-        r"my\_planner\textsuperscript{1} & 5.0 $\pm$ 1.0 & 2 stuck \\",
-        r"{[}bold] a\textbar{}b \& 50\% & -- & -- \\",
-        r"\bottomrule",
-        r"\end{tabular}",
-        r"\par{\footnotesize \textsuperscript{1} follows $\hat{\lambda}$ \& C:\textbackslash{}\{x\}}",
+    assert to_latex(TABLE, "Over λ̄ & more", "mine").splitlines() == [
+        r"\begin{table*}[t]",
+        r"  \centering",
+        r"  \caption{Over $\bar{\lambda}$ \& more}",
+        r"  \label{tab:mine}",
+        r"  \scriptsize",
+        r"  \setlength{\tabcolsep}{3pt}",
+        r"  \begin{tabular}{lcc}",
+        r"    \toprule",
+        r"    planner & $\bar{\lambda}$ {[}\%] & failures \\",
+        r"    \midrule",
+        r"    my\_planner\textsuperscript{1} & 5.0 $\pm$ 1.0 & 2 stuck \\",
+        r"    {[}bold] a\textbar{}b \& 50\% & -- & -- \\",
+        r"    \bottomrule",
+        r"  \end{tabular}",
+        r"  \par\smallskip\raggedright \textsuperscript{1} follows $\hat{\lambda}$ \& C:\textbackslash{}\{x\}",
+        r"\end{table*}",
     ]
 
 
@@ -79,7 +87,7 @@ def test_bold_cells_and_what_bold_means() -> None:
     lines = to_markdown(BOLD).splitlines()
     assert lines[3] == r"| [bold] a\|b & 50% | **–** | – |"
     assert lines[-3:] == [r"Bold: the best \| all", "", r"- **failures**: how \<it> ended."]
-    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex(BOLD)
+    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex(BOLD, "", "")
     plain = to_terminal(BOLD)
     assert "–*" in plain
     assert plain.count("*") == 2
