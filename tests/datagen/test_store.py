@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.datagen import schema
+from benchnav.datagen import latent, schema
 from benchnav.datagen.generate import generate
-from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.datagen.store import TerrainDataset, find_dataset, terrain_of
 from benchnav.errors import DatasetError
+from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 
 
@@ -75,3 +76,18 @@ def test_bad_requests_are_named(dataset_path: Path) -> None:
     assert dataset.read("train", fields=[]) == {}
     with pytest.raises(DatasetError, match="neither a file"):
         find_dataset("no-such-id")
+
+
+def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
+    """The truth by class, and what looks alike by each twin: single-class settings choose among these."""
+    recipe = small_stakes()
+    terrain = terrain_of(generate(recipe, "train", np.arange(4)), recipe)
+    assert terrain.truth.group == (0, 0)
+    assert terrain.look_alikes is not None
+    seen = terrain.look_alikes(terrain.class_id, terrain.slope_deg)
+    assert seen.group == (0, 0, 1, 1)
+    twins = torch.tensor([len(own) for own in latent.twins(recipe.classes)])[terrain.class_id]
+    assert set(twins.unique().tolist()) == {1, 2}
+    for place, share in enumerate((1 / twins, 1 - 1 / twins)):
+        own = [k for k, group in enumerate(seen.group) if group == place]
+        torch.testing.assert_close(seen.weights[:, own].sum(1), share)

@@ -62,6 +62,7 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(dataset_path: Path,
         {"robot": "differential_drive", "objective": "goal_distance"},
         {"world": {"noise": "stored", "time_budget_s": 1.0}, "goal_radius_m": 6.0},
         {"world": {"preset": "stakes", "time_budget_s": 1.0, "immobile": None}},
+        {"world": {"noise": "stored", "time_budget_s": 1.0, "immobile": {"below": 1.0, "for_s": 0.5}}},
     ],
 )
 def test_each_vector_member_is_the_single_environment_with_its_seed(
@@ -73,8 +74,9 @@ def test_each_vector_member_is_the_single_environment_with_its_seed(
     batch, _ = vector.reset(seed=7)
     alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
     # One is further on, so that they do not end together.
-    vector.unwrapped._batch._now.step[1] += 4
-    singles[1]._batch._now.step[0] += 4
+    for now, member in ((vector.unwrapped._batch._now, 1), (singles[1]._batch._now, 0)):
+        now.step[member] += 4
+        now.held[member] += 2
     generator = np.random.default_rng(0)
     ended, episodes = [False] * 3, 0
     for _ in range(45):

@@ -124,3 +124,13 @@ def test_the_last_ten_seconds_of_an_episode_are_those_before_its_own_end() -> No
     assert told.tolist() == [Outcome.TIMEOUT, Outcome.STUCK]
     told = tell_standstill(outcome, steps, positions, 0.01 * (moved + 1) * (moved == 0), DT_S)
     assert told.tolist() == [Outcome.TIMEOUT, Outcome.STUCK]
+
+
+def test_what_the_wheels_did_after_an_episodes_end_is_not_looked_at() -> None:
+    """Two stand still; one drives against the ground up to its own end, the other does not."""
+    drove = torch.full((2, 300), 0.1)
+    drove[0, 150:] = 0.0
+    drove[1, :] = 0.0
+    outcome, steps = torch.tensor([Outcome.TIMEOUT] * 2), torch.tensor([150, 300])
+    told = tell_standstill(outcome, steps, torch.zeros(2, 301, 2), drove, DT_S)
+    assert told.tolist() == [Outcome.STUCK, Outcome.STALLED]
