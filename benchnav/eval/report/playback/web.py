@@ -20,7 +20,7 @@ _START_S = 60.0
 
 
 def serve(path: Path) -> None:
-    """Serves the viewer with a recording, and prints its address, until it is interrupted.
+    """Serves the viewer with a recording, and prints its address, until it is interrupted or told to end.
 
     Args:
         path: an `.rrd` file.
@@ -33,6 +33,7 @@ def serve(path: Path) -> None:
     command += ["--web-viewer-port", str(page), "--port", str(data)]
     # It has a child of its own, so that both are ended as a group.
     viewer = subprocess.Popen(command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         _wait_for(page, viewer)
         _wait_for(data, viewer)
@@ -45,6 +46,7 @@ def serve(path: Path) -> None:
         with suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGTERM)
         viewer.wait()
+        signal.signal(signal.SIGTERM, before)
 
 
 def _free_port(wanted: int) -> int:

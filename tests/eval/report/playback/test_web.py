@@ -5,23 +5,27 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import urlopen
 
 import psutil
+import pytest
 
 from benchnav.eval.report.playback.files import write_playback
 from benchnav.eval.report.playback.web import HOST, _free_port
 from tests.eval.report import made
 
 
-def test_the_viewer_is_served_here_alone_and_ends_when_it_is_interrupted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_the_viewer_is_served_here_alone_until_it_is_told_to_end(tmp_path: Path, end: signal.Signals) -> None:
     path = write_playback(tmp_path, "one", made.recording(5))
     code = (
         "import sys; from pathlib import Path; from benchnav.eval.report.playback.web import serve; "
         "serve(Path(sys.argv[1]))"
     )
+    family: list[psutil.Process] = []
     process = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -39,12 +43,15 @@ def test_the_viewer_is_served_here_alone_and_ends_when_it_is_interrupted(tmp_pat
         held = {connection.laddr for connection in connections if connection.status == psutil.CONN_LISTEN}
         assert {place.ip for place in held} == {HOST}
         assert {address.port, urlsplit(data.removeprefix("rerun+")).port} <= {place.port for place in held}
-        process.send_signal(signal.SIGINT)
+        process.send_signal(end)
         assert process.wait(60) == 0
         assert not psutil.wait_procs(family, timeout=30)[1]
     finally:
         process.kill()
         process.wait()
+        for member in family:
+            with suppress(psutil.NoSuchProcess):
+                member.kill()
 
 
 def test_a_port_that_is_taken_is_left_alone() -> None:
