@@ -5,6 +5,7 @@ Bad input ends in one line on standard error and exit status 2; an interruption 
 
 import errno
 import inspect
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -91,8 +92,19 @@ def run(
     except OSError as error:
         return _refuse(program, _unusable(error, known[asked]))
     except KeyboardInterrupt:
-        print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
+        print(
+            f"{program}: interrupted; what was finished is kept. The same command goes on, a training with --resume.",
+            file=sys.stderr,
+        )
         return 130
+
+
+def tell(line: str) -> None:
+    """Prints a line on standard error; where no one reads it any more, the work goes on without."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except BrokenPipeError:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
 
 
 def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
@@ -125,7 +137,7 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
     for done, total in steps:
         if done * 10 // total > tenths:
             tenths = done * 10 // total
-            print(f"{what}: {done}/{total}", file=sys.stderr, flush=True)
+            tell(f"{what}: {done}/{total}")
 
 
 def _subparser(command: Command, known: Known) -> Any:

@@ -2,13 +2,14 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
-from benchnav.command import Command, run
+from benchnav.command import Command, run, show_progress, tell
 from benchnav.errors import ConfigError
 
 seen: list[Any] = []
@@ -340,3 +341,27 @@ def test_an_interruption_ends_with_130(capsys: pytest.CaptureFixture[str]) -> No
 
     assert run("x", "Does.", {"stop": Command(stop)}, ["stop"]) == 130
     assert "what was finished is kept" in capsys.readouterr().err
+
+
+class Unread:
+    """A standard error whose reader has gone."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+    def flush(self) -> None:
+        raise BrokenPipeError
+
+
+def test_work_goes_on_where_no_one_reads_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", Unread())
+    reached = []
+
+    def steps() -> Iterator[tuple[int, int]]:
+        for done in range(11):
+            reached.append(done)
+            yield done, 10
+
+    show_progress(steps(), "units")
+    tell("a line more")
+    assert reached == list(range(11))

@@ -5,10 +5,10 @@ test, ours with theirs by Fisher's exact test.
 """
 
 import pandas as pd
-from benchnav.eval.stats.intervals import wilson_interval
 from scipy.stats import binomtest, fisher_exact
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
+from benchnav.eval.stats.summary import wilson_interval
 
 CAUTIOUS, NEUTRAL = "cvar:0.8", "mean"
 _NONE = "–"

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from benchnav.command import Command, run
+from benchnav.command import Command, run, tell
 from benchnav.eval.replay import program, replay
 from benchnav.eval.suite import RENAMED, Suite
 
@@ -204,7 +204,7 @@ def _finish(folder: Path, record: str) -> int:
 
 
 def _say(line: str) -> None:
-    print(f"benchnav-eval: {line}", file=sys.stderr, flush=True)
+    tell(f"benchnav-eval: {line}")
 
 
 def _print(report: "Report", folder: Path) -> None:
@@ -229,8 +229,10 @@ def _print_replay(folder: Path) -> None:
     from benchnav.eval.trial import NOT_USED
 
     every = [trial.labels for trial, _ in open_run(folder).trials.values()]
+    # What looks at a prediction has more to show.
+    shown = next((labels for labels in every if labels["risk"] != NOT_USED), every[0])
     words = ["replay", str(folder)]
-    for name, label in every[-1].items():
+    for name, label in shown.items():
         if label != NOT_USED and (name in ("planner", "scenario") or len({one[name] for one in every}) > 1):
             is_plain = yaml.safe_load(f"[{label}]") == [label]
             words += [f"--{name}", label if is_plain else json.dumps([label])]
@@ -241,12 +243,15 @@ def _failed(folder: Path) -> int:
     """Exit status of a finished run: 1 where a planner or model failed, which one line says."""
     from benchnav.eval.run.folder import EPISODES, ERRORS, read_table
 
-    outcomes = read_table(folder, EPISODES)["outcome"]
-    faults = {kind: int((outcomes == kind).sum()) for kind in ("planner_error", "model_error")}
+    rows = read_table(folder, EPISODES)
+    faults = {kind: int((rows["outcome"] == kind).sum()) for kind in ("planner_error", "model_error")}
     if not any(faults.values()):
         return 0
     counted = " and ".join(f"{count} in {kind}" for kind, count in faults.items() if count)
-    _say(f"episodes that ended by a fault of the code they ran: {counted}; see {folder / ERRORS}")
+    first = rows.loc[rows["outcome"].isin(list(faults)), "error"].iloc[0]
+    _say(
+        f"episodes that ended by a fault of the code they ran: {counted}, the first by {first}; see {folder / ERRORS}"
+    )
     return 1
 
 

@@ -264,7 +264,8 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
         )
     if trials != earlier.trials:
         new = len(trials) - len(earlier.trials)
-        say(f"{folder} is extended: {new} new trials" if new else f"{folder} is extended by more episodes")
+        more = {0: "by more episodes", 1: "by 1 new trial"}.get(new, f"by {new} new trials")
+        say(f"{folder} is extended {more}")
         write_text(folder / RUN, json.dumps(now, indent=1))
     return now, trials
 
@@ -321,6 +322,6 @@ def _notes(trial: Trial) -> dict[str, Any]:
     remarks = getattr(planner, "remarks", None)
     return {
         "follows": str(getattr(planner, "follows", "J")),
-        "remarks": list(remarks(trial.make_task().robot)) if remarks else [],
+        "remarks": list(remarks(trial.make_task())) if remarks else [],
         "changed": changed_options(trial.planner),
     }

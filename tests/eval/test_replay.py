@@ -109,6 +109,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     )
     (line,) = [line for line in printed if line.startswith("replay:  ")]
     words = shlex.split(line.removeprefix("replay:  "))
+    assert "straight" not in words
     assert call(*words[1:], "--view", "false") == 0
     assert (
         call("run", "--data", str(dataset_path), "--out", str(tmp_path / "none"), *SMALL, "--record", "none")

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.report.tables import ResultTable
-from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.comparison import ALPHA, LEAST_MAPS
 from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 
@@ -39,6 +39,7 @@ def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
         "p",
         "Δ T if both arrive [s]",
         "95 %",
+        "on maps",
     )
     rows = [
         (
@@ -68,6 +69,7 @@ def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
         _p(row["time_p_holm"]),
         _signed(row["arrival_time_difference_s"]),
         _range(row["arrival_time_low_s"], row["arrival_time_high_s"]),
+        str(row["arrival_time_n_maps"]),
     )
 
 
@@ -81,6 +83,8 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
         "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
         "interval of Bonett and Price. T_total: a failure counts as T; Wilcoxon's signed-rank test, bootstrap over "
         "maps.",
+        "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "
+        f"where there are fewer than {LEAST_MAPS} maps.",
         "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %; "
         "a dash where they are too few to show any. "
         f"A difference of {points} needs {maps} maps.",

@@ -98,6 +98,11 @@ class Recording:
         last = max(len(self.traversability) - 1, 0)
         return [plan for plan in self.plans if plan.step <= last]
 
+    @property
+    def moment_s(self) -> float:
+        """The moment that figures show: `SNAPSHOT_S`, or half-way where the episode was short."""
+        return min(SNAPSHOT_S, self.end_s / 2)
+
     def plan_at(self, time_s: float) -> DrawnPlan:
         """The last plan that was drawn by a time; an empty one where there is none."""
         due = time_s / self.dt_s + 1e-6
@@ -110,7 +115,7 @@ class Recording:
         Args:
             path: an `.npz` file.
         """
-        moment = self.plan_at(SNAPSHOT_S).step
+        moment = self.plan_at(self.moment_s).step
         plans = [plan if plan.step == moment else thinned(plan) for plan in self.own_plans]
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {_PLANS + name: values for name, values in join_plans(plans).items()}
@@ -157,12 +162,12 @@ class Recording:
             raise ConfigError(f"{path} is damaged: {error}. Remove it; `replay` makes it again.") from error
 
 
-def take_snapshot(recording: Recording, time_s: float = SNAPSHOT_S) -> Snapshot:
+def take_snapshot(recording: Recording, time_s: float | None = None) -> Snapshot:
     """Takes an episode at a moment, or at its last plan where it had ended by then.
 
     Args:
         recording: the episode.
-        time_s: the moment; the last plan that was drawn by then is taken.
+        time_s: the moment; the last plan that was drawn by then is taken. None for that of figures.
     """
     return Snapshot(
         about=recording.about,
@@ -177,7 +182,7 @@ def take_snapshot(recording: Recording, time_s: float = SNAPSHOT_S) -> Snapshot:
         dt_s=recording.dt_s,
         track=recording.states[:, :2],
         traversability=recording.traversability,
-        plan=recording.plan_at(time_s),
+        plan=recording.plan_at(recording.moment_s if time_s is None else time_s),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchnav.eval.report.drawn_plan import DrawnPlan
 
-# Half-way for most episodes; the paper shows 25 s, when robots here have mostly arrived.
+# About half-way for most episodes; the paper shows 25 s, when robots here have mostly arrived.
 SNAPSHOT_S = 15.0
 
 

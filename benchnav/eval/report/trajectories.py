@@ -80,10 +80,11 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
         first = layers * (place // across)
         above, below, *last = panels[first : first + layers, place % across]
         _draw_terrain(above, snapshot)
+        lines = _draw_driven(above, snapshot)
         _draw_predicted(below, snapshot)
+        _draw_black(below, snapshot.track[: snapshot.now + 1])
         for panel in (above, below):
             _draw_plan(panel, snapshot)
-            lines = _draw_driven(panel, snapshot)
             _draw_marks(panel, snapshot, snapshot.track[snapshot.now])
         if snapshot.field is not None:
             _draw_field(last[0], snapshot, snapshot.field)
@@ -121,6 +122,10 @@ def _draw_predicted(panel: Axes, snapshot: Snapshot) -> None:
     panel.imshow(
         snapshot.predicted, origin="lower", extent=extent, cmap=TRAVERSABILITY_COLOURS, vmin=0, vmax=1
     )
+    blind = snapshot.about["model"] == NOT_USED
+    panel.set_title(
+        "E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner", fontsize=9
+    )
     closed = np.where(snapshot.free, np.nan, 1.0)
     panel.imshow(closed, origin="lower", extent=extent, cmap=ListedColormap([_CLOSED]))
 
@@ -135,25 +140,28 @@ def _draw_plan(panel: Axes, snapshot: Snapshot) -> None:
 
 
 def _draw_driven(panel: Axes, snapshot: Snapshot) -> LineCollection:
-    """Draws the path driven by that moment, coloured by the λ met."""
+    """Draws the path driven by that moment over the terrain, coloured by the λ met."""
     driven = snapshot.track[: snapshot.now + 1]
     segments = np.stack((driven[:-1], driven[1:]), axis=1)
     lines = LineCollection(list(segments), cmap=TRAVERSABILITY_COLOURS, linewidths=3, capstyle="round")
     lines.set_array(snapshot.traversability[: snapshot.now])
     lines.set_clim(0, 1)
-    # Edged, since below the map has the same colours.
     panel.plot(*driven.T, color="white", lw=4.6, solid_capstyle="round")
     panel.add_collection(lines)
     lines.set_zorder(2.5)
     return lines
 
 
+def _draw_black(panel: Axes, track: np.ndarray) -> None:
+    """Draws a driven path over a map of λ, whose colours those of the λ met would be lost on."""
+    for colour, width in (("white", 4.0), ("black", 2.2)):
+        panel.plot(*track.T, color=colour, lw=width, solid_capstyle="round")
+
+
 def _draw_field(panel: Axes, snapshot: Snapshot, field: np.ndarray) -> None:
     """Draws λ as it was, and the whole driven path over it."""
     panel.imshow(field_colours(field, snapshot.holding), origin="lower", extent=_extent(snapshot))
-    # In one colour, since the λ met is that of the map.
-    for colour, width in (("white", 4.0), ("black", 2.2)):
-        panel.plot(*snapshot.track.T, color=colour, lw=width, solid_capstyle="round")
+    _draw_black(panel, snapshot.track)
     _draw_marks(panel, snapshot, snapshot.track[-1])
     held = immobilised_at(snapshot.about, snapshot.track)
     if held is not None:
@@ -189,6 +197,7 @@ def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
         Line2D([], [], marker=marker, color=colour, mec="white", ms=size, ls="none", label=name)
         for name, (marker, colour, size) in _MARKS.items()
     ]
+    marks.append(Line2D([], [], color="black", lw=2.2, label="driven; above in the colour of the λ met"))
     lines: list[Artist] = [
         Line2D(
             [], [], color=_looks(style)["colors"], lw=max(_LINE_WIDTH * style.width, 1), label=style.label,
@@ -203,9 +212,13 @@ def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
 def _ground_legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
     """Names what is drawn of the ground."""
     known = [snapshot for snapshot in snapshots if snapshot.field is not None]
-    entries: list[Artist] = [Patch(color=_CLOSED, label="not free")]
+    entries: list[Artist] = []
+    if not all(snapshot.free.all() for snapshot in snapshots):
+        entries.append(Patch(color=_CLOSED, label="not free"))
     if any(snapshot.soft.any() for snapshot in known):
-        entries.append(Patch(fc="0.45", ec=_unit(SOFT), hatch="////", label="soft ground"))
+        entries.append(
+            Patch(fc="0.45", ec=_unit(SOFT), hatch="////", label="soft ground, which does not show")
+        )
     if any(snapshot.holding.any() for snapshot in known):
         entries.append(Patch(color=_unit(HOLDING), label="holds a robot"))
     if any(immobilised_at(snapshot.about, snapshot.track) is not None for snapshot in known):

@@ -203,8 +203,8 @@ def _doubts(trial: Trial, dataset: TerrainDataset) -> list[str]:
     threshold = dataset.recipe.stuck_threshold
     if trial.rules.free_space.above != threshold:
         lines.append(
-            f"the maps of {dataset.id} were made solvable at λ_stuck = {threshold:g}, "
-            f"and ground is free above {trial.rules.free_space.above:g} here"
+            f"each map of {dataset.id} has a way over ground above {threshold:g}, and ground is free above "
+            f"{trial.rules.free_space.above:g} here"
         )
     split = dataset.recipe.splits.get(trial.split)
     if split is not None and not split.solvable:

@@ -89,8 +89,8 @@ def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> l
     ]
     if not pairs:
         raise ConfigError(
-            f"Expected trials that differ in their {by} and in nothing else, got {by} {', '.join(values)}"
-            " of which no two go together. Say what is compared with `--by`."
+            f"Expected two trials or more that differ in their {by} and in nothing else, got {by} "
+            f"{', '.join(values) or NOT_USED}.{_others(trials, by)}"
         )
     families = list(dict.fromkeys(tuple(pair.shared.values()) for pair in pairs))
     return sorted(pairs, key=lambda pair: families.index(tuple(pair.shared.values())))
@@ -110,6 +110,19 @@ def _label_of(trials: Sequence[Compared], against: str) -> str:
     return found[0]
 
 
+def _others(trials: Sequence[Compared], by: str) -> str:
+    """Names the labels in which the trials do differ."""
+    several = {
+        name: labels
+        for name in COMPARED
+        if name != by and len(labels := {trial.labels[name] for trial in trials} - {NOT_USED}) > 1
+    }
+    if not several:
+        return ""
+    told = " and ".join(f"{name} ({', '.join(sorted(labels))})" for name, labels in several.items())
+    return f" They differ in {told}: try `--by {next(iter(several))}`."
+
+
 def _differ_in(one: Compared, other: Compared, by: str) -> bool:
     a, b = one.labels, other.labels
     alike = all(
@@ -127,7 +140,8 @@ def _pair(one: Compared, other: Compared, by: str) -> Pair:
     names = f"{one.labels[by]!r} and {other.labels[by]!r}"
     if one.world != other.world:
         raise ConfigError(
-            f"Expected trials in one world, got {names}, whose λ is not the same: {_difference(one, other)}."
+            f"Expected trials that met the same λ, got {names}, in whose worlds it differs "
+            f"({_difference(one, other)}), so that their episodes are no pairs."
         )
     common = min(len(one.maps), len(other.maps))
     if list(one.maps[:common]) != list(other.maps[:common]):

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 from benchnav.planning.planners.dwa import DWA, DWAConfig, DWAState
 from benchnav.planning.planners.guided import GuideConfig, Guided
-from benchnav.planning.robots import SPEED, TURN_RATE, Robot
+from benchnav.planning.problem import Task
+from benchnav.planning.robots import SPEED, TURN_RATE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +37,6 @@ class AStarDWA(Guided[DWAState]):
         self._dwa = DWA(self.config.dwa)
         super().__init__(self.config, self._dwa)
 
-    def remarks(self, robot: Robot) -> tuple[str, ...]:
-        """Names the accelerations that are not the robot's; see `Planner`."""
-        return self._dwa.remarks(robot)
+    def remarks(self, task: Task) -> tuple[str, ...]:
+        """Names the accelerations that are not the robot's, and paths that no setting moves; see `Planner`."""
+        return (*self._dwa.remarks(task.robot), *super().remarks(task))

@@ -119,7 +119,7 @@ def _unsound_attributes(planner: Any) -> Breaches:
 
 def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
     """Tells what a planner breaks on one batch; stops at what makes the rest meaningless."""
-    yield from _unsound_remarks(planner, problem.robot)
+    yield from _unsound_remarks(planner, problem.task)
     plan_state, found = _begin(planner, problem)
     yield from found
     if plan_state is NOTHING:
@@ -149,10 +149,10 @@ def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
     yield from _compare_blind(planner, problem, steps[0], actions[0])
 
 
-def _unsound_remarks(planner: Any, robot: Robot) -> Breaches:
+def _unsound_remarks(planner: Any, task: Task) -> Breaches:
     if not hasattr(planner, "remarks"):
         return
-    remarks, found = watch("remarks", lambda: planner.remarks(robot))
+    remarks, found = watch("remarks", lambda: planner.remarks(task))
     yield from found
     if remarks is not NOTHING and not (
         isinstance(remarks, tuple) and all(isinstance(line, str) and "\n" not in line for line in remarks)

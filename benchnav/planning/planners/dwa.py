@@ -116,7 +116,7 @@ class DWA:
         return DWAState(problem, velocity)
 
     def remarks(self, robot: Robot) -> tuple[str, ...]:
-        """Names the accelerations of the window where they are not the robot's; see `Planner`."""
+        """Names the accelerations of the window where they are not the robot's."""
         if action_limits(robot) is not None:
             return ()
         config = self.config

@@ -17,7 +17,7 @@ from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.recovery import Recovery, aim, watch
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.planners.waypoint import GroundCosts, choose_waypoint, ground_costs
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, Task
 
 Local = TypeVar("Local")
 
@@ -97,6 +97,15 @@ class Guided(Generic[Local]):
         """Whose objectives it follows."""
         cost = "travel time" if self.guide.by_time else "path length"
         return f"{cost} (A*), J ({self.local.name})"
+
+    def remarks(self, task: Task) -> tuple[str, ...]:
+        """Says where no risk setting moves the path; see `Planner`."""
+        if self.guide.by_time or task.rules.free_space.by != "mean":
+            return ()
+        return (
+            "A* takes the shortest way over free ground, and ground is free by the mean: its path is the same under "
+            f"every risk setting, which moves {self.local.name} alone (by_time: true lets it choose the path)",
+        )
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""

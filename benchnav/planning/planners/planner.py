@@ -93,7 +93,7 @@ class Planner(Protocol[State]):
     - `follows`: whose objective it follows, for tables, where it is not the user's J alone.
     - `blind`: on the class, true where it looks at nothing predicted, so that one run stands for every
       model and risk setting.
-    - `remarks(robot)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
+    - `remarks(task)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
     - `compiled`: whether it runs compiled; None before its first plan.
     """
 

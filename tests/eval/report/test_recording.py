@@ -39,8 +39,9 @@ def test_a_snapshot_is_of_the_recordings_own_ground() -> None:
     assert take_snapshot(made.recording()).field is None
 
 
-def test_fifteen_seconds_is_the_moment() -> None:
+def test_fifteen_seconds_is_the_moment_and_half_way_of_a_short_episode() -> None:
     assert take_snapshot(made.recording(400, 0.1)).time_s == pytest.approx(15)
+    assert take_snapshot(made.recording(200, 0.1)).time_s == pytest.approx(10)
 
 
 def test_plans_after_the_end_are_not_the_episodes_own() -> None:
@@ -86,7 +87,7 @@ def test_a_recording_comes_back_as_it_was(recording: Recording, tmp_path: Path) 
         elif item.name != "plans":
             assert after == before
     # The plan of figures is whole; the others are thinned, as the viewer is given them.
-    moment = recording.plan_at(15.0).step
+    moment = recording.plan_at(recording.moment_s).step
     for before, after in zip(recording.own_plans, again.plans, strict=True):
         expected = before if before.step == moment else thinned(before)
         assert (after.step, set(after.lines)) == (before.step, set(before.lines))

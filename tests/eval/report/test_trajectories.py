@@ -60,6 +60,9 @@ def shown(figure: Figure) -> list:  # type: ignore[type-arg]
     return [axes for axes in figure.axes if axes.get_visible() and axes.get_images()]
 
 
+SOFT_WORDS = "soft ground, which does not show"
+
+
 @pytest.mark.parametrize("count", [1, 3, 6])
 def test_every_snapshot_has_two_panels_of_its_map(count: int) -> None:
     figure = trajectory_figure([snapshot()] * count)
@@ -74,15 +77,19 @@ def test_every_snapshot_has_two_panels_of_its_map(count: int) -> None:
 def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     taken = snapshot()
     above, below = shown(trajectory_figure([taken]))
-    assert above.get_title() == "MPPI, cvar, std 0\nt = 15 s; outcome: out of bounds"
+    now = taken.now
+    assert above.get_title() == f"MPPI, cvar, std 0\nt = {now / 10:g} s; outcome: out of bounds"
     for panel in (above, below):
         lines = [path.vertices for layer in panel.collections for path in layer.get_paths()]
         for layer in taken.plan.lines.values():
             for line in layer:
                 assert any(np.array_equal(line, drawn) for drawn in lines)
-        met = next(layer for layer in panel.collections if layer.get_array() is not None)
-        np.testing.assert_array_equal(met.get_array(), taken.traversability[:150])
-        np.testing.assert_array_equal(met.get_paths()[-1].vertices, taken.track[149:151])
+    (met,) = (layer for layer in above.collections if layer.get_array() is not None)
+    np.testing.assert_array_equal(met.get_array(), taken.traversability[:now])
+    np.testing.assert_array_equal(met.get_paths()[-1].vertices, taken.track[now - 1 : now + 1])
+    # On the map of λ̂ in black, since it has the colours of λ.
+    black = [line for line in below.lines if line.get_color() == "black" and len(line.get_xdata()) > 1]
+    np.testing.assert_array_equal(np.stack(black[0].get_data(), axis=1), taken.track[: now + 1])
     np.testing.assert_array_equal(below.get_images()[0].get_array(), taken.predicted)
     closed = below.get_images()[1].get_array()
     np.testing.assert_array_equal(np.isfinite(np.ma.filled(closed, np.nan)), ~taken.free)
@@ -117,7 +124,7 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
     # Where it was by the moment of the plan is told by the panels above.
     for panel in (above, below):
         assert not [line for line in panel.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
-        assert max(len(line.get_xdata()) for line in panel.lines) == 151
+        assert max(len(line.get_xdata()) for line in panel.lines) == taken.now + 1 < 170
 
 
 def test_soft_ground_is_marked_on_the_terrain_alone() -> None:
@@ -165,7 +172,7 @@ def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
 def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
     def titles(*labels: dict[str, str]) -> list[str]:
         figure = trajectory_figure([snapshot(**one) for one in labels])
-        return [axes.get_title().split("\n")[0] for axes in shown(figure) if axes.get_title()]
+        return [axes.get_title().split("\n")[0] for axes in shown(figure) if "outcome" in axes.get_title()]
 
     blind = {"planner": "straight", "model": "–", "risk": "–"}
     assert titles({}, blind) == ["MPPI, cvar, std 0", "straight, std 0"]
@@ -183,13 +190,13 @@ def names_in_legend(figure: Figure) -> list[str]:
 @pytest.mark.parametrize(
     ("changes", "names"),
     [
-        ({}, ["not free", "soft ground", "holds a robot", "immobilised"]),
+        ({}, ["not free", SOFT_WORDS, "holds a robot", "immobilised"]),
         ({"soft": np.zeros((40, 60), bool)}, ["not free", "holds a robot", "immobilised"]),
-        ({"holding": np.zeros((40, 60), bool)}, ["not free", "soft ground", "immobilised"]),
+        ({"holding": np.zeros((40, 60), bool)}, ["not free", SOFT_WORDS, "immobilised"]),
     ],
 )
 def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: list[str]) -> None:
-    assert names_in_legend(trajectory_figure([held(**changes)]))[3 : 3 + len(names) + 1] == [
+    assert names_in_legend(trajectory_figure([held(**changes)]))[4 : 4 + len(names) + 1] == [
         *names,
         "samples",
     ]
@@ -197,7 +204,18 @@ def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: li
 
 def test_the_legend_names_layers_that_are_there() -> None:
     names = names_in_legend(trajectory_figure([snapshot()]))
-    assert names == ["start", "goal", "robot", "not free", "samples", "reference path", "planned"]
+    marks = ["start", "goal", "robot", "driven; above in the colour of the λ met"]
+    assert names == [*marks, "not free", "samples", "reference path", "planned"]
+    taken = snapshot()
+    everywhere = replace(taken, free=np.ones_like(taken.free))
+    assert "not free" not in names_in_legend(trajectory_figure([everywhere]))
+
+
+def test_whose_map_of_λ_it_is_stands_above_it() -> None:
+    blind = {"planner": "straight", "model": "–", "risk": "–"}
+    *_, given, none = shown(trajectory_figure([snapshot(), snapshot(**blind)]))
+    assert given.get_title() == "λ̂ given to the planner"
+    assert none.get_title() == "E[λ] in truth; the planner is given nothing"
 
 
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:

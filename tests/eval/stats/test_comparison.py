@@ -88,3 +88,11 @@ def test_pairs_of_which_never_both_arrived_have_no_time_of_arrival() -> None:
     (row,) = compare([pair([30.0, 100], [100.0, 30])]).to_dict("records")
     assert np.isnan(row["arrival_time_difference_s"])
     assert row["arrival_time_n_maps"] == 0
+
+
+def test_so_few_maps_have_no_interval_of_time() -> None:
+    few, enough = (compare([pair(A[:n], B[:n])]).iloc[0] for n in (5, 6))
+    for name in ("time_low_s", "time_high_s"):
+        assert np.isnan(few[name])
+        assert np.isfinite(enough[name])
+    assert np.isfinite(few["time_difference_s"])

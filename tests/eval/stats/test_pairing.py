@@ -114,6 +114,11 @@ def test_runs_that_share_trials_are_compared_with_each_other() -> None:
         ({"maps": ["a", "b", "x", "d"]}, {}, "other digests"),
         ({"episodes": [row(trial("mppi", "cvar"), 0, seed=7)]}, {}, "seeds 7, realisations 0 and seeds 0"),
         ({"scenario": "hg"}, {}, "differ in their risk and in nothing else"),
+        (
+            {"risk": "mean", "planner": "cl_rrt"},
+            {},
+            r"They differ in planner \(cl_rrt, mppi\): try `--by planner`",
+        ),
         ({}, {"by": "scenario"}, "other maps"),
         ({}, {"by": "planer"}, "Did you mean 'planner'"),
         ({}, {"against": "meen"}, "Did you mean 'mean'"),
@@ -125,7 +130,7 @@ def test_what_cannot_be_paired_is_refused_with_the_reason(
     changes: dict[str, Any], asked: dict[str, str], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        find_pairs([compared(), compared(risk="cvar", **changes)], **asked)
+        find_pairs([compared(), compared(**{"risk": "cvar", **changes})], **asked)
 
 
 def test_a_shorter_trial_is_paired_on_the_maps_it_met() -> None:

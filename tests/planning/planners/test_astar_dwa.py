@@ -8,6 +8,7 @@ import torch
 
 from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.planners.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.dwa import DWAConfig
 from benchnav.planning.planners.planner import check_steers
@@ -136,8 +137,17 @@ def test_its_settings_are_its_own_and_those_of_dwa() -> None:
 
 
 def test_it_tells_of_accelerations_that_the_robot_does_not_have() -> None:
-    assert AStarDWA().remarks(DifferentialDrive()) == ()
-    assert "0.5 m/s²" in AStarDWA().remarks(Unicycle())[0]
+    assert AStarDWA().remarks(factories.task(DifferentialDrive())) == ()
+    assert "0.5 m/s²" in AStarDWA().remarks(factories.task(Unicycle()))[0]
+
+
+def test_it_tells_where_no_risk_setting_moves_its_path() -> None:
+    by_mean, by_risk = (Rules(free_space=FreeSpace(by=by)) for by in ("mean", "risk"))
+    (remark,) = AStarDWA().remarks(factories.task(DifferentialDrive(), rules=by_mean))
+    assert "by_time" in remark
+    assert AStarDWA().remarks(factories.task(DifferentialDrive(), rules=by_risk)) == ()
+    quick = AStarDWA(AStarDWAConfig(by_time=True))
+    assert quick.remarks(factories.task(DifferentialDrive(), rules=by_mean)) == ()
 
 
 def test_it_refuses_a_robot_that_steers() -> None:

@@ -206,8 +206,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "follows no text": (having(follows=3), "Expected `follows` of type str, got 3"),
     "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "`steers` as tuples of action names"),
     "steers nothing": (having(steers=()), "Expected a robot among those tried that it steers, got none"),
-    "remarks that are no tuple": (having(remarks=lambda self, robot: "slow"), "to give a tuple of single lines"),
-    "remarks that raise": (having(remarks=lambda self, robot: robot.wheels), "from `remarks`, got AttributeError"),
+    "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to give a tuple of single lines"),
+    "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
 }  # fmt: skip
 
 

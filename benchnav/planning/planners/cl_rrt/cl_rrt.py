@@ -43,8 +43,8 @@ from benchnav.planning.planners.cl_rrt.edges import SPACING_M, ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
 from benchnav.planning.planners.cl_rrt.tree import Route, map_tensors, no_route, search
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
-from benchnav.planning.problem import Problem
-from benchnav.planning.robots import SPEED, TURN_RATE, Robot
+from benchnav.planning.problem import Problem, Task
+from benchnav.planning.robots import SPEED, TURN_RATE
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
 
@@ -141,11 +141,11 @@ class CLRRT:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or CLRRTConfig()
 
-    def remarks(self, robot: Robot) -> tuple[str, ...]:
+    def remarks(self, task: Task) -> tuple[str, ...]:
         """Notes for tables; see `Planner`."""
         asked_m, used_m = (
             self.config.follower.lookahead_m,
-            PathFollower(self.config.follower, robot).lookahead_m,
+            PathFollower(self.config.follower, task.robot).lookahead_m,
         )
         if used_m <= asked_m:
             return ()

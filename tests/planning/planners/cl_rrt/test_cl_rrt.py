@@ -485,8 +485,8 @@ def test_what_tables_say_of_it() -> None:
     planner = CLRRT()
     assert planner.steers == (("speed_mps", "turn_rate_radps"),)
     assert planner.follows == "travel time"
-    assert planner.remarks(Unicycle()) == ()
-    assert "looks 1 m ahead" in planner.remarks(DifferentialDrive())[0]
+    assert planner.remarks(factories.task(Unicycle())) == ()
+    assert "looks 1 m ahead" in planner.remarks(factories.task(DifferentialDrive()))[0]
 
 
 @pytest.mark.parametrize(("expansions", "per_round"), [(100, 25), (100, 50), (200, 25)])
