@@ -1,6 +1,7 @@
 """The command `benchnav-datagen`: make, list, show, check, mend, combine, import and draw datasets."""
 
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +10,8 @@ from benchnav.command import Command, run
 
 if TYPE_CHECKING:
     from benchnav.datagen.store import TerrainDataset
+
+_INTERRUPTED = 130  # exit status of `run`
 
 
 def create(
@@ -37,7 +40,7 @@ def create(
 
     from benchnav.command import show_progress
     from benchnav.datagen.create import create as create_dataset
-    from benchnav.datagen.difficulty import table
+    from benchnav.datagen.difficulty import explain, table
     from benchnav.datagen.scenario import load_recipe
     from benchnav.datagen.store import TerrainDataset
     from benchnav.errors import ConfigError
@@ -60,10 +63,13 @@ def create(
         kept = {name: replace(spec, maps=min(first, spec.maps)) for name, spec in chosen.splits.items()}
         chosen = replace(chosen, splits=kept)
     path = Path(out or f"datasets/{chosen.id}.h5").expanduser()
-    show_progress(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite), "maps")
+    show_progress(_tell_kept(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite)), "maps")
     made = TerrainDataset(path)
     _report(made)
-    Console(highlight=False).print(table(made))
+    console = Console(highlight=False)
+    console.print(table(made))
+    for line in explain(made):
+        console.print(line, soft_wrap=True, markup=False)
 
 
 def list_datasets(folder: str = "") -> None:
@@ -83,8 +89,9 @@ def list_datasets(folder: str = "") -> None:
     if folder and not Path(folder).is_dir():
         raise DatasetError(f"Expected `folder` to be one, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
-        print(f"files in {place}:")
-        for path in sorted(place.glob("*.h5")):
+        files = sorted(place.glob("*.h5"))
+        print(f"files in {place}:" if files else f"no files in {place}")
+        for path in files:
             try:
                 dataset = TerrainDataset(path)
             except DatasetError as error:
@@ -283,8 +290,19 @@ def preview(
     print(f"wrote {path}")
 
 
+def _tell_kept(steps: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Passes the steps of `create` on, and says first what a killed run has left of them."""
+    done, total = next(steps)
+    if done:
+        print(f"{done} of {total} maps were there already", file=sys.stderr)
+    yield done, total
+    yield from steps
+
+
 def _report(dataset: "TerrainDataset") -> None:
-    print(f"wrote {dataset.path} ({dataset.path.stat().st_size / 1e6:.1f} MB)")
+    from rich.filesize import decimal
+
+    print(f"wrote {dataset.path} ({decimal(dataset.path.stat().st_size)})")
     for name, split in dataset.splits.items():
         print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
 
@@ -301,10 +319,8 @@ def main() -> None:
         "import-dem": Command(import_dem, ("dem",)),
         "preview": Command(preview, ("file",)),
     }
-    sys.exit(
-        run(
-            "benchnav-datagen",
-            "Make, list, show, check, mend, combine, import and draw terrain datasets.",
-            commands,
-        )
-    )
+    description = "Make, list, show, check, mend, combine, import and draw terrain datasets."
+    status = run("benchnav-datagen", description, commands)
+    if status == _INTERRUPTED and sys.argv[1] == "create":
+        print("benchnav-datagen: to go on, give the same command again", file=sys.stderr)
+    sys.exit(status)

@@ -37,6 +37,8 @@ def create(
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset, yielding (maps done, maps in all) as it goes; to be iterated to the end.
 
+    What comes first is told before anything is made: the maps that a killed run has left, and those in all.
+
     Args:
         recipe: what to make.
         path: file to write.
@@ -64,6 +66,7 @@ def create(
         make = partial(_make_block, recipe, folder)
         there = {span for span in work if _block_path(folder, span).exists()}
         done = sum(stop - start for _, start, stop in there)
+        yield done, total
         with _left_nothing(folder), writing_into(folder, path, recipe.id, [recipe], splits) as write:
             for (split, start, stop), finished in zip(work, run(make, work), strict=True):
                 write(split, Block.load(finished))

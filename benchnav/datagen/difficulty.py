@@ -22,6 +22,16 @@ _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADS = (
     "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
 )  # fmt: skip
+# What columns hold: heading and sentence.
+_EXPLAINED = (
+    ("stuck %", "share of the cells that count as stuck: their true mean λ is at most λ_stuck, {stuck:g}."),
+    ("soft ground %", "share of the cells whose class has soft spots, which no colour shows; 0 where no class has."),
+    ("soft spots %", "share of all ground that is itself a soft spot, on average over draws of λ."),
+    ("time s", "of the fastest path over cells that are not stuck, at 1 m/s times their mean λ: median, least and most "
+     "of the maps. A dash where the recipe does not ask for it with `solvable: true`."),
+    ("straight free", "maps on which the straight line from start to goal meets no stuck cell. Where these are nearly "
+     "all, there is little to plan."),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +127,9 @@ def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.nda
 
 def table(dataset: TerrainDataset) -> Table:
     """Lays out how hard every split of a dataset is, for a terminal."""
-    title = f"what stands in the way (λ_stuck {dataset.recipe.stuck_threshold:g})"
+    title = (
+        f"how hard the maps are: what stands in a robot's way (λ_stuck {dataset.recipe.stuck_threshold:g})"
+    )
     laid = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
     laid.add_column("split", no_wrap=True)
     for head in _HEADS:
@@ -131,6 +143,12 @@ def table(dataset: TerrainDataset) -> Table:
             typical, spread = f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}"
         laid.add_row(split, *shares, typical, spread, f"{found.straight}/{found.maps}")
     return laid
+
+
+def explain(dataset: TerrainDataset) -> list[str]:
+    """Says in plain words what the columns of `table` hold: a line a column."""
+    stuck = dataset.recipe.stuck_threshold
+    return [f"  {heading}: {sentence.format(stuck=stuck)}" for heading, sentence in _EXPLAINED]
 
 
 def _together(pieces: Iterable[Difficulty]) -> Difficulty:

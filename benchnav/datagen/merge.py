@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, is_dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -61,23 +62,35 @@ def merge(
 
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
-    """Gives every reason why datasets cannot be one."""
+    """Gives every reason why datasets cannot be one: a sentence a pair of them, which names both once."""
     prints = [_fingerprints(dataset) for dataset in datasets]
     for one, other in combinations(range(len(datasets)), 2):
         first, second = datasets[one], datasets[other]
-        pair = f"{first.path} and {second.path}"
-        for name in _SHARED:
-            ours, theirs = getattr(first.recipe, name), getattr(second.recipe, name)
-            if ours != theirs:
-                yield f"{pair} have unlike {name}" + ("" if name == "classes" else f" ({ours}, {theirs})")
-        for split in sorted(set(first.splits) & set(second.splits)):
-            if not _kinds(first, split) | _kinds(second, split) <= _kinds(first, split) & _kinds(
-                second, split
-            ):
-                yield f"{pair} have unlike scenarios or `solvable` in split {split!r}"
+        reasons = list(_differences(first, second))
         common = np.intersect1d(prints[one], prints[other])
         if len(common):
-            yield f"{pair} have {len(common)} map(s) in common"
+            reasons.append(f"{len(common)} map(s) in common")
+        if reasons:
+            yield f"{first.path} and {second.path} have {', '.join(reasons)}"
+
+
+def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]:
+    for name in _SHARED:
+        ours, theirs = getattr(first.recipe, name), getattr(second.recipe, name)
+        if ours != theirs:
+            yield f"unlike {name}" + (
+                "" if name == "classes" else f" ({_in_words(ours)} / {_in_words(theirs)})"
+            )
+    for split in sorted(set(first.splits) & set(second.splits)):
+        if not _kinds(first, split) | _kinds(second, split) <= _kinds(first, split) & _kinds(second, split):
+            yield f"unlike scenarios or `solvable` in split {split!r}"
+
+
+def _in_words(value: Any) -> str:
+    """A value of a recipe as its YAML file has it."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return ", ".join(f"{name} {item}" for name, item in asdict(value).items())
+    return "none" if value is None else str(value)
 
 
 def _kinds(dataset: TerrainDataset, split: str) -> set[str]:

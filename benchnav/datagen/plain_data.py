@@ -1,10 +1,12 @@
 """Between dataclasses and the plain data of YAML and JSON."""
 
 import re
+import sys
 from copy import deepcopy
 from typing import Any
 
 from benchnav.errors import ConfigError
+from benchnav.options import hint, list_options
 
 
 def parse(kind: type, data: Any) -> Any:
@@ -26,7 +28,7 @@ def parse(kind: type, data: Any) -> Any:
     except (ArgumentError, TypeError, ValueError) as error:
         # "value" is the parser's name for the whole, not a key that the user wrote.
         message = re.sub(r"\bvalue\.", "", " ".join(str(error).split())).replace("Group 'value'", "It")
-        raise ConfigError(message) from error
+        raise ConfigError(_about_unknown_key(kind, message) or message) from error
 
 
 def plain(value: Any) -> Any:
@@ -34,3 +36,18 @@ def plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     return [plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _about_unknown_key(kind: type, message: str) -> str:
+    """Says which keys there are where the parser met one that it does not know; empty where it met none."""
+    if found := re.fullmatch(r"It does not accept option '([^']+)'", message):
+        owner, name, where = kind, found[1], ""
+    elif found := re.search(r"class_path '([\w.]+)': Option '([^']+)' is not accepted", message):
+        module, _, class_name = found[1].rpartition(".")
+        owner, name = getattr(sys.modules[module], class_name), found[2]
+        place = ".".join(re.findall(r'Parser key "(\w+)"', message[: found.start()]))
+        where = f" of `{place}`" if place else ""
+    else:
+        return ""
+    known = list_options(owner)
+    return f"Expected keys{where} among {', '.join(known)}, got {name!r}.{hint(name, known)}"

@@ -11,7 +11,7 @@ import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -200,6 +200,32 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
+
+
+def training_folder(folder: str | Path) -> Path:
+    """Where the logs of a training stand, and what it needs to go on: beside its checkpoint."""
+    return Path(f"{os.path.normpath(folder)}.training")
+
+
+def refuse_unfinished(folder: str | Path, trained: Collection[str] = ()) -> None:
+    """Refuses a model whose training was interrupted, with how to go on.
+
+    Args:
+        folder: of its checkpoint, whether or not it is there yet.
+        trained: names of the parts that the checkpoint holds.
+
+    Raises:
+        CheckpointError: a part was begun in the folder of logs that the checkpoint lacks.
+    """
+    logs = training_folder(folder)
+    begun = sorted(path.name for path in logs.glob("*") if path.is_dir() and path.name not in trained)
+    if begun:
+        command = "all" if GP in trained else begun[0].partition("-")[0]
+        raise CheckpointError(
+            f"Expected a trained model in {folder}, got one whose training was interrupted: {logs / begun[0]} has not "
+            "come to its end. Go on with the command that began it and --resume, such as "
+            f"`benchnav-train {command} --data DATA --out {folder} --resume`."
+        )
 
 
 def read_config(folder: Path) -> dict[str, Any]:

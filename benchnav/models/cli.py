@@ -1,8 +1,7 @@
 """The command `benchnav-train`: train models and measure them."""
 
-import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -20,6 +19,8 @@ if TYPE_CHECKING:
 
 _HELD_OUT = 0.1  # of slip logs
 _FEW_ROWS = 10  # of a class in slip logs
+_INTERRUPTED = 130  # exit status of `run`
+_RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
 Config = TypeVar("Config", ClassifierConfig, MDNConfig)
 
@@ -186,14 +187,13 @@ def _options(
     out: str, config: Config, trainer: dict[str, Any] | None, resume: bool
 ) -> "tuple[Config, FitOptions]":
     """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
+    from benchnav.models.checkpoint import training_folder
     from benchnav.models.fitting import FitOptions
 
     settings = dict(trainer or {})
     if "max_epochs" in settings:
         config = replace(config, max_epochs=settings.pop("max_epochs"))
-    return config, FitOptions(
-        folder=Path(f"{os.path.normpath(out)}.training"), resume=resume, trainer=settings
-    )
+    return config, FitOptions(folder=training_folder(out), resume=resume, trainer=settings)
 
 
 def _members(count: int) -> list[str]:
@@ -310,27 +310,22 @@ def _train_gp_on_logs(
     data: str, out: str, config: LatentGPConfig, seed: int, options: "FitOptions", overwrite: bool
 ) -> None:
     from benchnav.models.cells import cell_nll, hold_out
-    from benchnav.models.checkpoint import CONFIG, Checkpoint, Part, load_checkpoint
+    from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
     from benchnav.models.slip_logs import read_slip_logs
     from benchnav.models.slope_sums import SlopeSums
     from benchnav.models.target import open_target
     from benchnav.models.training import fit_gps
 
     logs = read_slip_logs(data)
-    there = (Path(out) / CONFIG).is_file()
-    names = load_checkpoint(out).class_names if there else logs.class_names
+    there = load_checkpoint(out) if (Path(out) / CONFIG).is_file() else None
+    names = there.class_names if there else logs.class_names
     cells = logs.cells(names)
     sums = SlopeSums.of(cells, len(names))
     target = open_target(
         Path(out), Checkpoint(class_names=names), ["gp"], f"file:{logs.digest}", options, overwrite
     )
     counts = dict(zip(names, sums.count.tolist(), strict=True))
-    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
-        print(
-            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes "
-            f"({', '.join(few)}); what is predicted of them is little more than the prior",
-            file=sys.stderr,
-        )
+    _warn_of_rows(data, counts, out if there and GP in there.parts else "")
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
         kept, held = hold_out(cells, _HELD_OUT, seed)
@@ -350,6 +345,31 @@ def _train_gp_on_logs(
         data_digest=f"file:{logs.digest}",
     )
     target.add("gp", part)
+
+
+def _warn_of_rows(data: str, counts: Mapping[str, int], replaced: str) -> None:
+    """Names the classes that a file of slip logs says little or nothing of.
+
+    Args:
+        data: the file.
+        counts: rows by class.
+        replaced: the checkpoint whose GPs the new ones replace; empty where there are none.
+    """
+    if missing := [name for name, count in counts.items() if not count]:
+        lost = f", and what {replaced} had learned of them is dropped" if replaced else ""
+        _warn(
+            f"{data} has no rows of {len(missing)} of {len(counts)} classes ({', '.join(missing)}); their GPs become "
+            f"the prior, which is vague{lost}"
+        )
+    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
+        _warn(
+            f"{data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what is predicted of them "
+            "is little more than the prior"
+        )
+
+
+def _warn(line: str) -> None:
+    print(f"benchnav-train: warning: {line}", file=sys.stderr)
 
 
 def _say_soft_modes(model: "LatentGPs", class_names: "Sequence[str]") -> None:
@@ -380,4 +400,9 @@ def main() -> None:
         "mdn": Command(train_mdn),
         "evaluate": Command(evaluate, ("checkpoint",)),
     }
-    sys.exit(run("benchnav-train", "Train and measure models of traversability.", commands))
+    status = run("benchnav-train", "Train and measure models of traversability.", commands)
+    if status == _INTERRUPTED and sys.argv[1] in _RESUMABLE:
+        anew = any(word.startswith("--overwrite") for word in sys.argv)
+        instead = " in place of --overwrite" if anew else ""
+        print(f"benchnav-train: to go on, give the same command with --resume{instead}", file=sys.stderr)
+    sys.exit(status)

@@ -79,7 +79,7 @@ def evaluate(
     if all(quality.classes for quality in qualities.values()):
         by_colour = {split: nearest_colour_accuracy(dataset, split) for split in chosen}
         listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
-        notes.append(f"accuracy of the class of the nearest colour: {listed}")
+        notes.append(f"accuracy of the class of the nearest colour, without a model: {listed}")
         console.print(notes[0], soft_wrap=True)
     about = {
         "model": checkpoint,
@@ -93,6 +93,7 @@ def evaluate(
         write_text(Path(json), report)
         print(f"wrote {json}")
     if not out:
+        print(f"what the columns mean: with --out FOLDER, {PAGE} there says so")
         return
     folder = Path(out)
     write_text(folder / REPORT, report)
@@ -100,11 +101,14 @@ def evaluate(
     for old in (folder / FIGURES).glob("*.png"):
         old.unlink()
     notes += _absent(model, qualities)
-    figures = _save_figures(model, dataset, qualities, maps, folder / FIGURES)
+    name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
+    about_maps = f"model {name} on dataset {dataset.id}"
+    figures = _save_figures(about_maps, model, dataset, qualities, maps, folder / FIGURES)
     write_text(folder / PAGE, quality_markdown(title, qualities, notes, figures))
     for note in notes[len(by_colour) > 0 :]:
         print(note)
     print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(figures)} figures in {out}")
+    print(f"what the columns and figures mean: {folder / PAGE}")
 
 
 def _check_targets(out: str, json: str, overwrite: bool) -> None:
@@ -150,7 +154,12 @@ def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
 
 
 def _save_figures(
-    model: "AnyModel", dataset: "TerrainDataset", qualities: "Mapping[str, Quality]", maps: int, folder: Path
+    title: str,
+    model: "AnyModel",
+    dataset: "TerrainDataset",
+    qualities: "Mapping[str, Quality]",
+    maps: int,
+    folder: Path,
 ) -> list[str]:
     """Draws what applies; returns paths from the page's folder."""
     from benchnav.command import show_progress
@@ -159,7 +168,7 @@ def _save_figures(
     written: list[str] = []
 
     def steps() -> Iterator[tuple[int, int]]:
-        drawn = list(_figures(model, dataset, qualities, maps))
+        drawn = list(_figures(title, model, dataset, qualities, maps))
         for name, draw in drawn:
             save_figure(draw(), folder / f"{name}.png")
             written.append(f"{folder.name}/{name}.png")
@@ -170,13 +179,14 @@ def _save_figures(
 
 
 def _figures(
-    model: "AnyModel", dataset: "TerrainDataset", qualities: "Mapping[str, Quality]", maps: int
+    title: str, model: "AnyModel", dataset: "TerrainDataset", qualities: "Mapping[str, Quality]", maps: int
 ) -> "Iterator[tuple[str, Callable[[], Figure]]]":
     """Names the figures that apply, each with what draws it."""
     from functools import partial
 
     from benchnav.models import figures, map_sheet
     from benchnav.models.quality_report import find_ladders
+    from benchnav.models.quality_words import sheet_name
 
     by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
     by_cell = {split: quality.traversability for split, quality in qualities.items()}
@@ -200,8 +210,8 @@ def _figures(
         ]
         scales = map_sheet.shared_scales(sheets, classes)
         for sheet in sheets:
-            name = f"maps-{sheet.split.replace('/', '-')}"
-            yield name, partial(map_sheet.map_sheet_figure, sheet, scales, classes)
+            draw = partial(map_sheet.map_sheet_figure, sheet, scales, classes, title)
+            yield sheet_name(sheet.split), draw
 
 
 def _slope_table(model: "AnyModel") -> "SlopeTable | None":

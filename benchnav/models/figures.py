@@ -35,6 +35,7 @@ _BLUE, _ORANGE, _GREEN, _PINK, _SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 _COLOURS = (_BLUE, _ORANGE, _GREEN, _PINK, _SKY, "#E69F00", "black")
 _MARKERS = "os^Dv<P"
 _MOST_NUMBERED = 16  # classes; among more, numbers would not fit their cells
+_BAND = "0.82"
 _RARE = 1e-3
 _NO_SOFT = (0.0, 0.0, 1.0)  # weight, mean and standard deviation of no second mode
 _NEAR = 0.01  # to the ideal; finer differences fill no panel
@@ -63,7 +64,8 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
     """
     most = 3 if len(qualities) > 2 else 2
     columns, rows = _grid(len(qualities), most)
-    figure = _figure(columns / most, rows, 2.35 if most == 3 else 3.2, 0.75)
+    names_within = 0.55 if len(qualities) % columns else 0.0  # those of columns, under panels that end above
+    figure = _figure(columns / most, rows, 2.2 if most == 3 else 3.1, 0.7 + names_within)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     labels = [name.replace("_", " ") for name in names]
     palette, image = matplotlib.colormaps["Blues"].with_extremes(bad="0.85"), None
@@ -82,10 +84,13 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
         panel.set_title(f"{split}: accuracy {quality.accuracy:.3f}", size=_TITLE)
         panel.tick_params(labelsize=TEXT - 0.5, length=2, width=0.5, pad=1.5)
     _drop_rest(panels, len(qualities))
+    for panel in panels[:, 0]:
+        panel.set_ylabel("true class", size=TEXT)
     figure.supxlabel("most likely class", size=TEXT)
-    figure.supylabel("true class", size=TEXT)
     if image is not None:
-        bar = figure.colorbar(image, ax=list(panels.flat)[: len(qualities)], fraction=0.02, pad=0.01)
+        # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
+        beside = panels[0, -1].inset_axes((1.04, 0, 0.05, 1))
+        bar = figure.colorbar(image, cax=beside)
         bar.set_label("share of the true class [%]", size=TEXT)
         bar.ax.tick_params(labelsize=TEXT, length=2, width=0.5)
     return figure
@@ -120,9 +125,8 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
             if many.any():
                 points = confidence[many], accuracy[many]
                 upper.plot(*points, "o", ms=3, mfc=fill, mec=_BLUE, mew=0.7, clip_on=False)
-        upper.text(0.96, 0.06, f"ECE {quality.ece:.3f}", size=TEXT, ha="right")
         upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
-        upper.set_title(split, size=_TITLE)
+        upper.set_title(f"{split}: ECE {quality.ece:.3f}", size=_TITLE)
         lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=_SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
@@ -162,21 +166,21 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
 def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     """Draws the histogram of the PIT of λ as it departs from 1, its height for a calibrated model.
 
-    The band holds 90 % of the bins of as many independent, rightly predicted cells.
+    Each panel has a scale of its own, since one bad split would flatten all others. The band holds 90 % of
+    the bins of as many independent, rightly predicted cells.
 
     Args:
         qualities: by split.
     """
     columns, rows = _grid(len(qualities), 3)
-    figure = _figure(columns / 3, rows, 1.75, 0.45)
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    figure = _figure(columns / 3, rows, 1.75, 0.45 if columns == 3 else 0.65)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
     edges = np.linspace(0, 1, PIT_BINS + 1)
-    lowest, highest = 0.95, 1.05
     for panel, (split, quality) in zip(panels.flat, qualities.items(), strict=False):
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
         low, high = (bound / level for bound in binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
-        panel.fill_between([0, 1], low, high, color="0.6", lw=0)
+        panel.fill_between([0, 1], low, high, color=_BAND, lw=0)
         tail = round((1 - LEVEL) * PIT_BINS)
         for bins, colour in ((slice(0, tail), _ORANGE), (slice(tail, None), _SKY)):
             ends = np.append(edges[:-1][bins], edges[1:][bins][-1])
@@ -191,10 +195,11 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
             size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
         )  # fmt: skip
         panel.set_title(split, size=_TITLE)
-        lowest, highest = min(lowest, *(counts / level)), max(highest, *(counts / level))
+        lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
+        room = highest - lowest
+        panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
+        panel.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         _tick(panel)
-    room = highest - lowest
-    panels[0, 0].set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
     _drop_rest(panels, len(qualities))
     figure.supxlabel("PIT of the realised λ", size=TEXT)
     figure.supylabel("density", size=TEXT)
@@ -202,10 +207,12 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         figure,
         [
             Patch(facecolor=_SKY, label="observed"),
-            Patch(facecolor=_ORANGE, label="observed, λ under VaR at level 0.9"),
-            Patch(facecolor="0.6", label="90 % of the bins of a calibrated model"),
+            Patch(facecolor=_ORANGE, label="observed, under VaR at 0.9"),
+            Line2D([], [], color="black", lw=0.7, label="calibrated"),
+            Patch(facecolor=_BAND, label="90 % of a calibrated model's bins"),
             Line2D([], [], color="black", lw=0.7, ls=":", label="central 90 %"),
         ],
+        most=5,
     )
     return figure
 
@@ -386,8 +393,9 @@ def _tick(panel: Axes) -> None:
     panel.spines[:].set_linewidth(0.5)
 
 
-def _legend(figure: Figure, handles: Sequence[Any]) -> None:
-    columns = min(len(handles), 4 if figure.get_figwidth() == WIDTH else 2)
+def _legend(figure: Figure, handles: Sequence[Any], most: int = 4) -> None:
+    """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
+    columns = min(len(handles), most if figure.get_figwidth() == WIDTH else 2)
     figure.legend(
         handles=handles, loc="outside upper center", ncols=columns, fontsize=TEXT, frameon=False,
         handlelength=1.6, columnspacing=1.4,

@@ -137,7 +137,7 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
 
 
 def map_sheet_figure(
-    sheet: MapSheet, scales: dict[str, dict[str, Any]], classes: Sequence[TerrainClass]
+    sheet: MapSheet, scales: dict[str, dict[str, Any]], classes: Sequence[TerrainClass], title: str
 ) -> Figure:
     """Draws a sheet, a row a map and a column a layer; the panel of a layer has the label `LAYER ROW`.
 
@@ -145,6 +145,7 @@ def map_sheet_figure(
         sheet: the maps.
         scales: from `shared_scales`.
         classes: of the dataset.
+        title: which model and dataset; the split follows.
     """
     names = [name for name in TITLES if name in sheet.layers]
     width_m, height_m = sheet.extent_m
@@ -189,7 +190,7 @@ def map_sheet_figure(
             bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             _tick(bar)
             _write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")
-    _write(figure, _LEFT, 0.06, f"split {sheet.split}", size=TEXT + 1, weight="bold", va="top")
+    _write(figure, _LEFT, 0.06, f"{title}, split {sheet.split}", size=TEXT + 1, weight="bold", va="top")
     _write(figure, 0.26, (_TOP + bottom) / 2, "y [m]", rotation=90, ha="center", va="center")
     if shown:
         colours = class_colours(classes)

@@ -18,7 +18,14 @@ from torch import Tensor
 from benchnav import registry
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.checkpoint import CONFIG, Checkpoint, load_checkpoint
+from benchnav.models.checkpoint import (
+    CLASSIFIER,
+    CONFIG,
+    FUSED,
+    Checkpoint,
+    load_checkpoint,
+    refuse_unfinished,
+)
 from benchnav.terrain import Observation, Terrain
 
 if TYPE_CHECKING:
@@ -132,7 +139,10 @@ def load_model(source: Source) -> AnyModel:
     """
     part = _as_part(source)
     if isinstance(part, Path):
-        return open_checkpoint(load_checkpoint(part))
+        checkpoint = load_checkpoint(part)
+        if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
+            refuse_unfinished(part, checkpoint.parts)
+        return open_checkpoint(checkpoint)
     if isinstance(registry.find("model", part.part).target, ModelFamily):
         raise ConfigError(
             f"Expected a model, got {part.part!r}, which is a family of models. "
@@ -168,14 +178,17 @@ def find_checkpoint(source: str | Path) -> Path:
     """Finds the folder of a checkpoint by path, or by name in `checkpoints/` here and in this checkout.
 
     Raises:
-        CheckpointError: the folder holds no checkpoint.
+        CheckpointError: the training of the checkpoint was interrupted.
         ConfigError: there is no such folder, nor a model of that name.
     """
-    for path in (Path(source), *(folder / source for folder in _checkpoint_folders())):
+    places = (Path(source), *(folder / source for folder in _checkpoint_folders()))
+    for path in places:
         if (path / CONFIG).is_file():
             return path
     if Path(source).is_dir():
         return Path(source)  # to be refused by the reader, which says what is missing there
+    for path in places:
+        refuse_unfinished(path)
     known = sorted({*registry.names("model"), *(path.name for path in list_checkpoints())})
     near = registry.hint(str(source), known) or _near_path(Path(source))
     raise ConfigError(

@@ -12,11 +12,13 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import PurePath
 from typing import Any
 
 from rich.table import Table
 
 from benchnav.models.calibration import Quality
+from benchnav.models.quality_words import COLUMNS, caption
 
 Ladders = dict[str, list[tuple[float, str]]]
 
@@ -141,13 +143,13 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 def quality_markdown(
     title: str, qualities: Mapping[str, Quality], notes: Sequence[str], figures: Sequence[str]
 ) -> str:
-    """Writes the numbers as a page with its figures.
+    """Writes the numbers as a page with its figures, and what each column and figure means.
 
     Args:
         title: of the page.
         qualities: by split.
         notes: lines under the table.
-        figures: paths of images from the page.
+        figures: paths of images from the page, each named for what it shows.
     """
     rows = {split: numbers(quality) for split, quality in qualities.items()}
     names = _shown(rows)
@@ -156,8 +158,12 @@ def quality_markdown(
     for split, row in rows.items():
         cells = [split, str(qualities[split].maps), *(_decimal(row.get(name)) for name in names)]
         lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "- **split**: the maps that were measured; their number is under **maps**."]
+    lines += [f"- **{heading}**: {COLUMNS[name]}" for heading, name in zip(headings[2:], names, strict=True)]
     lines += [text for note in notes for text in ("", note)]
-    lines += [text for path in figures for text in ("", f"![{path}]({path})")]
+    for path in figures:
+        heading, text = caption(PurePath(path).stem, qualities)
+        lines += ["", f"![{heading}]({path})", "", f"**{heading}.** {text}"]
     return "\n".join([*lines, ""])
 
 

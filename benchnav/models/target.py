@@ -13,6 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from rich.filesize import decimal
+
 from benchnav.errors import CheckpointError
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -68,9 +70,12 @@ class Target:
         if wanted.items() <= there.items() and (part.seed, part.data_digest) == (seed, self.digest):
             self._forget(name)  # a kill may have come between saving and forgetting
             return True
+        remedy = "pass --overwrite instead of --resume"
+        if self.options.folder and interrupted(self.options.folder, [name]):
+            remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
-            f"{part.seed} and {part.data_id}. Repeat its settings, or pass --overwrite instead of --resume."
+            f"{part.seed} and {part.data_id}. Repeat its settings, or {remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:
@@ -90,7 +95,7 @@ class Target:
         save_checkpoint(self.folder, self.checkpoint)
         size = sum(path.stat().st_size for path in self.folder.iterdir())
         parts = " and ".join(sorted(self.checkpoint.parts))
-        print(f"wrote {self.folder} with {parts} ({size / 1e6:.1f} MB)")
+        print(f"wrote {self.folder} with {parts} ({decimal(size)})")
 
     def _forget(self, name: str) -> None:
         if self.options.folder and is_first_process():

@@ -79,8 +79,8 @@ def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_blocks(tmp_pat
     steps = create(tiny_recipe(train=4000), path, block_maps=20)
     for _ in range(len(finished) - jobs):
         done, total = next(steps)
-    assert total == 4009
-    assert done >= 20 * len(finished)
+        assert total == 4009
+        assert done >= 20 * len(finished)
     # Not carried to the end here; the kept blocks stand untouched.
     steps.close()
     assert all(block.stat().st_mtime_ns == when for block, when in finished.items())
@@ -90,13 +90,15 @@ def test_a_resumed_run_has_the_digest_of_an_unbroken_one(tmp_path: Path) -> None
     recipe = tiny_recipe(train=12)
     broken, whole = tmp_path / "broken.h5", tmp_path / "whole.h5"
     steps = create(recipe, broken, block_maps=4)
-    next(steps)
-    next(steps)
+    assert [next(steps) for _ in range(3)] == [(0, 21), (4, 21), (8, 21)]
     steps.close()
     assert not broken.exists()
     kept = next((tmp_path / ".broken.h5.partial").glob("*.block"))
     content = bytearray(kept.read_bytes())
     content[len(content) // 2] ^= 1
+    resumed = create(recipe, broken, block_maps=4)
+    assert next(resumed) == (8, 21)
+    resumed.close()
     # A block that the disk did not keep whole is made again.
     kept.write_bytes(content)
     assert not Block.is_whole(kept)
@@ -111,6 +113,7 @@ def test_a_resumed_run_has_the_digest_of_an_unbroken_one(tmp_path: Path) -> None
 def test_blocks_of_another_recipe_are_dropped(tmp_path: Path) -> None:
     path = tmp_path / "d.h5"
     steps = create(tiny_recipe(), path, block_maps=4)
+    next(steps)
     next(steps)
     steps.close()
     other = replace(tiny_recipe(), seed=3)

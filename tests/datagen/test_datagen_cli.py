@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchnav.datagen import cli
+from benchnav.datagen.block import Block
 from benchnav.datagen.latent import SoftSpots
 from benchnav.datagen.scenario import load_recipe, shipped_recipes
 from benchnav.datagen.store import TerrainDataset
@@ -146,6 +147,17 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
     ("old", "new", "said"),
     [
         ("seed: 0", "seed: 0\ncraters: 3", "craters"),
+        ("height: 32", "heigth: 32", "got 'heigth'. Did you mean 'height'?"),
+        (
+            "maps: 40",
+            "mapps: 40",
+            "`splits` among scenario, maps, solvable, got 'mapps'. Did you mean 'maps'?",
+        ),
+        (
+            "{preset: hs, relief_m",
+            "{preset: hs, reliefs_m",
+            "got 'reliefs_m'. Did you mean 'relief_m'?",
+        ),
         ("occupancy: [0.3, 0.3, 0.2, 0.2]", "occupancy: [0.3, 0.3, 0.2, 0.1]", "summing to 1"),
         ("crater_count: [1, 2]", "crater_count: [30, 40]", "cover at most 40%"),
         ("crater_radius_m: [1.5, 3.0]", "crater_radius_m: [1.5, 30.0]", "crater_radius_m"),
@@ -239,7 +251,11 @@ def test_a_dataset_with_stakes_from_making_to_mending(datagen: Call, tmp_path: P
     assert datagen("create", "stakes-v1", *changes, "--out", "d.h5") == 0
     made = capsys.readouterr().out
     assert "λ_stuck 0.1" in made
-    assert made.rstrip().splitlines()[-1].split()[0] == "test/hg"
+    last = made.rstrip().splitlines()[-7:]
+    assert last[0].split()[0] == "test/hg"
+    assert [line.partition(":")[0].strip() for line in last[2:]] == [
+        "stuck %", "soft ground %", "soft spots %", "time s", "straight free"
+    ]  # fmt: skip
     assert datagen("show", "d.h5") == 0
     shown = capsys.readouterr().out
     for words in (
@@ -285,6 +301,10 @@ def test_show_of_a_dataset_of_synthesis_1_tells_of_no_soft_spots(datagen: Call, 
         ("correlation_m=9", "`correlation_m`"),
         ("correlation_m=far", "correlation_m"),
         ("occupancy=[1.0]", "`occupancy`"),
+        (
+            "classes.dune_sand.soft.wieght=0.3",
+            "`classes.soft` among weight, mean, std, got 'wieght'. Did you mean 'weight'?",
+        ),
     ],
 )
 def test_bad_stakes_are_one_line(datagen: Call, capsys, change: str, expected: str) -> None:  # type: ignore[no-untyped-def]
@@ -310,6 +330,38 @@ def test_the_first_maps_of_each_split_are_those_of_the_whole(datagen: Call, caps
     assert "`first` ≥ 0" in capsys.readouterr().err
     assert datagen("create", "tiny-v1", "--splits", "[test/hs]", "--first", "9", "--out", "all.h5") == 0
     assert TerrainDataset("all.h5").map_count("test/hs") == 4
+
+
+def test_an_interrupted_create_goes_on_and_says_what_was_there(
+    datagen: Call, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "d.h5")
+    save = Block.save
+
+    def interrupted(self: Block, path: Path) -> None:
+        if path.name.startswith("test"):
+            raise KeyboardInterrupt
+        save(self, path)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Block, "save", interrupted)
+        assert datagen(*asked) == 130
+    assert (
+        capsys.readouterr().err.splitlines()[-1] == "benchnav-datagen: to go on, give the same command again"
+    )
+    assert datagen(*asked) == 0
+    assert capsys.readouterr().err.splitlines()[0] == "10 of 14 maps were there already"
+    assert datagen(*asked, "--overwrite") == 0
+    assert "already" not in capsys.readouterr().err
+
+
+def test_a_folder_without_datasets_is_told(datagen: Call, capsys: pytest.CaptureFixture[str]) -> None:
+    assert datagen("list", "--folder", ".") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "no files in ."
+    assert datagen("create", "tiny-v1", "--splits", "train", "--out", "d.h5") == 0
+    assert " kB)" in capsys.readouterr().out
+    assert datagen("list", "--folder", ".") == 0
+    assert capsys.readouterr().out.splitlines()[-2] == "files in .:"
 
 
 def test_an_override_names_an_item_of_a_list_by_its_name() -> None:

@@ -117,3 +117,13 @@ def test_the_table_fits_a_terminal_and_names_every_split(tmp_path: Path) -> None
     ]  # fmt: skip
     assert train[4:6] == ["-", "-"]
     assert not any("…" in line for line in lines)
+
+
+def test_every_column_is_explained_in_one_line(tmp_path: Path) -> None:
+    dataset = TerrainDataset(tiny_dataset(tmp_path / "d.h5", small_stakes()))
+    explained = [line.strip().partition(": ") for line in difficulty.explain(dataset)]
+    columns = [str(column.header).replace("\n", " ") for column in difficulty.table(dataset).columns]
+    headings = list(dict.fromkeys(column.partition(",")[0] for column in columns[1:]))
+    assert sorted(heading for heading, _, _ in explained) == sorted(headings)
+    assert all(sentence.endswith(".") and "\n" not in sentence for _, _, sentence in explained)
+    assert "λ_stuck, 0.1." in {heading: sentence for heading, _, sentence in explained}["stuck %"]

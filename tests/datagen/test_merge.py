@@ -67,10 +67,13 @@ def test_all_reasons_are_given_at_once(tmp_path: Path) -> None:
     with pytest.raises(DatasetError) as caught:
         run([first, second, first], tmp_path / "m.h5", "no spaces")
     for reason in (
-        r"unlike resolution_m (0.5, 0.6)", "unlike classes", "unlike scenarios or `solvable` in split 'test/hs'",
+        r"unlike resolution_m (0.5 / 0.6)", "unlike classes", "unlike scenarios or `solvable` in split 'test/hs'",
         "10 map(s) in common", "got 'no spaces'",
     ):  # fmt: skip
         assert reason in str(caught.value)
+    # Each pair is named once: (a, b), (a, a) and (b, a).
+    assert str(caught.value).count(f"{first} and {second} have ") == 1
+    assert str(caught.value).count(" have ") == 3
     assert not (tmp_path / "m.h5").exists()
     with pytest.raises(DatasetError, match="fewer than two"):
         run([first], tmp_path / "m.h5")
@@ -92,8 +95,9 @@ def test_maps_made_in_another_way_are_refused(tmp_path: Path) -> None:
         ("synthesis", plain),
     ):
         path = tiny_dataset(tmp_path / "other.h5", only(replace(other, seed=3), "train"))
-        with pytest.raises(DatasetError, match=f"unlike {name} "):
+        with pytest.raises(DatasetError, match=f"unlike {name} ") as caught:
             run([first, path], tmp_path / "n.h5")
+        assert "Rule(" not in str(caught.value)
         path.unlink()
 
 
@@ -126,8 +130,10 @@ def test_what_a_killed_run_made_of_the_same_name_is_kept(tmp_path: Path) -> None
     recipe = tiny_recipe()
     steps = create(recipe, tmp_path / "m.h5", block_maps=4)
     next(steps)
+    next(steps)
     steps.close()
     kept = set((tmp_path / ".m.h5.partial").glob("*.block"))
+    assert kept
     parts = [tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name)) for name in ("train", "valid")]
     run(parts, tmp_path / "m.h5")
     assert kept <= set((tmp_path / ".m.h5.partial").glob("*.block"))

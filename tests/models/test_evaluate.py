@@ -8,6 +8,7 @@ import pytest
 
 from benchnav import registry
 from benchnav.datagen.store import TerrainDataset
+from benchnav.models import map_sheet
 from benchnav.models.baseline import nearest_colour_accuracy
 from benchnav.models.calibration import evaluate
 from benchnav.models.cli import main
@@ -43,6 +44,7 @@ def test_a_table_is_printed_and_nothing_written(
     for value in (quality.classes[0].ece, quality.traversability.nll, quality.traversability.coverage):
         assert f"{value:.4f}" in row
     assert f"test/hs {nearest_colour_accuracy(dataset, 'test/hs'):.4f}" in out
+    assert out.splitlines()[-1] == "what the columns mean: with --out FOLDER, quality.md there says so"
     assert max(map(len, out.splitlines())) <= 124
     assert err.splitlines() == ["splits: 1/2", "splits: 2/2"]
     assert list(tmp_path.iterdir()) == []
@@ -73,14 +75,21 @@ def test_a_folder_holds_report_page_and_figures(
     monkeypatch.setattr("benchnav.models.figures.DPI", 30)
     out = tmp_path / "new" / "quality"
     asked = ["colours", "--data", dataset.path, "--out", out, "--maps", 1]
+    draw, titles = map_sheet.map_sheet_figure, []
+    monkeypatch.setattr(
+        map_sheet, "map_sheet_figure", lambda *given: titles.append(given[-1]) or draw(*given)
+    )
     assert call(monkeypatch, *asked) == 0
+    assert titles == ["model colours on dataset tiny-v1"] * 2
     assert {path.name for path in out.iterdir()} == {"quality.json", "quality.csv", "quality.md", "figures"}
     figures = {path.name for path in (out / "figures").iterdir()}
     assert figures == {
         "confusion.png", "reliability.png", "pit.png", "latent.png",
         "maps-test-std.png", "maps-test-hs.png",
     }  # fmt: skip
-    assert "no ladder" in capfd.readouterr().out
+    printed = capfd.readouterr().out
+    assert "no ladder" in printed
+    assert printed.splitlines()[-1] == f"what the columns and figures mean: {out}/quality.md"
     page = (out / "quality.md").read_text()
     assert all(f"(figures/{name})" in page for name in figures)
     assert "nearest colour" in page

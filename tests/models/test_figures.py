@@ -68,6 +68,21 @@ def test_rows_of_the_confusion_matrix_are_shares_of_the_true_class(qualities: Qu
     ]
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_the_colour_bar_is_as_high_as_the_panel_beside_it(count: int, qualities: Qualities) -> None:
+    quality = qualities["valid"].classes[0]
+    figure = confusion_figure({f"split-{n}": quality for n in range(count)}, ColourModel().class_names)
+    figure.set_dpi(50)
+    figure.draw_without_rendering()
+    beside = panel(figure, f"split-{min(count, 3) - 1}")
+    (bar,) = [axes for axes in (*figure.axes, *beside.child_axes) if axes.get_ylabel().startswith("share")][
+        :1
+    ]
+    square, drawn = beside.get_window_extent(), bar.get_window_extent()
+    assert (drawn.y0, drawn.y1) == pytest.approx((square.y0, square.y1))
+    assert drawn.x0 > square.x1
+
+
 def test_the_reliability_diagram_shows_the_curve_and_the_cells(qualities: Qualities) -> None:
     by_class = {split: quality.classes[0] for split, quality in qualities.items()}
     figure = reliability_figure(by_class)
@@ -77,7 +92,8 @@ def test_the_reliability_diagram_shows_the_curve_and_the_cells(qualities: Qualit
     axes = panel(figure, "test/hs")
     drawn = line(axes, color="#0072B2", linestyle="-")
     np.testing.assert_allclose(drawn, [np.array(curve.confidence)[often], np.array(curve.accuracy)[often]])
-    assert any(f"{by_class['test/hs'].ece:.3f}" in text.get_text() for text in axes.texts)
+    assert axes.get_title() == f"test/hs: ECE {by_class['test/hs'].ece:.3f}"
+    assert not axes.texts  # nothing is written where a curve may run
     bars = [axes for axes in figure.axes if len(axes.patches) == len(cells)]
     assert len(bars) == len(by_class)
     np.testing.assert_allclose([bar.get_height() for bar in bars[1].patches], cells / cells.sum())
@@ -98,9 +114,16 @@ def test_the_pit_departs_from_one_by_its_counts(qualities: Qualities) -> None:
     (text,) = [text.get_text() for text in axes.texts]
     assert f"{quality.coverage:.3f}" in text
     assert f"{quality.tail_rate:.3f}" in text
-    low, high = axes.get_ylim()
-    assert low < density.min()
-    assert high > density.max()
+    for split, one in qualities.items():
+        axes = panel(figure, split)
+        density = np.array(one.traversability.pit) * 20 / sum(one.traversability.pit)
+        low, high = axes.get_ylim()
+        # Each panel is filled by its own histogram: a bad split does not flatten the others.
+        assert low < density.min()
+        assert high > density.max()
+        assert high - low == pytest.approx(1.6 * (max(density.max(), 1.05) - min(density.min(), 0.95)))
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "calibrated" in labels
 
 
 def test_the_ladder_draws_quality_over_severity(qualities: Qualities) -> None:

@@ -50,7 +50,9 @@ def test_what_a_model_has_not_is_not_drawn(dataset: TerrainDataset) -> None:
     assert "information" not in single.layers
     sheet = read_sheet(Oracle(), dataset, "valid", [0])
     assert set(sheet.layers) == {"rgb", "expected_true", "expected", "error", "width"}
-    figure = map_sheet_figure(sheet, shared_scales([sheet], dataset.recipe.classes), dataset.recipe.classes)
+    figure = map_sheet_figure(
+        sheet, shared_scales([sheet], dataset.recipe.classes), dataset.recipe.classes, ""
+    )
     assert not figure.legends
     figure.set_dpi(20)
     figure.draw_without_rendering()
@@ -70,7 +72,7 @@ def test_a_quantity_has_one_scale_in_all_sheets(dataset: TerrainDataset) -> None
 def test_panels_show_their_layers_in_rows_of_maps(dataset: TerrainDataset) -> None:
     classes = dataset.recipe.classes
     sheet = read_sheet(ColourModel(), dataset, "test/std", [1, 0])
-    figure = map_sheet_figure(sheet, shared_scales([sheet], classes), classes)
+    figure = map_sheet_figure(sheet, shared_scales([sheet], classes), classes, "model m on dataset d")
     for name, layer in sheet.layers.items():
         for row in range(2):
             image = panel(figure, f"{name} {row}").images[0]
@@ -78,7 +80,7 @@ def test_panels_show_their_layers_in_rows_of_maps(dataset: TerrainDataset) -> No
             assert image.origin == "lower"
             assert image.get_extent() == [0, sheet.extent_m[0], 0, sheet.extent_m[1]]
     texts = {text.get_text() for text in figure.texts}
-    assert {"split test/std", "map 1", "map 0", "Mutual information"} <= texts
+    assert {"model m on dataset d, split test/std", "map 1", "map 0", "Mutual information"} <= texts
     image = panel(figure, "class_true 0").images[0]
     drawn = image.cmap(image.norm(sheet.layers["class_true"][0]))[..., :3]
     np.testing.assert_allclose(drawn, class_colours(classes)[sheet.layers["class_true"][0]], atol=1 / 255)
@@ -93,7 +95,7 @@ def test_panels_show_their_layers_in_rows_of_maps(dataset: TerrainDataset) -> No
 def test_nothing_stands_outside_the_sheet(maps: int, dataset: TerrainDataset) -> None:
     classes = dataset.recipe.classes
     sheet = read_sheet(ColourModel(), dataset, "valid", range(maps))
-    figure = map_sheet_figure(sheet, shared_scales([sheet], classes), classes)
+    figure = map_sheet_figure(sheet, shared_scales([sheet], classes), classes, "model m on dataset d")
     figure.set_dpi(50)
     figure.draw_without_rendering()
     box = figure.get_tightbbox()

@@ -1,12 +1,15 @@
 import json
+import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from benchnav.datagen.store import TerrainDataset
-from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models import cli
+from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.cli import main
 from benchnav.models.data import read_maps
@@ -59,6 +62,7 @@ def test_halves_are_trained_into_one_checkpoint(
     assert "validation RMSE of the latent mean" in out
     assert "validation accuracy" in out
     assert "wrote new/mine with classifier and gp" in out
+    assert re.search(r"wrote new/mine with gp \(\d+\.\d kB\)", out)
     assert [line.split(":")[0] for line in err.strip().splitlines()] == ["gp", "classifier"], err
     there = load_checkpoint("new/mine")
     assert set(there.parts) == {"classifier", "gp"}
@@ -155,6 +159,59 @@ def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
         assert len(told) == (name == "few")
         if told:
             assert "few.csv has fewer than 10 rows of some classes (mud 1, sand 1)" in told[0]
+
+
+def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_dropped(
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    folder = shutil.copytree(checkpoint_path, tmp_path / "mine")
+    names = load_checkpoint(folder).class_names
+    rows = "".join(f"{name},{slope},0.8\n" for name in names[2:] for slope in range(12))
+    Path(tmp_path, "logs.csv").write_text("class,slope_deg,traversability\n" + rows)
+    command = ["gp", "--data", tmp_path / "logs.csv", "--out", folder, *QUICK_GP]
+    assert call(monkeypatch, *command, "--overwrite") == 0
+    first, *rest = capfd.readouterr().err.splitlines()
+    assert f"no rows of 2 of 10 classes ({names[0]}, {names[1]}); their GPs become the prior" in first
+    assert f"what {folder} had learned of them is dropped" in first
+    assert not any("warning" in line for line in rest)
+
+    there = load_checkpoint(folder)
+    save_checkpoint(tmp_path / "alone", replace(there, parts={"classifier": there.part("classifier")}))
+    assert call(monkeypatch, *command[:4], tmp_path / "alone", *QUICK_GP) == 0
+    err = capfd.readouterr().err
+    assert "no rows of 2 of 10 classes" in err
+    assert "dropped" not in err
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (["all"], "benchnav-train: to go on, give the same command with --resume"),
+        (
+            ["classifier", "--overwrite"],
+            "benchnav-train: to go on, give the same command with --resume in place of --overwrite",
+        ),
+        (["mdn"], "benchnav-train: to go on, give the same command with --resume"),
+        (["gp"], "benchnav-train: interrupted; what was finished is kept"),
+    ],
+)
+def test_an_interruption_says_how_to_go_on(
+    command: list[str],
+    expected: str,
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_open_dataset", interrupted)
+    assert call(monkeypatch, *command, "--data", dataset.path, "--out", tmp_path / "c") == 130
+    assert capfd.readouterr().err.splitlines()[-1] == expected
 
 
 def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(

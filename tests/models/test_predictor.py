@@ -15,7 +15,7 @@ from benchnav.datagen.store import TerrainDataset
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models import fused
-from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import (
     Oracle,
@@ -183,6 +183,31 @@ def test_a_model_is_found_by_file_or_module_with_its_options(place: str) -> None
         mixture = predict(load_model(source), terrain)
         assert torch.equal(mixture.means, torch.full((2, 1, 16, 16), mean))
         assert torch.equal(mixture.stds, torch.full((2, 1, 16, 16), std))
+
+
+@pytest.mark.usefixtures("_own_file")
+def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_on(
+    checkpoint_path: Path,
+) -> None:
+    whole = load_checkpoint(checkpoint_path)
+    half = replace(whole, parts={"gp": whole.part("gp")})
+    save_checkpoint("checkpoints/killed", half)
+    with pytest.raises(CheckpointError, match="a part 'classifier'"):
+        load_model("killed")
+    for folder in ("killed.training/classifier", "first.training/mdn", "whole.training/classifier"):
+        Path("checkpoints", folder).mkdir(parents=True)
+    for source, command in (
+        ("killed", "all --data DATA --out checkpoints/killed --resume"),
+        ("checkpoints/killed/", "all --data DATA --out checkpoints/killed --resume"),
+        ("first", "mdn --data DATA --out checkpoints/first --resume"),
+    ):
+        with pytest.raises(CheckpointError, match="training was interrupted") as caught:
+            load_model(source)
+        assert f"`benchnav-train {command}`" in str(caught.value)
+    # A finished training has left its logs; a member that joins an ensemble may still be trained.
+    Path("checkpoints/whole.training/classifier-2").mkdir()
+    save_checkpoint("checkpoints/whole", whole)
+    assert isinstance(load_model("whole"), FusedModel)
 
 
 @pytest.mark.usefixtures("_own_file")

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from benchnav.datagen.store import TerrainDataset
 from benchnav.models.calibration import Quality, evaluate
+from benchnav.models.evaluate import _figures
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality_report import (
     HEADINGS,
@@ -19,6 +20,7 @@ from benchnav.models.quality_report import (
     quality_markdown,
     quality_table,
 )
+from benchnav.models.quality_words import COLUMNS, caption
 
 from .stub import ColourModel
 
@@ -90,7 +92,8 @@ def test_what_there_is_not_is_left_out_or_dashed(qualities: Qualities, dataset: 
     assert f"{oracle['valid'].traversability.crps:.4f}" in page
     nameless = replace(qualities["valid"].classes[0], entropy_auroc=float("nan"))
     mixed = {**qualities, "valid": replace(qualities["valid"], classes=(nameless,))}
-    assert "–" in quality_markdown("title", mixed, [], []).splitlines()[-1]
+    (row,) = [line for line in quality_markdown("title", mixed, [], []).splitlines() if "| valid |" in line]
+    assert "–" in row
 
 
 def test_json_holds_everything_and_nothing_that_is_no_json(qualities: Qualities) -> None:
@@ -134,9 +137,39 @@ def test_csv_leaves_a_number_that_there_is_not_empty(qualities: Qualities) -> No
 
 
 def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
-    lines = quality_markdown("title", qualities, ["a note"], ["figures/pit.png"]).splitlines()
+    figures = ["figures/pit.png", "figures/maps-test-hs-050.png"]
+    lines = quality_markdown("title", qualities, ["a note"], figures).splitlines()
     assert lines[0] == "# title"
     header, rule, *rows = [line for line in lines if line.startswith("|")]
     assert len({line.count("|") for line in (header, rule, *rows)}) == 1
     assert len(rows) == len(qualities)
-    assert {"a note", "![figures/pit.png](figures/pit.png)"} <= set(lines)
+    images = ["![Whether the predicted distribution of λ can be trusted](figures/pit.png)"]
+    images.append("![Maps of test/hs-050](figures/maps-test-hs-050.png)")
+    assert {"a note", *images} <= set(lines)
+    for image in images:
+        under = lines[lines.index(image) + 2]
+        assert under.startswith(f"**{image[2 : image.index(']')]}.** ")
+        assert under.endswith(".")
+
+
+def test_every_column_of_the_page_is_explained_and_no_other(
+    qualities: Qualities, dataset: TerrainDataset
+) -> None:
+    assert set(COLUMNS) == set(HEADINGS)
+    oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
+    for measured in (qualities, oracle):
+        lines = quality_markdown("title", measured, [], []).splitlines()
+        headings = [cell.strip() for cell in lines[2].strip("|").split("|")]
+        explained = [line[4:].partition("**: ") for line in lines if line.startswith("- **")]
+        assert [heading for heading, _, _ in explained] == [h for h in headings if h != "maps"]
+        assert all(sentence.endswith(".") for _, _, sentence in explained)
+
+
+def test_every_figure_has_a_caption(dataset: TerrainDataset, qualities: Qualities) -> None:
+    named = [
+        name
+        for name, _ in _figures("m on d", ColourModel(), dataset, dict(evaluate(ColourModel(), dataset)), 1)
+    ]
+    assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(named)
+    captions = [caption(name, dataset.splits) for name in (*named, "ladder")]
+    assert len({title for title, _ in captions}) == len(captions)

@@ -92,6 +92,20 @@ def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(tmp_path: Path)
         target.holds("gp", {"width": 3}, 0)
 
 
+def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(tmp_path: Path) -> None:
+    folder = there(tmp_path / "m", "classifier")
+    with pytest.raises(CheckpointError, match=r"pass --overwrite instead of --resume\."):
+        start(folder, ["classifier"], resume=True).holds("classifier", {"width": 4}, 0)
+    state = tmp_path / "m.training" / "classifier" / STATE
+    state.parent.mkdir(parents=True)
+    state.write_text("what a kill has left")
+    with pytest.raises(CheckpointError, match="pass --overwrite with --resume to go on"):
+        start(folder, ["classifier"], resume=True).holds("classifier", {"width": 4}, 0)
+    target = start(folder, ["classifier"], resume=True, overwrite=True)
+    assert not target.holds("classifier", {"width": 4}, 0)
+    assert state.exists()
+
+
 def test_replacing_a_classifier_drops_its_whole_ensemble_and_keeps_the_rest(tmp_path: Path) -> None:
     folder = there(tmp_path / "m", "gp", "classifier", "classifier-2")
     assert set(start(folder, ["classifier"], overwrite=True).checkpoint.parts) == {"gp"}
