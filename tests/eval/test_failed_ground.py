@@ -31,7 +31,7 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     }
     suite = Suite(
         data=str(dataset_path), scenarios=("std",), model="oracle", planners=("tests.eval.parts:Faulty",),
-        risks=("cvar",), world=world, instances=2, seeds=(0, 1), recorded=0,
+        risks=("cvar",), world=world, instances=2, seeds=(0, 1), record="none",
     )  # fmt: skip
     for _ in run_suite(suite, made):
         pass

@@ -7,7 +7,8 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.report.tables import ResultTable
-from benchnav.eval.stats.comparison import ALPHA, LEAST_MAPS
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.difference import LEAST_MAPS
 from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 

@@ -26,7 +26,8 @@ def convert_rows(episodes: pd.DataFrame, about: Mapping[str, Any]) -> pd.DataFra
     return episodes.drop(columns="roughness").assign(
         trial=trial, data=about["dataset"]["id"], model=suite["model"], robot="unicycle",
         objective="goal_distance", world=world["label"], seed=suite["seed"], realisation=0, score=np.nan,
-        roughness_radps2=episodes["roughness"] / _DT_S, planning_ms=np.nan, compiled=np.nan, error="",
+        roughness_radps2=episodes["roughness"] / _DT_S, planning_ms=np.nan,
+        planning_ms_p95=np.nan, planning_start_ms=np.nan, compiled=np.nan, error="",
     )  # fmt: skip
 
 

@@ -17,7 +17,6 @@ from benchnav.eval.stats.pairing import Pair
 from benchnav.eval.stats.power import maps_needed, smallest_difference
 
 ALPHA = 0.05
-LEAST_MAPS = 6  # for a bootstrap over them
 
 
 def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
@@ -81,7 +80,4 @@ def _late(rows: pd.DataFrame) -> np.ndarray:
 
 def _intervals(late: Sequence[np.ndarray], name: str) -> pd.DataFrame:
     columns = [f"{name}_difference_s", f"{name}_low_s", f"{name}_high_s"]
-    table = pd.DataFrame(dict(zip(columns, mean_intervals(late), strict=True)))
-    few = [len(values) < LEAST_MAPS for values in late]
-    table.loc[few, columns[1:]] = np.nan
-    return table
+    return pd.DataFrame(dict(zip(columns, mean_intervals(late), strict=True)))

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import binom, bootstrap, t, wilcoxon
 
+LEAST_MAPS = 6  # for a bootstrap over them
+
 _RESAMPLES = 9_999
 # Indices of resamples that are held at once, for a vectorised bootstrap within some 50 MB.
 _HELD = 3_000_000
@@ -118,7 +120,8 @@ def mean_intervals(values: Sequence[np.ndarray]) -> np.ndarray:
         values: N of them, each of shape [M], M its own.
 
     Returns:
-        Means, lower and upper ends, shape [3, N]; NaN where there are no maps.
+        Means, lower and upper ends, shape [3, N]; NaN where there are no maps. Under `LEAST_MAPS` maps there is a
+        mean and no interval.
     """
     made = np.full((3, len(values)), np.nan)
     sizes = np.array([len(one) for one in values])
@@ -126,6 +129,7 @@ def mean_intervals(values: Sequence[np.ndarray]) -> np.ndarray:
         alike = sizes == size
         rows = [one for one, same in zip(values, alike, strict=True) if same]
         made[:, alike] = mean_interval(np.stack(rows))
+    made[1:, sizes < LEAST_MAPS] = np.nan
     return made
 
 

@@ -32,7 +32,7 @@ def test_a_unit_stays_in_its_shard_whatever_else_is_run() -> None:
     before = {unit.path: shard_of(unit, 5) for unit in some_units()}
     # A last block that is not full, another setting, another order, recordings.
     more = [
-        replace(unit, recorded=1)
+        replace(unit, keep=Keep(record="all"))
         for unit in reversed(some_units(risks=("cvar", "var", "mean"), instances=110))
     ]
     after = {unit.path: shard_of(unit, 5) for unit in more}

@@ -33,7 +33,8 @@ def serve(path: Path) -> None:
     command += ["--web-viewer-port", str(page), "--port", str(data)]
     # It has a child of its own, so that both are ended as a group.
     viewer = subprocess.Popen(command, env={**os.environ, "RUST_LOG": "error"}, start_new_session=True)
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Also where Ctrl-C was ignored, as in a process that a script started in the background.
+    before = {one: signal.signal(one, signal.default_int_handler) for one in (signal.SIGINT, signal.SIGTERM)}
     try:
         _wait_for(page, viewer)
         _wait_for(data, viewer)
@@ -46,7 +47,8 @@ def serve(path: Path) -> None:
         with suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGTERM)
         viewer.wait()
-        signal.signal(signal.SIGTERM, before)
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def _free_port(wanted: int) -> int:
