@@ -29,7 +29,7 @@ def compare_runs(
     """Compares the trials of runs pair by pair.
 
     Args:
-        folders: finished runs, of format version 2.
+        folders: finished runs, of format version 2 or later.
         by: label in which trials differ; see `pairing.find_pairs`.
         against: what all others are compared with; all pairs when empty.
         asked: labels of the trials that are looked at, several with a comma between; all when not named.

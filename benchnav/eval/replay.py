@@ -74,6 +74,12 @@ def replay(
         show_progress(write_video(_recordings(Path(folder), found), Path(video)), "frames")
         print(f"video:   {video}")
         return 0
+    worlds = dict.fromkeys(unit.trial.labels["world"] for unit, _ in found)
+    if len({repr(unit.trial.world) for unit, _ in found}) > 1:
+        raise ConfigError(
+            f"Expected trials in one world to show on one map, got {', '.join(worlds)}. A video shows them side by "
+            "side: --video FILE.mp4."
+        )
     path = _viewer_file(Path(folder), found)
     print(f"recording: {path}")
     if web:

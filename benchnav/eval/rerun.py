@@ -18,7 +18,7 @@ from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run import provenance
 from benchnav.eval.run.check import check_everywhere
 from benchnav.eval.run.check_world import Say
-from benchnav.eval.run.folder import EPISODES, FORMAT_VERSION, Run, open_run, read_table
+from benchnav.eval.run.folder import EPISODES, FORMAT_VERSION, RUN, Run, open_run, read_table
 from benchnav.eval.run.keep import Keep
 from benchnav.eval.run.sameness import KEYS, Difference, differences, differing_columns
 from benchnav.eval.runner import Work, Workers, run_work
@@ -67,6 +67,11 @@ def rerun(
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
     _check_there(run)
+    if not overwrite and (folder / RUN).exists() and set(open_run(folder).trials) != set(run.trials):
+        raise ConfigError(
+            f"Expected `out` to be new or an earlier rerun of {run_folder}, but {folder} has other trials. Choose "
+            "another `out`."
+        )
     if workers.elsewhere or run.about["planner_limit_s"]:
         check_everywhere(trial for trial, _ in run.trials.values())
     limit_s = run.about["planner_limit_s"]

@@ -11,7 +11,7 @@ import traceback
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import chdir, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,13 @@ from benchnav.eval.run.episode import (
     time_budgets,
 )
 from benchnav.eval.run.folder import (
+    EPISODES,
     FORMAT,
     FORMAT_VERSION,
     RUN,
     about_unit,
     has_all,
+    kept,
     merge_tables,
     open_run,
     write_errors,
@@ -146,7 +148,12 @@ def run_work(
         every = units(trials, work.keep)
         own = [unit for unit in every if work.shard is None or work.shard.has(unit)]
         known = [(unit, about_unit(folder, unit, about["run_id"])) for unit in own]
-        missing = [unit for unit, found in known if not has_all(found, unit)]
+        # With what it has kept, so that a run is never the poorer for being asked for more.
+        missing = [
+            replace(unit, keep=unit.keep.joined(kept(folder, unit, about["run_id"])))
+            for unit, found in known
+            if not has_all(found, unit)
+        ]
         done = len(own) - len(missing)
         if done:
             say(f"{done} of {len(own)} units were there already")
@@ -266,6 +273,7 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
         new = len(trials) - len(earlier.trials)
         more = {0: "by more episodes", 1: "by 1 new trial"}.get(new, f"by {new} new trials")
         say(f"{folder} is extended {more}")
+        (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
         write_text(folder / RUN, json.dumps(now, indent=1))
     return now, trials
 

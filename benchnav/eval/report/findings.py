@@ -58,13 +58,14 @@ def _sentences(
 ) -> Iterable[str]:
     rivals = rows[competing(rows)]
     best = rivals[rivals["trial"] == rivals["best"].iloc[0]].to_dict("records")[0]
-    others = rivals[rivals["trial"] != best["trial"]].sort_values(
-        "success_rate", ascending=False, kind="stable"
-    )
+    others = rivals[rivals["trial"] != best["trial"]].sort_values("best_difference", kind="stable")
     yield (
         f"The highest success rate is that of {names[best['trial']]}: {_rate(best)} of its episodes reached the goal "
         f"(95 % interval {100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
     )
+    common = int(best["best_episodes"])
+    if not others.empty and (rivals["n_episodes"] > common).any():
+        yield f"The settings are compared on the {common} episodes that all of them have."
     yield from _rank(best, others, names)
     yield from _why(best, names, failures, told)
     count = int(rivals["n_episodes"].sum())
@@ -87,7 +88,7 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
     alike, apart = others[others["best_alike"]], others[~others["best_alike"]]
     if alike.empty:
         other = "the other setting" if len(apart) == 1 else f"each of the {len(apart)} other settings"
-        yield f"It is told apart from {other}: it is the best of this run."
+        yield f"It is told apart from {other}: it is the best here."
     elif len(alike) == 1:
         yield f"One other setting cannot be told from it (p ≥ 0.05): {names[alike['trial'].iloc[0]]}."
     else:
@@ -99,11 +100,9 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
         )
     comparisons = "1 comparison" if len(others) == 1 else f"{len(others)} comparisons"
     if apart.empty:
-        shown = others["best_shown"].min()
+        shown = others["best_shown"].max()
         seen = (
-            ""
-            if np.isnan(shown)
-            else f" So many maps show a difference from about {100 * shown:.0f} points on."
+            f" So many maps show a difference from about {100 * shown:.0f} points on." if shown <= 1 else ""
         )
         yield f"No setting is told apart from it, so the run does not say which is best.{seen}"
         return
@@ -141,7 +140,8 @@ def _why(
 
 
 def _rate(row: Mapping[Any, Any]) -> str:
-    return f"{100 * row['success_rate']:.0f} %"
+    # Never 100 % of what failed once, nor 0 % of what once arrived.
+    return f"{100 * row['success_rate']:.1f}".removesuffix(".0") + " %"
 
 
 def _shares(outcomes: pd.Series) -> str:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from benchnav.eval.report.charts.panels import blocks
 from benchnav.eval.report.figures import display_name
-from benchnav.eval.report.rendering import latex
+from benchnav.eval.report.rendering import latex, latex_label
 from benchnav.eval.report.tables import bold_note
 from benchnav.eval.trial import NOT_USED
 
@@ -37,7 +37,7 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
             rf"\begin{{table{wide}}}[t]",
             r"  \centering",
             rf"  \caption{{{_caption(summary)} {note}}}",
-            rf"  \label{{tab:{label}}}",
+            rf"  \label{{tab:{latex_label(label)}}}",
             r"  \footnotesize",
             r"  \setlength{\tabcolsep}{4pt}",
             "\n  \\par\\medskip\n".join(tabulars),

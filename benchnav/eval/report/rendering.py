@@ -13,7 +13,8 @@ _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "±": r"$\pm$", "–": "--", "λ": r"$\lambda$",
-    "ω": r"$\omega$", "θ": r"$\theta$", "≥": r"$\geq$", "×": r"$\times$", "Δ": r"$\Delta$", "−": "$-$",
+    "ω": r"$\omega$", "θ": r"$\theta$", "α": r"$\alpha$", "ε": r"$\varepsilon$", "σ": r"$\sigma$", "µ": r"$\mu$",
+    "≥": r"$\geq$", "≤": r"$\leq$", "×": r"$\times$", "→": r"$\to$", "·": r"$\cdot$", "Δ": r"$\Delta$", "−": "$-$",
     "¶": r"\P{}",
 }  # fmt: skip
 _LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
@@ -50,7 +51,7 @@ def to_latex(table: ResultTable, caption: str, label: str) -> str:
         r"\begin{table*}[t]",
         r"  \centering",
         rf"  \caption{{{latex(caption)}}}",
-        rf"  \label{{tab:{label}}}",
+        rf"  \label{{tab:{latex_label(label)}}}",
         r"  \scriptsize",
         r"  \setlength{\tabcolsep}{3pt}",
         r"  \begin{tabular}{" + "l" * table.labels + "c" * numbers + "}",
@@ -109,6 +110,11 @@ def latex(text: str) -> str:
         if found:
             return latex(before) + written + latex(after)
     return "".join(_LATEX.get(character, character) for character in text)
+
+
+def latex_label(text: str) -> str:
+    """A name that LaTeX can refer to."""
+    return re.sub(r"[^A-Za-z0-9.:_-]+", "-", text)
 
 
 def markdown(text: str) -> str:

@@ -29,7 +29,7 @@ class Sheets:
     Args:
         shown: of each block its title and the lines of its sheet.
         told: by trial λ̂ where its failed episodes ended, shape [N].
-        left_out: why there is no sheet; empty where there is one, or nothing failed.
+        left_out: why sheets are missing; empty where none is, or nothing failed.
     """
 
     shown: tuple[tuple[str, tuple[Shown, ...]], ...]
@@ -55,10 +55,12 @@ def collect_sheets(
         why = "No sheet of failures: the run kept no steps of them." if asked else ""
         return Sheets(shown=(), told={}, left_out=why)
     several = ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
-    shown, told = [], {}
-    try:
-        for title, rows in blocks(summary)[:_MOST_BLOCKS]:
-            lines = []
+    shown, told, left_out = [], {}, []
+    if len(every := blocks(summary)) > _MOST_BLOCKS:
+        left_out.append(f"Sheets of failures are of the first {_MOST_BLOCKS} of {len(every)} blocks.")
+    for title, rows in every[:_MOST_BLOCKS]:
+        lines = []
+        try:
             for row in _looked_at(rows):
                 own = placed[placed["trial"] == row["trial"]].head(_MOST_FAILURES).reset_index(drop=True)
                 if own.empty:
@@ -67,19 +69,20 @@ def collect_sheets(
                 told[row["trial"]] = ground.told(own[["x_m", "y_m"]].to_numpy())
                 count = int((failures["trial"] == row["trial"]).sum())
                 lines.append(_line(folder, trial_name(row, several), own, ground, count))
-            if lines:
-                shown.append((title, tuple(lines)))
-    except (BenchnavError, OSError) as error:
-        return Sheets(shown=(), told={}, left_out=f"No sheet of failures: {error}")
-    return Sheets(shown=tuple(shown), told=told, left_out="")
+        except (BenchnavError, OSError) as error:
+            left_out.append(f"No sheet of failures: {error}")
+            continue
+        if lines:
+            shown.append((title, tuple(lines)))
+    return Sheets(shown=tuple(shown), told=told, left_out=" ".join(dict.fromkeys(left_out)))
 
 
 def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """The best of a block, and the worst that looks at a prediction."""
-    best = rows["best"].iloc[0]
+    """The best of a block and the worst, of those that look at a prediction."""
     seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
+    best = seeing.loc[seeing["trial"] == seeing["best"], "trial"]
     worst = seeing.sort_values("success_rate", kind="stable")["trial"].head(1)
-    for trial in dict.fromkeys([best, *worst]):
+    for trial in dict.fromkeys([*best, *worst]):
         (row,) = rows[rows["trial"] == trial].to_dict("records")
         yield {str(name): value for name, value in row.items()}
 

@@ -260,10 +260,10 @@ def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
             *(f"- {markdown(said)}" for said in finding.sentences),
             "",
         ]
-    lines += ["## Results", "", *(f"- {line}" for line in (*report.header, *report.warnings)), ""]
+    lines += ["## Results", "", *(f"- {markdown(line)}" for line in (*report.header, *report.warnings)), ""]
     lines += [to_markdown(report.table)]
     for drawn in figures:
-        lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", drawn.caption, ""]
+        lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", markdown(drawn.caption), ""]
     return "\n".join(
         [*lines, "Commands:", "", *(f"    {command}" for command in report.about["commands"]), ""]
     )

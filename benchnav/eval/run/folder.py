@@ -118,13 +118,23 @@ def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, An
 
 def about_unit(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
     """What is known of a unit; None where this run has not finished it for the instances it now has."""
+    about = _about(folder, unit, run_id)
+    return about if about and about.get("instances") == list(unit.instances) else None
+
+
+def kept(folder: Path, unit: Unit, run_id: str) -> Keep:
+    """What this run has kept of a unit beside its rows, perhaps of fewer instances; nothing where it has not run."""
+    about = _about(folder, unit, run_id)
+    return Keep(**about["keep"]) if about else Keep()
+
+
+def _about(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
     try:
         metadata = pq.read_schema(folder / unit.path).metadata or {}
     except (OSError, ValueError):
         return None
-    about = json.loads(metadata.get(_METADATA, b"{}"))
-    own = about.get("run_id") == run_id and about.get("instances") == list(unit.instances)
-    return about if own else None
+    about: dict[str, Any] = json.loads(metadata.get(_METADATA, b"{}"))
+    return about if about.get("run_id") == run_id else None
 
 
 def has_all(about: Mapping[str, Any] | None, unit: Unit) -> bool:

@@ -51,8 +51,15 @@ class Keep:
         """Whether a unit that was run to keep this has all that the other asks for."""
         return _includes(self.record, other.record) and _includes(self._stored, other._stored)
 
+    def joined(self, other: "Keep") -> "Keep":
+        """What has all that either asks for."""
+        record, stored = _joined(self.record, other.record), _joined(self._stored, other._stored)
+        if stored == record:
+            return Keep(record=record, steps="recorded" if stored != "none" else "none")
+        return Keep(record=record, steps="none" if stored == "none" else "all")
+
     @property
-    def _stored(self) -> str:
+    def _stored(self) -> Record:
         return self.record if self.steps == "recorded" else self.steps
 
     def to_dict(self) -> dict[str, str]:
@@ -66,6 +73,12 @@ def _chosen(rule: str, succeeded: Sequence[bool]) -> list[int]:
     if rule == "failures":
         return [member for member in every if not succeeded[member]]
     return list(every[: {"none": 0, "first": 1, "all": None}[rule]])
+
+
+def _joined(rule: Record, other: Record) -> Record:
+    if _includes(rule, other):
+        return rule
+    return other if _includes(other, rule) else "all"
 
 
 def _includes(rule: str, other: str) -> bool:

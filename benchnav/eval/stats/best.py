@@ -1,6 +1,6 @@
 """The best trial of each block of a run, and which others the paired test does not tell from it."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,8 +42,9 @@ def competing(rows: pd.DataFrame, told: Collection[str] = TOLD) -> pd.Series:
 def against_best(episodes: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
     """Compares the best trial of each block with all others that compete, map by map.
 
-    The best has the highest success rate and, of several, the least mean T_total. Holm's correction is over
-    the others of its block.
+    All of them on the episodes that they have in common, so that one which was run on more maps is not judged by
+    others. The best has the highest success rate there and, of several, the least mean T_total. Holm's correction
+    is over the others of its block.
 
     Args:
         episodes: rows of episodes.
@@ -51,36 +52,44 @@ def against_best(episodes: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         A row a trial, in the order of the summary: `trial`; `best`, the trial that is the best of its block;
-        `best_rivals`, how many others compete; `best_difference`, by how much the best's success rate is higher,
-        with its 95 % interval `_low`, `_high`; `best_p_holm`; `best_shown`, the smallest difference that so many
-        maps show with a chance of 80 %; and `best_alike`, true where the best is not told from it. NaN and false
-        where a trial does not compete, NaN and true for the best itself.
+        `best_rivals`, how many others compete; `best_episodes`, of each of them in common; `best_difference`, by how
+        much the best's success rate is higher, with its 95 % interval `_low`, `_high`; `best_p_holm`; `best_shown`,
+        the smallest difference that so many maps show with a chance of 80 %; and `best_alike`, true where the best is
+        not told from it. NaN and false where a trial does not compete, NaN and true for the best itself.
     """
     groups = dict(list(episodes.groupby("trial", sort=False)))
     found: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
-        rivals = rows[competing(rows)]
-        order = rivals.sort_values(
-            ["success_rate", "total_time_mean_s"], ascending=[False, True], kind="stable"
+        rivals = _in_common({trial: groups[trial] for trial in rows.loc[competing(rows), "trial"]})
+        best, *others = sorted(
+            rivals, key=lambda trial: (-rivals[trial]["success"].mean(), rivals[trial]["total_time_s"].mean())
         )
-        best, *others = order["trial"]
         alpha = ALPHA / max(len(others), 1)
-        compared = [_compare(groups[best], groups[other], alpha) for other in others]
+        compared = [_compare(rivals[best], rivals[other], alpha) for other in others]
         p = [one["best_p_holm"] for one in compared]
         corrected = multipletests(p, ALPHA, method="holm")[1] if p else []
         for other, one, value in zip(others, compared, corrected, strict=True):
             found.append({"trial": other, **one, "best_p_holm": value, "best_alike": bool(value >= ALPHA)})
-        left_out = rows.loc[~rows["trial"].isin(order["trial"]), "trial"]
+        left_out = rows.loc[~rows["trial"].isin(list(rivals)), "trial"]
         found += [
             {"trial": best, "best_alike": True},
             *({"trial": one, "best_alike": False} for one in left_out),
         ]
-        for one in found[-len(rows) :]:
-            one |= {"best": best, "best_rivals": len(others)}
-    columns = ["trial", "best", "best_rivals", "best_difference", "best_low", "best_high"]
+        for entry in found[-len(rows) :]:
+            entry |= {"best": best, "best_rivals": len(others), "best_episodes": len(rivals[best])}
+    columns = ["trial", "best", "best_rivals", "best_episodes", "best_difference", "best_low", "best_high"]
     columns += ["best_p_holm", "best_shown", "best_alike"]
     table = pd.DataFrame(found).reindex(columns=columns)
     return summary[["trial"]].merge(table, on="trial", how="left", validate="1:1")
+
+
+def _in_common(trials: Mapping[str, pd.DataFrame]) -> Mapping[str, pd.DataFrame]:
+    """Episodes of trials under the luck that all of them met; all of each where there is none."""
+    met = [set(rows[_LUCK].itertuples(index=False, name=None)) for rows in trials.values()]
+    common = pd.DataFrame(sorted(set.intersection(*met)), columns=_LUCK)
+    if common.empty:
+        return trials
+    return {trial: rows.merge(common, on=_LUCK) for trial, rows in trials.items()}
 
 
 def _compare(best: pd.DataFrame, other: pd.DataFrame, alpha: float) -> dict[str, float]:
@@ -90,9 +99,10 @@ def _compare(best: pd.DataFrame, other: pd.DataFrame, alpha: float) -> dict[str,
     if both.empty:
         return {"best_p_holm": 1.0}  # no map in common: nothing tells them apart
     draws = both.groupby("instance")["success"].transform("size")
-    both = both[draws == draws.max()]
+    count = int(draws.mode().max())  # as many draws as most episodes have
+    both = both[draws == count]
     gain = both["success"].astype(int) - both["success_other"].astype(int)
-    by_map, count = gain.groupby(both["instance"]).sum().to_numpy(), int(draws.max())
+    by_map = gain.groupby(both["instance"]).sum().to_numpy()
     if len(by_map) < 2:
         return {"best_difference": float(by_map.mean()) / count, "best_p_holm": sign_flip_p(by_map)}
     difference, low, high = (float(value) for value in success_interval(by_map, count))

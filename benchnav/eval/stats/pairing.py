@@ -153,7 +153,7 @@ def _pair(one: Compared, other: Compared, by: str) -> Pair:
             f"Expected trials with episodes in common, got {names} with {_luck(one)} and {_luck(other)}."
         )
     draws = both.groupby("instance")["success"].transform("size")
-    both = both[draws == draws.max()]
+    both = both[draws == draws.mode().max()]  # maps with as many draws as most episodes have
     left_out = len(one.episodes) + len(other.episodes) - 2 * len(both)
     shared = {
         name: other.labels[name] if one.labels[name] == NOT_USED else one.labels[name]

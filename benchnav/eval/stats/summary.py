@@ -101,7 +101,7 @@ def summarise(episodes: pd.DataFrame) -> pd.DataFrame:
     """Summarises each trial, in the order in which trials first appear.
 
     Args:
-        episodes: rows of episodes, format version 2.
+        episodes: rows of episodes, format version 2 or later.
 
     Returns:
         A row a trial: `trial` and its labels; `n_episodes`, `n_maps`; `success_rate` with Wilson's interval

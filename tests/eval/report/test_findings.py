@@ -35,7 +35,7 @@ def test_a_best_that_is_told_apart_from_all_others() -> None:
         "The highest success rate is that of MPPI, cvar:0.9: 90 % of its episodes reached the goal (95 % interval "
         "83 to 94 %)."
     )
-    assert sentences[1] == "It is told apart from each of the 2 other settings: it is the best of this run."
+    assert sentences[1] == "It is told apart from each of the 2 other settings: it is the best here."
     assert sentences[2].startswith(
         "The next is MPPI, mean with 40 %: the difference is 50.0 points (95 % interval "
     )
@@ -65,11 +65,33 @@ def test_several_that_cannot_be_told_from_it_are_named_up_to_six() -> None:
     assert "So many maps show a difference from about " in sentences[2]
 
 
+def test_the_interval_is_that_of_the_difference_and_the_power_that_of_the_hardest_pair() -> None:
+    summary = summary_of(trial(40, risk="mean"), trial(90, risk="cvar"))
+    row = summary[summary["risk"] == "mean"].iloc[0]
+    low, high = 100 * row["best_low"], 100 * row["best_high"]
+    told = findings(summary, NONE)[0].sentences[2]
+    assert f"(95 % interval {low:.1f} to {high:.1f})" in told
+    alike = summary_of(trial(90, risk="a"), trial(89, risk="b"), [*trial(87, risk="c")])
+    shown = 100 * alike["best_shown"].max()
+    assert alike["best_shown"].min() < alike["best_shown"].max()
+    assert f"from about {shown:.0f} points on" in findings(alike, NONE)[0].sentences[2]
+
+
+def test_settings_that_were_run_on_unlike_maps_are_said_to_be_compared_on_those_they_share() -> None:
+    sentences = said(trial(90, risk="a"), trial(10, of=40, risk="b"))
+    assert sentences[1] == "The settings are compared on the 40 episodes that all of them have."
+    assert not any("compared on" in line for line in said(trial(90, risk="a"), trial(10, risk="b")))
+
+
+def test_a_rate_is_not_rounded_to_all() -> None:
+    assert "99.6 % of its episodes" in said(trial(249, of=250))[0]
+
+
 def test_a_single_setting_and_two() -> None:
     alone = said(trial(100))
     assert alone[1:] == ["There is no other setting to compare it with.", "It never failed."]
     two = said(trial(90, risk="a"), trial(10, risk="b"))
-    assert two[1] == "It is told apart from the other setting: it is the best of this run."
+    assert two[1] == "It is told apart from the other setting: it is the best here."
     assert two[2].endswith("after Holm's correction over 1 comparison.")
 
 

@@ -3,6 +3,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from benchnav.errors import BenchnavError
 from benchnav.eval.report.charts.failure_sheet import Ground
@@ -66,6 +67,14 @@ def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
     # What the planner was told is that of all failures, shown or not.
     assert set(sheets.told) == {trials["cvar"], trials["mean"]}
     np.testing.assert_allclose(sheets.told[trials["mean"]], np.arange(2, 10) / 100)
+
+
+def test_a_planner_that_is_told_nothing_has_no_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in RATES:  # the blind line, which fails on all, is then as good
+        monkeypatch.setitem(RATES, name, 0)
+    sheets, trials = collected(tmp_path, ground_of)
+    assert trials["–"] not in sheets.told
+    assert all("straight" not in line.name for _, lines in sheets.shown for line in lines)
 
 
 def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:

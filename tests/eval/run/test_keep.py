@@ -53,6 +53,11 @@ def test_a_unit_that_kept_more_has_all_that_less_asks_for() -> None:
             )
         )
         assert one.covers(other) == has, (one, other)
+        joined = one.joined(other)
+        assert joined.covers(one)
+        assert joined.covers(other)
+        if one.covers(other):
+            assert joined == one or (joined.covers(one) and one.covers(joined))
 
 
 @pytest.mark.parametrize(

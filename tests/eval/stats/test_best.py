@@ -75,6 +75,35 @@ def test_maps_are_paired_under_the_same_luck() -> None:
     assert compared(one, few).loc["three", "best_difference"] == pytest.approx(1)
 
 
+def test_what_was_run_on_more_maps_is_judged_by_those_that_all_have() -> None:
+    """On the first maps the one wins, in all of its own it has the lower rate."""
+    more = [made.row(made.trial(risk="more"), i, 30.0 if i < 10 else None) for i in range(40)]
+    less = [made.row(made.trial(risk="less"), i, 30.0 if i < 5 else None) for i in range(10)]
+    found = compared(more, less)
+    assert set(found["best"]) == {found.loc["more", "trial"]}
+    assert list(found["best_episodes"]) == [10, 10]
+    assert found.loc["less", "best_difference"] == pytest.approx(0.5)
+
+
+def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
+    trials = [episodes(made.trial(risk="a"), range(29)), episodes(made.trial(risk="b"), range(5))]
+    again = [[made.row(made.trial(risk=risk), 0, 30.0, seed=5)] for risk in "ab"]
+    plain, with_one = compared(*trials), compared(*trials, *again)
+    # Of 30 maps the one that has two draws is left out, not the 29 that have one.
+    assert with_one.loc["b", "best_difference"] == pytest.approx(24 / 29)
+    assert not with_one.loc["b", "best_alike"]
+    assert plain.loc["b", "best_difference"] == pytest.approx(24 / 30)
+
+
+def test_the_difference_that_can_be_shown_is_at_the_level_of_the_first_step() -> None:
+    two = compared(episodes(made.trial(risk="a"), range(20)), episodes(made.trial(risk="b"), range(10)))
+    more = [episodes(made.trial(risk=f"r{n}"), range(10)) for n in range(6)]
+    many = compared(
+        episodes(made.trial(risk="a"), range(20)), episodes(made.trial(risk="b"), range(10)), *more
+    )
+    assert many.loc["b", "best_shown"] > two.loc["b", "best_shown"]
+
+
 @pytest.mark.parametrize(
     ("models", "left"),
     [
