@@ -17,6 +17,8 @@ from benchnav.arguments import Known, explain, know, spell
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.options import hint
 
+INTERRUPTED = 130
+
 
 @dataclass(frozen=True)
 class Command:
@@ -92,11 +94,8 @@ def run(
     except OSError as error:
         return _refuse(program, _unusable(error, known[asked]))
     except KeyboardInterrupt:
-        print(
-            f"{program}: interrupted; what was finished is kept. The same command goes on, a training with --resume.",
-            file=sys.stderr,
-        )
-        return 130
+        print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
+        return INTERRUPTED
 
 
 def tell(line: str) -> None:

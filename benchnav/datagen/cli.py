@@ -6,12 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchnav.command import Command, run
+from benchnav.command import INTERRUPTED, Command, run
 
 if TYPE_CHECKING:
     from benchnav.datagen.store import TerrainDataset
-
-_INTERRUPTED = 130  # exit status of `run`
 
 
 def create(
@@ -321,6 +319,6 @@ def main() -> None:
     }
     description = "Make, list, show, check, mend, combine, import and draw terrain datasets."
     status = run("benchnav-datagen", description, commands)
-    if status == _INTERRUPTED and sys.argv[1] == "create":
+    if status == INTERRUPTED and sys.argv[1] == "create":
         print("benchnav-datagen: to go on, give the same command again", file=sys.stderr)
     sys.exit(status)

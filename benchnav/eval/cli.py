@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from benchnav.command import Command, run, tell
+from benchnav.command import INTERRUPTED, Command, run, tell
 from benchnav.eval.replay import program, replay
 from benchnav.eval.suite import RENAMED, Suite
 
@@ -276,8 +276,8 @@ def main() -> None:
         "merge": Command(merge, ("out", "parts")),
         "rerun": Command(rerun, ("folder",)),
     }
-    sys.exit(
-        run(
-            "benchnav-eval", "Evaluate planners under risk settings; report, replay, merge, repeat.", commands
-        )
-    )
+    description = "Evaluate planners under risk settings; report, replay, merge, repeat."
+    status = run("benchnav-eval", description, commands)
+    if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
+        _say("to go on, give the same command again")
+    sys.exit(status)

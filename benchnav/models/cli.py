@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from benchnav.command import Command, run
+from benchnav.command import INTERRUPTED, Command, run
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig
 from benchnav.models.evaluate import evaluate
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 _HELD_OUT = 0.1  # of slip logs
 _FEW_ROWS = 10  # of a class in slip logs
-_INTERRUPTED = 130  # exit status of `run`
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
 Config = TypeVar("Config", ClassifierConfig, MDNConfig)
@@ -401,7 +400,7 @@ def main() -> None:
         "evaluate": Command(evaluate, ("checkpoint",)),
     }
     status = run("benchnav-train", "Train and measure models of traversability.", commands)
-    if status == _INTERRUPTED and sys.argv[1] in _RESUMABLE:
+    if status == INTERRUPTED and sys.argv[1] in _RESUMABLE:
         anew = any(word.startswith("--overwrite") for word in sys.argv)
         instead = " in place of --overwrite" if anew else ""
         print(f"benchnav-train: to go on, give the same command with --resume{instead}", file=sys.stderr)
