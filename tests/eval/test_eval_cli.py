@@ -1,3 +1,4 @@
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -6,9 +7,12 @@ import pytest
 import yaml
 
 from benchnav import registry
+from benchnav.errors import ConfigError
 from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
 from benchnav.eval.run.folder import open_run
+from benchnav.eval.run.shard import Shard
+from benchnav.eval.runner import run_suite
 
 SMALL = (
     "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1",
@@ -66,6 +70,38 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
         assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 30.0)
         assert trial.rules.slowest == 0.05
         assert (trial.rules.free_space.by, trial.rules.free_space.above) == ("mean", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("words", "changed"),
+    [
+        ((), {}),
+        (("--jobs", "3", "--overwrite"), {"jobs": 3, "overwrite": True}),
+        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Shard(index=2, of=4)}),
+        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"scheduler": "tcp://a:1"}),
+    ],
+)  # fmt: skip
+def test_the_options_of_run_are_those_that_the_suite_is_run_with(
+    words: tuple[str, ...], changed: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, object]] = []
+
+    def begin(*args: object, **options: object) -> None:
+        given.append(inspect.signature(run_suite).bind(*args, **options).arguments)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr("benchnav.eval.runner.run_suite", begin)
+    assert evaluate(monkeypatch, "run", "--out", str(tmp_path / "run"), *SMALL, *words) == 2
+    (told,) = given
+    expected = {
+        "jobs": 1,
+        "overwrite": False,
+        "planner_limit_s": 0.0,
+        "shard": None,
+        "scheduler": "",
+    } | changed
+    assert {name: told[name] for name in expected} == expected
+    assert told["folder"] == tmp_path / "run"
 
 
 def test_a_planner_that_fails_ends_with_status_1(

@@ -31,28 +31,31 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     }
     suite = Suite(
         data=str(dataset_path), scenarios=("std",), model="oracle", planners=("tests.eval.parts:Faulty",),
-        risks=("cvar",), world=world, instances=2, seeds=(0, 1), record="none",
+        risks=("cvar",), world=world, instances=2, seeds=(0, 1), realisations=2,
+        record="none",
     )  # fmt: skip
     for _ in run_suite(suite, made):
         pass
     return made
 
 
-def test_the_ground_is_that_of_each_episode_under_its_own_seed(folder: Path) -> None:
+def test_the_ground_is_that_of_each_episode_under_its_own_luck(folder: Path) -> None:
     rows = read_table(folder, "episodes.parquet")  # whether they failed does not matter here
-    assert len(rows) == 4
+    assert len(rows) == 8
     mixed = rows.sort_values("instance")
     ground = ground_of_run(folder)(mixed)
     (trial, _) = next(iter(open_run(folder).trials.values()))
     for place, row in enumerate(mixed.to_dict("records")):
-        unit = Unit(trial=trial, seed=row["seed"], realisation=0, instances=(row["instance"],))
+        luck = {name: row[name] for name in ("seed", "realisation")}
+        unit = Unit(trial=trial, instances=(row["instance"],), **luck)
         problem, simulation = build(unit, "again")
         np.testing.assert_array_equal(ground.predicted[place], problem.risk_map[0].numpy())
         assert simulation.field is not None
         np.testing.assert_array_equal(ground.holding[place], (simulation.field[0] < BELOW).numpy())
         np.testing.assert_array_equal(ground.goal_m[place], problem.goal_m[0].numpy())
-    assert ground.holding[0].any()
-    assert not np.array_equal(ground.holding[0], ground.holding[1])
+    # Each is held elsewhere, so that no ground passes for another's.
+    assert ground.holding.any(axis=(1, 2)).all()
+    assert len({holding.tobytes() for holding in ground.holding}) == 8
 
 
 def test_the_report_shows_it_and_says_what_the_planner_was_told(folder: Path) -> None:

@@ -11,21 +11,27 @@ from benchnav.eval.run.unit import Extent
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
 
+DRAWS = ((4, 0, 60), (4, 1, 60), (9, 0, 2))
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run is about, without its rows."""
+
+def made(path: Path, **draws: tuple[tuple[int, int, int], ...]) -> Path:
+    """What a run is about, without its rows; by planner the draws of luck that are not those of all."""
     suite = Suite(
         model="oracle", planners=("straight", "astar_dwa", "mppi"), risks=("mean", "cvar:0.5", "cvar")
     )
-    trials = trials_of(suite, lambda data: ["std", "hs"])
-    extent = Extent(draws=((4, 0, 60), (4, 1, 60), (9, 0, 2)))
-    entries = {t.id: {"value": t.value, "labels": t.labels, **extent.to_dict()} for t in trials}
+    entries = {}
+    for trial in trials_of(suite, lambda data: ["std", "hs"]):
+        extent = Extent(draws=draws.get(trial.labels["planner"], DRAWS))
+        entries[trial.id] = {"value": trial.value, "labels": trial.labels, **extent.to_dict()}
     about = {"format": FORMAT, "format_version": FORMAT_VERSION, "suite": {}, "trials": entries}
-    path = tmp_path_factory.mktemp("find") / "run"
     path.mkdir()
     (path / "run.json").write_text(json.dumps(about))
     return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made(tmp_path_factory.mktemp("find") / "run")
 
 
 def found(
@@ -59,6 +65,20 @@ def test_several_labels_give_several_trials_in_their_order(folder: Path) -> None
         ("mppi", "cvar", "std", 4), ("mppi", "mean", "std", 4)
     ]  # fmt: skip
     assert len(found(folder, planner=["mppi", "astar_dwa"], risk=["cvar", "mean"])) == 4
+
+
+def test_trials_that_begin_with_other_seeds_are_shown_under_one(tmp_path: Path) -> None:
+    """Of a run that was extended for one planner: all the others are looked for under the first's seed."""
+    folder = made(tmp_path / "run", straight=((7, 0, 2), (9, 0, 2)), mppi=((9, 0, 2), (4, 0, 2)))
+    assert found(folder, planner=["mppi", "astar_dwa"], risk=["cvar"]) == [
+        ("mppi", "cvar", "std", 9), ("astar_dwa", "cvar", "std", 9)
+    ]  # fmt: skip
+    assert found(folder, planner=["astar_dwa", "mppi"], risk=["cvar"]) == [
+        ("astar_dwa", "cvar", "std", 4), ("mppi", "cvar", "std", 4)
+    ]  # fmt: skip
+    with pytest.raises(ConfigError, match=r"got planner 'mppi', realisation 0, instance 0, seed 7\."):
+        found(folder, planner=["straight", "mppi"])
+    assert [seed for *_, seed in found(folder, seed=9, planner=["straight", "mppi"])] == [9, 9]
 
 
 def test_a_blind_planner_stands_once_under_any_risk_setting(folder: Path) -> None:

@@ -1,5 +1,6 @@
 """What recordings tell of the ground, against what robots met on it and against the dataset."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +18,9 @@ from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.recorder import Recorder, find_recording
 from benchnav.eval.report.drawn_plan import drawn_plan, thinned
 from benchnav.eval.report.recording import Recording
+from benchnav.eval.run.episode import build
+from benchnav.eval.run.folder import open_run
+from benchnav.eval.run.unit import Unit
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
 from benchnav.planning.planners.planner import Plan
@@ -84,6 +88,34 @@ def test_a_recorded_field_is_what_the_robot_met_in_its_own_episode(stakes: Path)
     # The others' fields are others.
     for recording, other in zip(taken, taken[1:] + taken[:1], strict=True):
         assert not np.array_equal(other.field[cells(recording)], recording.traversability)  # type: ignore[index]
+
+
+def test_a_recording_holds_the_problem_of_its_own_episode(dataset: Path, tmp_path: Path) -> None:
+    task = {"free_space": {"by": "mean", "above": 0.6}}
+    folder = run(dataset, tmp_path / "run", instances=3, realisations=2, seeds=(3,), task=task)
+    ((trial, _),) = open_run(folder).trials.values()
+    taken = recordings(folder)
+    episodes = [tuple(int(r.about[name]) for name in ("seed", "realisation", "instance")) for r in taken]
+    assert sorted(episodes) == list(itertools.product((3,), range(2), range(3)))
+    for recording, (seed, realisation, instance) in zip(taken, episodes, strict=True):
+        unit = Unit(trial=trial, seed=seed, realisation=realisation, instances=(instance,))
+        problem, simulation = build(unit, "again")
+        assert simulation.field is not None
+        for found, expected in (
+            (recording.rgb, problem.observation.rgb),
+            (recording.elevation_m, problem.elevation_m),
+            (recording.predicted, problem.risk_map),
+            (recording.free, problem.free),
+            (recording.field, simulation.field),
+            (recording.goal_m, problem.goal_m),
+            (recording.states[0], problem.start),
+        ):
+            np.testing.assert_array_equal(found, expected[0].numpy())
+        assert recording.time_budget_s == float(problem.time_budget_s[0])
+    # No two maps are alike in any of these, so that none passes for another.
+    for name in ("rgb", "elevation_m", "predicted", "free", "time_budget_s"):
+        assert len({np.asarray(getattr(recording, name)).tobytes() for recording in taken}) == 3
+    assert len({recording.field.tobytes() for recording in taken if recording.field is not None}) == 6
 
 
 def test_cells_that_hold_a_robot_are_those_under_the_worlds_own_limit(stakes: Path) -> None:

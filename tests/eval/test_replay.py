@@ -76,6 +76,17 @@ def test_other_episodes_together_are_another_file(folder: Path, capsys: Any) -> 
     assert len(set(paths)) == 3
 
 
+@pytest.mark.parametrize("seed", ["0", "9"])
+def test_each_option_asks_for_what_it_names(seed: str, folder: Path, capsys: Any) -> None:
+    """Of an episode that the run does not have, the refusal tells what was looked for."""
+    columns = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
+    words = [word for name in columns for word in (f"--{name}", f"some {name}")]
+    words += ["--seed", seed, "--realisation", "3", "--instance", "4"]
+    assert call("replay", str(folder), *words) == 2
+    labels = ", ".join(f"{name} 'some {name}'" for name in columns)
+    assert f"got {labels}, realisation 3, instance 4, seed {seed}." in capsys.readouterr().err
+
+
 def test_a_video_shows_trials_side_by_side(folder: Path, tmp_path: Path, capsys: Any) -> None:
     widths = []
     for name, risk in (("one", "mean"), ("two", "mean,cvar:0.5")):

@@ -1,5 +1,6 @@
 """A run that is repeated says truly whether its rows came out the same, and what differs around it."""
 
+import inspect
 import json
 import shutil
 import sys
@@ -182,6 +183,32 @@ def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match="version 1"):
         repeat(Path(__file__).parents[1] / "data" / "run-1", tmp_path / "again")
     assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((), {"workers": Workers(), "overwrite": False}),
+        (("--jobs", "3", "--overwrite"), {"workers": Workers(jobs=3), "overwrite": True}),
+        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"workers": Workers(scheduler="tcp://a:1")}),
+    ],
+)
+def test_the_command_repeats_with_the_workers_that_are_asked_for(
+    words: tuple[str, ...], expected: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, object]] = []
+
+    def begin(*args: object, **options: object) -> None:
+        given.append(inspect.signature(rerun).bind(*args, **options).arguments)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr("benchnav.eval.rerun.rerun", begin)
+    monkeypatch.setattr(sys, "argv", ["benchnav-eval", "rerun", str(tmp_path / "run"), *words])
+    with pytest.raises(SystemExit):
+        cli.main()
+    (told,) = given
+    assert {name: told[name] for name in expected} == expected
+    assert (told["run_folder"], told["folder"]) == (tmp_path / "run", tmp_path / "run-rerun")
 
 
 def test_the_command_ends_with_0_1_or_2(  # type: ignore[no-untyped-def]

@@ -108,15 +108,18 @@ def test_what_holds_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -
 
 
 def with_steps(folder: Path, rows: pd.DataFrame) -> None:
+    """Stores a path of each row, like no other's."""
     for place, (trial, own) in enumerate(rows.groupby("trial", sort=False)):
-        steps = pd.concat(
-            pd.DataFrame({"seed": 0, "realisation": 0, "instance": i, "step": np.arange(30)}
-                         | dict(zip(("x_m", "y_m"), (track(place) + i).T, strict=True)))
-            for i in own["instance"]
-        )  # fmt: skip
-        path = folder / "steps" / f"trial={trial}" / "0-0-00000.parquet"
-        path.parent.mkdir(parents=True)
-        steps.to_parquet(path, index=False)
+        for (seed, realisation), unit in own.groupby(["seed", "realisation"]):
+            steps = pd.concat(
+                pd.DataFrame({"seed": seed, "realisation": realisation, "instance": i, "step": np.arange(30)}
+                             | dict(zip(("x_m", "y_m"), (track(place) + i + 5 * seed + 9 * realisation).T,
+                                        strict=True)))
+                for i in unit["instance"]
+            )  # fmt: skip
+            path = folder / "steps" / f"trial={trial}" / f"{seed}-{realisation}-00000.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            steps.to_parquet(path, index=False)
 
 
 def test_the_figure_is_of_the_stored_steps_of_its_map(
@@ -142,6 +145,29 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
     assert own["instance"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
+
+
+@pytest.mark.parametrize(("seed", "realisation"), [(0, 0), (0, 1), (7, 0), (7, 1)])
+def test_the_paths_are_those_of_the_maps_own_luck(
+    seed: int, realisation: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = made.rows(
+        made.row(made.trial(risk=risk, world="stakes"), instance, seed=one, realisation=draw)
+        for risk in RISKS for one in (0, 7) for draw in (0, 1) for instance in (0, 1)
+    )  # fmt: skip
+    folder = run_folder(tmp_path / "run", rows, format_version=3)
+    with_steps(folder, rows)
+    ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
+    shown: list[Any] = []
+    monkeypatch.setattr("benchnav.eval.report.driven.driven_figure", lambda *given: shown.append(given))
+    monkeypatch.setattr("benchnav.eval.report.driven.save", lambda *given: None)
+    caption = write_driven(folder)["driven"]
+    assert f"std 1, seed {seed}, realisation {realisation}:" in caption
+    ((_, own, tracks),) = shown
+    assert own["risk"].tolist() == list(RISKS)
+    assert set(zip(own["seed"], own["realisation"], own["instance"], strict=True)) == {(seed, realisation, 1)}
+    for place, positions in enumerate(tracks):
+        np.testing.assert_allclose(positions, track(place) + 1 + 5 * seed + 9 * realisation)
 
 
 def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: Path) -> None:

@@ -142,6 +142,19 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
         assert not list((tmp_path / "run").glob("units/*/*"))
 
 
+def test_planners_with_a_time_limit_have_processes_of_their_own_on_workers_too(
+    cluster_of_two: Cluster, dataset_path: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    suite = suite_on(dataset_path, log, risks=("mean",), scenarios=("std",), seeds=(0,))
+    list(run_suite(suite, tmp_path / "cluster", planner_limit_s=PATIENCE_S, scheduler=cluster_of_two.address))
+    (begun,) = log.read_text().split()
+    assert int(begun) not in {os.getpid(), *(worker.pid for worker in cluster_of_two.workers)}
+    list(run_suite(suite, tmp_path / "here"))
+    assert log.read_text().split() == [begun, str(os.getpid())]
+    same(tmp_path / "here", tmp_path / "cluster")
+
+
 def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Path, tmp_path: Path) -> None:
     suite = suite_on(dataset_path, tmp_path / "log")
     lost = Cluster(tmp_path, 1)
