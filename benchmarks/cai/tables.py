@@ -6,6 +6,7 @@ test, ours with theirs by Fisher's exact test.
 
 import pandas as pd
 from scipy.stats import binomtest, fisher_exact
+from statsmodels.stats.multitest import multipletests
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
 from benchnav.eval.stats.summary import wilson_interval
@@ -15,12 +16,12 @@ _NONE = "–"
 
 
 def tabulate_success(rows: pd.DataFrame) -> str:
-    """Success and mean time of the successes, ours and theirs.
+    """Success and mean time of the successes, ours and theirs; p is corrected by Holm's method over all lines.
 
     Args:
         rows: trials, from `run_trials`.
     """
-    lines = []
+    lines, compared = [], {}
     for (density, setting), group in rows.groupby(["density", "setting"], sort=False):
         arrived, trials = int(group["success"].sum()), len(group)
         cells = [
@@ -34,8 +35,11 @@ def tabulate_success(rows: pd.DataFrame) -> str:
             lines.append([*cells, _NONE, _NONE, _NONE])
             continue
         table = [[arrived, trials - arrived], [theirs.successes, TRIALS - theirs.successes]]
-        p = fisher_exact(table).pvalue
-        lines.append([*cells, show_share(theirs.successes, TRIALS), show_time(theirs.time_s), show_p(p)])
+        compared[len(lines)] = fisher_exact(table).pvalue
+        lines.append([*cells, show_share(theirs.successes, TRIALS), show_time(theirs.time_s)])
+    corrected = multipletests(list(compared.values()), method="holm")[1] if compared else []
+    for place, p in zip(compared, corrected, strict=True):
+        lines[place].append(show_p(p))
     return markdown(
         ["vegetation", "setting", "success, %", "time, s", "theirs, %", "theirs, s", "p of ours = theirs"],
         lines,

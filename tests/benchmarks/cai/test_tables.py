@@ -1,10 +1,10 @@
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, fisher_exact
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
-from benchmarks.cai.tables import mcnemar_p, show_share, tabulate_pairs, tabulate_success
+from benchmarks.cai.tables import mcnemar_p, show_p, show_share, tabulate_pairs, tabulate_success
 
 
 def rows(density: float, **success: list[bool]) -> pd.DataFrame:
@@ -48,6 +48,21 @@ def test_success_stands_beside_the_published() -> None:
     assert mean.startswith("| 40 % | `mean` | 50.0 [15, 85] | 10.0 | 69.0 [62, 75] | 9.1 | ")
     assert cvar == "| 40 % | `cvar:0.7` | 75.0 [30, 95] | 10.0 | – | – | – |"
     assert header.count("|") == mean.count("|") == cvar.count("|")
+
+
+def test_p_is_corrected_over_all_lines_that_are_compared() -> None:
+    arrived = {"mean": 100, "cvar_8": 170}
+    trials = {name: [True] * count + [False] * (200 - count) for name, count in arrived.items()}
+    table = tabulate_success(rows(0.4, **trials)).splitlines()[2:]
+    raw = [
+        fisher_exact(
+            [[count, 200 - count], [PUBLISHED[0.4, name].successes, 200 - PUBLISHED[0.4, name].successes]]
+        ).pvalue
+        for name, count in (("mean", 100), ("cvar:0.8", 170))
+    ]
+    first, second = sorted(raw)
+    expected = {first: 2 * first, second: max(2 * first, second)}
+    assert [line.split("|")[-2].strip() for line in table] == [show_p(expected[p]) for p in raw]
 
 
 def test_pairs_are_those_of_one_trial() -> None:
