@@ -28,7 +28,7 @@ demo: $(STAMP)
 	$(BIN)/benchnav-eval run --config demo --out runs/demo --jobs $(JOBS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS) -m slow
