@@ -9,7 +9,7 @@ _COLOURS = (
     *((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167)),
     *((230, 159, 0), (86, 180, 233), (0, 0, 0), (240, 228, 66)),
 )
-_LABELS = ("planner", "risk", "model", "robot", "objective", "world")
+NAMING = ("planner", "risk", "model", "robot", "objective", "world")
 
 
 def trial_colours(count: int) -> list[tuple[int, int, int]]:
@@ -27,7 +27,7 @@ def contender_names(abouts: Sequence[Mapping[str, str]]) -> list[str]:
     Args:
         abouts: labels of each trial.
     """
-    used = {name: {about.get(name, NOT_USED) for about in abouts} - {NOT_USED} for name in _LABELS}
+    used = {name: {about.get(name, NOT_USED) for about in abouts} - {NOT_USED} for name in NAMING}
     differing = [name for name, labels in used.items() if len(labels) > 1]
     names = []
     for about in abouts:

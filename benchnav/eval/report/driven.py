@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from benchnav.errors import ConfigError
-from benchnav.eval.report.contenders import contender_names, trial_colours
+from benchnav.eval.report.contenders import NAMING, contender_names, trial_colours
 from benchnav.eval.report.figures import save
 from benchnav.eval.report.ground import HOLDING
 from benchnav.eval.run.folder import EPISODES, read_table
@@ -23,7 +23,6 @@ GROUND = "ground.npz"
 MAP = ("data", "scenario", "world", "seed", "realisation", "instance")
 MOST_PATHS = 16
 
-_LABELS = ("planner", "risk", "model", "robot", "objective", "world")
 _ARRAYS = ("rgb", "holding", "goal_m")
 _STYLES = ("solid", "dashed")
 _DARKEST = 0.35  # grey of λ = 0
@@ -140,7 +139,7 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
     figure = Figure(figsize=(6.6, max(3.6, min(3.8 * high / wide + 0.3, 7.0))), layout="constrained")
     panel = figure.subplots()
     panel.imshow(_backdrop(ground), origin="lower", extent=(0, wide, 0, high), interpolation="nearest")
-    names = contender_names(rows[list(_LABELS)].to_dict("records"))
+    names = contender_names(rows[list(NAMING)].to_dict("records"))
     colours = trial_colours(len(rows))
     for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
         colour = tuple(value / 255 for value in colours[place])

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.report.charts.panels import blocks
+from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.figures import trial_name
 from benchnav.eval.stats.best import TOLD, competing
-from benchnav.eval.trial import NOT_USED
 from benchnav.planning.world.outcome import FAILURES
 
 _MOST_NAMED = 6
@@ -39,7 +38,7 @@ def findings(
         failures: from `failures.failures_table`.
         told: by trial the λ̂ where its failed episodes ended, where that is known.
     """
-    several = ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
+    several = several_models(summary)
     rows = ({str(name): value for name, value in row.items()} for row in summary.to_dict("records"))
     names = {row["trial"]: trial_name(row, several) for row in rows}
     return [

@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchnav.errors import BenchnavError
 from benchnav.eval.report.charts.failure_sheet import Ground, Shown, choose
-from benchnav.eval.report.charts.panels import blocks
+from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.failures import read_steps
 from benchnav.eval.report.figures import trial_name
 from benchnav.eval.stats.best import competing
@@ -54,7 +54,7 @@ def collect_sheets(
         asked = ground_of is not None and not failures.empty
         why = "No sheet of failures: the run kept no steps of them." if asked else ""
         return Sheets(shown=(), told={}, left_out=why)
-    several = ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
+    several = several_models(summary)
     shown, told, left_out = [], {}, []
     if len(every := blocks(summary)) > _MOST_BLOCKS:
         left_out.append(f"Sheets of failures are of the first {_MOST_BLOCKS} of {len(every)} blocks.")

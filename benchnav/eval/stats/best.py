@@ -1,6 +1,6 @@
 """The best trial of each block of a run, and which others the paired test does not tell from it."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,19 +20,18 @@ TOLD = ("clairvoyant", "oracle", "ideal")
 _LUCK = ["seed", "realisation", "instance"]
 
 
-def competing(rows: pd.DataFrame, told: Collection[str] = TOLD) -> pd.Series:
+def competing(rows: pd.DataFrame) -> pd.Series:
     """Tells which trials of a block compete for the best.
 
     What is told the truth is a yardstick and no rival, unless nothing else is there that looks at a prediction.
 
     Args:
         rows: of the summary, of one block.
-        told: labels of models that are told the truth.
 
     Returns:
         Bool, by the index of `rows`.
     """
-    for out in (list(told), list(told)[:1]):
+    for out in (list(TOLD), list(TOLD)[:1]):
         left = ~rows["model"].isin(out)
         if (left & (rows["model"] != NOT_USED)).any():
             return left

@@ -46,6 +46,11 @@ def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return [(", ".join(map(str, key)), rows) for key, rows in summary.groupby(keys, sort=False)]
 
 
+def several_models(summary: pd.DataFrame) -> list[str]:
+    """The label that names a trial beside planner and risk: its model, where those that look at one differ."""
+    return ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
+
+
 def planner_colours(summary: pd.DataFrame) -> dict[str, str]:
     """A colour a planner; grey for those that look at nothing predicted."""
     blind = set(summary.loc[summary["model"] == NOT_USED, "planner"])
@@ -83,7 +88,7 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     for place in last:
         axes.flat[place].tick_params(labelbottom=True)
         axes.flat[place].set_xlabel(measures[place % columns])
-    several = ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
+    several = several_models(summary)
     names = [
         trial_name(dict(zip(("planner", "model", "risk"), setting, strict=True)), several)
         for setting in heights

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 
+from benchnav.eval.report.contenders import NAMING
 from benchnav.eval.report.playback.robot import Driver
 from benchnav.eval.report.recording import Recording
 from benchnav.eval.report.tables import NOT_USED
-
-_LABELS = ("planner", "risk", "model", "robot", "objective", "world")
 
 
 def describe(drivers: Sequence[Driver]) -> str:
@@ -18,7 +17,7 @@ def describe(drivers: Sequence[Driver]) -> str:
         recording = drivers[0].recording
         lines += [f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s"]
         lines += ["", f"λ met on average: {_mean_met(recording)}", "", f"Free: {free_rule(recording)}", ""]
-        used = [(name, about[name]) for name in _LABELS if about.get(name, NOT_USED) != NOT_USED]
+        used = [(name, about[name]) for name in NAMING if about.get(name, NOT_USED) != NOT_USED]
         return "\n".join([*lines, "| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in used)])
     lines += ["| trial | outcome | time [s] | λ met | free |", "|---|---|---|---|---|"]
     for driver in drivers:
