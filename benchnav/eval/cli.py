@@ -55,7 +55,7 @@ def run_command(
     steps = run_suite(suite, folder, workers.jobs, overwrite, planner_limit_s, _say, share, workers.scheduler)
     show_progress(steps, "units")
     if share is None:
-        return _finish(folder, suite.record)
+        return _finish(folder)
     print(f"shard {share} is finished in {folder}")
     print(f"merge:   {program('benchnav-eval')} merge OUT PART …, when all {share.of} are")
     return _failed_shard(folder)
@@ -70,11 +70,10 @@ def merge(out: str, parts: list[str]) -> int:
     """
     from benchnav.command import show_progress
     from benchnav.eval.merge import merge_shards
-    from benchnav.eval.run.folder import open_run
 
     folder = Path(out)
     show_progress(merge_shards([Path(part) for part in parts], folder), "units")
-    return _finish(folder, open_run(folder).about["suite"]["record"])
+    return _finish(folder)
 
 
 def rerun(
@@ -192,13 +191,13 @@ def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
     return Workers(jobs=jobs, scheduler=scheduler)
 
 
-def _finish(folder: Path, record: str) -> int:
+def _finish(folder: Path) -> int:
     """Reports on a finished run; gives the exit status."""
     from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
 
     _print(write_report(folder, ground_of_run(folder)), folder)
-    _print_recorded(folder, record)
+    _print_recorded(folder)
     _print_replay(folder)
     return _failed(folder)
 
@@ -214,12 +213,11 @@ def _print(report: "Report", folder: Path) -> None:
     print(f"report:  {folder / PAGE}")
 
 
-def _print_recorded(folder: Path, record: str) -> None:
-    which = {"first": "the first instance of each trial", "failures": "failures", "all": "all"}
+def _print_recorded(folder: Path) -> None:
     files = list((folder / "playback").glob("*.rrd"))
-    if record in which and files:
+    if files:
         size = sum(path.stat().st_size for path in files) / 1e6
-        print(f"recorded: {which[record]}; {len(files)} files in {folder / 'playback'}, {size:.1f} MB")
+        print(f"recorded: {len(files)} files in {folder / 'playback'}, {size:.1f} MB")
 
 
 def _print_replay(folder: Path) -> None:

@@ -5,18 +5,21 @@ from pathlib import Path
 import numpy as np
 
 from benchnav.datagen.store import TerrainDataset, find_dataset
-from benchnav.eval.report.driven import GROUND, MAP, Ground, telling_map
+from benchnav.eval.report.driven import GROUND, MAP, DrivenGround, telling_map
 from benchnav.eval.run.episode import luck_key, read_maps
 from benchnav.eval.run.folder import EPISODES, open_run, read_table
+from benchnav.eval.run.steps import open_steps
 from benchnav.planning.world.simulation import Simulation
 
 
 def keep_ground(folder: Path) -> None:
-    """Writes the map on which the outcomes of a run differ most, with λ as it was there.
+    """Writes the map on which the outcomes of a run differ most, with λ as it was there; not where no steps were kept.
 
     Args:
         folder: a run whose rows are all there.
     """
+    if open_steps(folder) is None:
+        return
     rows = read_table(folder, EPISODES)
     about = telling_map(rows)
     on_map = np.logical_and.reduce([rows[name] == about[name] for name in MAP])
@@ -27,14 +30,11 @@ def keep_ground(folder: Path) -> None:
         block.terrain, trial.make_task(), trial.world, block.places, luck, [about["instance"]]
     )
     field = None if simulation.field is None else simulation.field[0].cpu().numpy()
-    holding = np.zeros(block.terrain.grid.shape, dtype=bool)
-    if field is not None and trial.world.immobile is not None:
-        holding = field < np.float32(trial.world.immobile.below)
-    Ground(
+    DrivenGround(
         about=about,
         resolution_m=block.terrain.grid.resolution_m,
         rgb=block.terrain.rgb[0].cpu().numpy(),
         field=field,
-        holding=holding,
+        holding=simulation.holding[0].cpu().numpy(),
         goal_m=block.places.goal_m[0].cpu().numpy(),
     ).save(folder / GROUND)

@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchnav.datagen.store import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.report.charts.failure_sheet import Ground
+from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.sheets import GroundOf
 from benchnav.eval.run import provenance
 from benchnav.eval.run.episode import build, one_thread
@@ -31,14 +31,14 @@ def ground_of_run(folder: Path) -> GroundOf:
     """
     run = open_run(folder)
 
-    def ground_of(failures: pd.DataFrame) -> Ground:
+    def ground_of(failures: pd.DataFrame) -> FailedGround:
         parts = [
             (rows.index.to_numpy(), _ground(run, rows))
             for _, rows in failures.reset_index(drop=True).groupby(["seed", "realisation"], sort=False)
         ]
         back = np.argsort(np.concatenate([index for index, _ in parts]))
         grounds = [ground for _, ground in parts]
-        return Ground(
+        return FailedGround(
             predicted=np.concatenate([one.predicted for one in grounds])[back],
             holding=np.concatenate([one.holding for one in grounds])[back],
             resolution_m=grounds[0].resolution_m,
@@ -48,7 +48,7 @@ def ground_of_run(folder: Path) -> GroundOf:
     return ground_of
 
 
-def _ground(run: Run, rows: pd.DataFrame) -> Ground:
+def _ground(run: Run, rows: pd.DataFrame) -> FailedGround:
     """The ground under one seed and realisation."""
     trial_id = rows["trial"].iloc[0]
     if trial_id not in run.trials:
@@ -69,12 +69,9 @@ def _ground(run: Run, rows: pd.DataFrame) -> Ground:
     )
     with one_thread():
         problem, simulation = build(unit, run.about["run_id"])
-    holding = np.zeros(problem.risk_map.shape, dtype=bool)
-    if simulation.field is not None and trial.world.immobile is not None:
-        holding = (simulation.field < trial.world.immobile.below).cpu().numpy()
-    return Ground(
+    return FailedGround(
         predicted=problem.risk_map.cpu().numpy(),
-        holding=holding,
+        holding=simulation.holding.cpu().numpy(),
         resolution_m=problem.grid.resolution_m,
         goal_m=problem.goal_m.cpu().numpy(),
     )

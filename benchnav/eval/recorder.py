@@ -92,14 +92,9 @@ class Recorder:
         truth = self.terrain.truth
         soft = (truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy()
         mean = truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy()
-        ground = {"true_mean": mean, "field": None, "soft": soft, "holding": np.zeros_like(soft)}
-        immobile = self.unit.trial.world.immobile
-        if self.simulation.field is not None:
-            field = self.simulation.field[member].cpu()
-            ground["field"] = field.numpy()
-            if immobile is not None:
-                ground["holding"] = (field < immobile.below).numpy()
-        return ground
+        field = None if self.simulation.field is None else self.simulation.field[member].cpu().numpy()
+        holding = self.simulation.holding[member].cpu().numpy()
+        return {"true_mean": mean, "field": field, "soft": soft, "holding": holding}
 
 
 def find_recording(folder: Path, unit: Unit, member: int) -> Recording:

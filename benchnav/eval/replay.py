@@ -61,6 +61,8 @@ def replay(
 
     if video and Path(video).suffix != VIDEO:
         raise ConfigError(f"Expected `video` as a file {VIDEO}, got {video!r}.")
+    if video and web:
+        raise ConfigError("Expected `video` or `web`, got both.")
     columns = {
         **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
         **{"robot": robot, "objective": objective, "world": world, "data": data},

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.driven_ground import keep_ground
-from benchnav.eval.report.driven import GROUND, Ground, telling_map
+from benchnav.eval.report.driven import GROUND, DrivenGround, telling_map
 from benchnav.eval.report.recording import Recording
 from tests.eval.test_recorder import SEEDS, recordings, run
 from tests.eval.test_recorder import dataset as dataset
@@ -27,7 +27,7 @@ def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
     dataset: Path, tmp_path: Path
 ) -> None:
     folder = run(dataset, tmp_path / "run", planners=PLANNERS, risks=("mean",))
-    kept = Ground.load(folder / GROUND)
+    kept = DrivenGround.load(folder / GROUND)
     assert dict(kept.about) == telling_map(pd.read_parquet(folder / "episodes.parquet"))
     same = on_map(folder, kept.about)
     assert len(same) == 2
@@ -45,7 +45,7 @@ def test_whichever_map_is_telling_is_kept_under_its_own_luck(dataset: Path, tmp_
         # All succeed but one of the two on this map.
         rows.assign(success=~here | (rows["planner"] == "straight")).to_parquet(folder / "episodes.parquet")
         keep_ground(folder)
-        kept = Ground.load(folder / GROUND)
+        kept = DrivenGround.load(folder / GROUND)
         asked = {"seed": seed, "realisation": realisation, "instance": instance}
         assert {name: kept.about[name] for name in asked} == asked
         same = on_map(folder, kept.about)
@@ -56,3 +56,11 @@ def test_whichever_map_is_telling_is_kept_under_its_own_luck(dataset: Path, tmp_
         assert kept.field is not None
         fields.add(kept.field.tobytes())
     assert len(fields) == 8
+
+
+def test_no_map_is_kept_where_no_steps_are(dataset: Path, tmp_path: Path) -> None:
+    folder = run(
+        dataset, tmp_path / "run", planners=("straight",), risks=("mean",), record="none", steps="none"
+    )
+    assert (folder / "episodes.parquet").exists()
+    assert not (folder / GROUND).exists()

@@ -115,9 +115,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     assert call("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--record", "failures") == 0
     printed = capsys.readouterr().out.splitlines()
     count = len(list((out / "playback").glob("*.rrd")))
-    assert any(
-        line.startswith(f"recorded: failures; {count} files in {out / 'playback'}, ") for line in printed
-    )
+    assert any(line.startswith(f"recorded: {count} files in {out / 'playback'}, ") for line in printed)
     (line,) = [line for line in printed if line.startswith("replay:  ")]
     words = shlex.split(line.removeprefix("replay:  "))
     assert "straight" not in words
@@ -133,6 +131,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     ("arguments", "told"),
     [
         (("replay", "RUN", "--video", "a.avi"), "Expected `video` as a file .mp4, got 'a.avi'"),
+        (("replay", "RUN", "--video", "a.mp4", "--web"), "Expected `video` or `web`, got both."),
         (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
         (("replay", "RUN", "--planner", "mpi"), "planners ['straight', 'Faulty']"),
         (("run", "--recorded", "4"), "It is now `record`: none, failures, first or all."),

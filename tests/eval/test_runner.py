@@ -21,7 +21,6 @@ from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.recorder import find_recording
 from benchnav.eval.report.playback.files import playback_path
-from benchnav.eval.report.playback.rerun_file import read_path
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run import provenance
 from benchnav.eval.run.folder import open_run
@@ -29,6 +28,7 @@ from benchnav.eval.run.steps import read_steps
 from benchnav.eval.runner import run_suite
 from benchnav.eval.suite import Suite
 from tests import factories
+from tests.eval.report.playback.rrd import read_path
 
 BUDGETS = {"mppi": {"samples": 64, "horizon": 20}, "cl_rrt": {"expansions": 50}}
 PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")

@@ -29,7 +29,7 @@ _DARKEST = 0.35  # grey of λ = 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ground:
+class DrivenGround:
     """The map of the figure.
 
     Args:
@@ -57,7 +57,7 @@ class Ground:
             np.savez_compressed(file, scalars=np.array(text), **arrays)
 
     @classmethod
-    def load(cls, path: Path) -> "Ground":
+    def load(cls, path: Path) -> "DrivenGround":
         """Reads what `save` wrote."""
         with np.load(path, allow_pickle=False) as stored:
             scalars = json.loads(str(stored["scalars"]))
@@ -94,7 +94,7 @@ def write_driven(folder: Path) -> dict[str, str]:
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
         return {}
-    ground, rows = Ground.load(path), read_table(folder, EPISODES)
+    ground, rows = DrivenGround.load(path), read_table(folder, EPISODES)
     for name in MAP:
         rows = rows[rows[name] == ground.about[name]]
     tracks = {}
@@ -125,7 +125,7 @@ def write_driven(folder: Path) -> dict[str, str]:
     return {"driven": " ".join(words)}
 
 
-def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> Figure:
+def driven_figure(ground: DrivenGround, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> Figure:
     """Draws paths over λ as it was, or over faded terrain where it was resampled.
 
     Args:
@@ -164,7 +164,7 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
     return figure
 
 
-def _title(ground: Ground) -> str:
+def _title(ground: DrivenGround) -> str:
     if ground.field is None:
         return "terrain, faded"
     return "λ as it was: the lighter the faster" + (
@@ -172,7 +172,7 @@ def _title(ground: Ground) -> str:
     )
 
 
-def _backdrop(ground: Ground) -> np.ndarray:
+def _backdrop(ground: DrivenGround) -> np.ndarray:
     """Colours in [0, 1] that paths stand out from, shape [H, W, 3]."""
     if ground.field is None:
         return 0.4 * np.moveaxis(ground.rgb, 0, -1) / 255 + 0.6

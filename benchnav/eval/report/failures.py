@@ -29,11 +29,11 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
     labels = ["planner", "risk", "model", "scenario", "world"]
     columns = ["trial", *labels, *_KEYS[1:], "outcome", "end_time_s"]
     failed = episodes.loc[~episodes["success"].astype(bool), columns]
-    ends = _ends(read_steps(folder, list(failed["trial"].unique())))
+    ends = _ends(steps_of(folder, list(failed["trial"].unique())))
     return failed.merge(ends, on=_KEYS, how="left").reset_index(drop=True)
 
 
-def read_steps(folder: Path, trials: list[str]) -> pd.DataFrame:
+def steps_of(folder: Path, trials: list[str]) -> pd.DataFrame:
     """Reads the steps of some trials, of one table or of one part a trial; no rows where none were kept.
 
     Args:

@@ -75,9 +75,11 @@ def _sentences(
             f"All {len(rivals)} compared settings together failed in {failed} of {count} episodes: {_shares(outcomes)}."
         )
     yardsticks = rows[~rows["trial"].isin(rivals["trial"])]
-    for model in [model for model in reversed(TOLD) if (yardsticks["model"] == model).any()]:
-        most = yardsticks[yardsticks["model"] == model].sort_values("success_rate", kind="stable").iloc[-1]
-        yield f"With the model {model}, which is told the truth, {names[most['trial']]} reached {_rate(most)}."
+    for part in [part for part in reversed(TOLD) if (yardsticks["told"] == part).any()]:
+        most = yardsticks[yardsticks["told"] == part].sort_values("success_rate", kind="stable").iloc[-1]
+        yield (
+            f"With the model {most['model']}, which is told the truth, {names[most['trial']]} reached {_rate(most)}."
+        )
 
 
 def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str]) -> Iterable[str]:

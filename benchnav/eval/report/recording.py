@@ -5,8 +5,6 @@ Letters in shapes: N steps, H×W cells, S state and A action dimensions.
 """
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 from benchnav.errors import ConfigError
 from benchnav.eval.report.drawn_plan import DrawnPlan, join_plans, split_plans, thinned
 from benchnav.eval.report.snapshot import SNAPSHOT_S, Snapshot
-from benchnav.eval.report.version2 import is_snapshot, read_snapshot
+from benchnav.eval.report.version2 import DAMAGE, is_snapshot, read_snapshot
 from benchnav.files import replacing
 from benchnav.terrain import Grid
 
@@ -25,7 +23,6 @@ _ARRAYS = (
     *("goal_m", "states", "actions", "traversability"),
 )
 _PLANS = "plans:"
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +155,7 @@ class Recording:
                 plans=split_plans(plans),
                 **arrays,
             )
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise ConfigError(f"{path} is damaged: {error}. Remove it; `replay` makes it again.") from error
 
 

@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 
 from benchnav.errors import BenchnavError
-from benchnav.eval.report.charts.failure_sheet import Ground, Shown, choose
+from benchnav.eval.report.charts.failure_sheet import FailedGround, Shown, choose
 from benchnav.eval.report.charts.panels import blocks, several_models
-from benchnav.eval.report.failures import read_steps
+from benchnav.eval.report.failures import steps_of
 from benchnav.eval.report.figures import trial_name
 from benchnav.eval.stats.best import competing
 from benchnav.eval.trial import NOT_USED
 
-GroundOf = Callable[[pd.DataFrame], Ground]
+GroundOf = Callable[[pd.DataFrame], FailedGround]
 
 _MOST_BLOCKS = 6
 # Failures of one trial whose ground is predicted again.
@@ -87,9 +87,9 @@ def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
         yield {str(name): value for name, value in row.items()}
 
 
-def _line(folder: Path, name: str, failures: pd.DataFrame, ground: Ground, among: int) -> Shown:
+def _line(folder: Path, name: str, failures: pd.DataFrame, ground: FailedGround, among: int) -> Shown:
     chosen = choose(failures)
-    steps = read_steps(folder, [chosen["trial"].iloc[0]])
+    steps = steps_of(folder, [chosen["trial"].iloc[0]])
     tracks = []
     for row in chosen.to_dict("records"):
         own = np.logical_and.reduce([steps[key] == row[key] for key in ("seed", "realisation", "instance")])
@@ -98,7 +98,7 @@ def _line(folder: Path, name: str, failures: pd.DataFrame, ground: Ground, among
     return Shown(
         name=name,
         failures=chosen.reset_index(drop=True),
-        ground=Ground(
+        ground=FailedGround(
             predicted=ground.predicted[places],
             holding=ground.holding[places],
             resolution_m=ground.resolution_m,

@@ -117,14 +117,14 @@ def bold_note(summary: pd.DataFrame) -> str:
     """
     words = ["the highest success rate of its block, and all that the paired test does not tell from it"]
     words.append("(sign-flip test by map, Holm's correction over the block, p ≥ 0.05)")
-    left_out = {
-        model
+    left_out = [
+        summary.loc[rows.index[~competing(rows)]]
         for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)
-        for model in rows.loc[~competing(rows), "model"]
-    }
-    out = [model for model in TOLD if model in left_out]
-    if out:
-        words.append(f"; what is told the truth ({', '.join(out)}) does not compete")
+    ]
+    told = pd.concat(left_out).sort_values("told", key=lambda parts: parts.map(TOLD.index), kind="stable")
+    if not told.empty:
+        out = ", ".join(dict.fromkeys(told["model"]))
+        words.append(f"; what is told the truth ({out}) does not compete")
     return " ".join(words).replace(" ;", ";") + "."
 
 

@@ -13,7 +13,8 @@ from benchnav.eval.report.snapshot import Snapshot
 
 _ARRAYS = ("rgb", "predicted", "free", "extent_m", "goal_m", "track", "traversability")
 _GROUND = ("field", "soft", "holding")
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
+# What reading a damaged archive raises.
+DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def is_snapshot(path: Path) -> bool:
@@ -21,7 +22,7 @@ def is_snapshot(path: Path) -> bool:
     try:
         with np.load(path, allow_pickle=False) as stored:
             return "track" in stored
-    except _DAMAGE:
+    except DAMAGE:
         return False
 
 
@@ -40,7 +41,7 @@ def read_snapshot(path: Path) -> Snapshot:
             arrays = {name: stored[name] for name in _ARRAYS}
             ground = {name: stored[name] for name in _GROUND if name in stored}
             lines = {n: cut(stored[f"points_{n}"], stored[f"sizes_{n}"]) for n in scalars["layers"]}
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ConfigError(f"{path} is damaged: {error}. Remove it; `replay` makes it again.") from error
     none = np.zeros_like(arrays["free"])
     ground = {"field": None, "soft": none, "holding": none} | ground

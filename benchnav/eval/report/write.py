@@ -32,7 +32,7 @@ from benchnav.eval.report.tables import NOT_USED, ResultTable, result_table
 from benchnav.eval.report.trajectories import choose, trajectory_figure
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.run.folder import ERRORS, open_run, read_table
-from benchnav.eval.stats.best import against_best
+from benchnav.eval.stats.best import against_best, told_the_truth
 from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
 
@@ -96,7 +96,8 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
         episodes = convert_rows(episodes, about)
         about = {**about, **convert_about(about, episodes)}
     summary = summarise(episodes)
-    summary = summary.merge(against_best(episodes, summary), on="trial", how="left", validate="1:1")
+    best = against_best(episodes, summary, told_the_truth(about["trials"]))
+    summary = summary.merge(best, on="trial", how="left", validate="1:1")
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(folder, summary, failures, ground_of)
     left_out = [sheets.left_out] if sheets.left_out else []

@@ -20,25 +20,44 @@ TOLD = ("clairvoyant", "oracle", "ideal")
 _LUCK = ["seed", "realisation", "instance"]
 
 
+def told_the_truth(trials: Mapping[str, Any]) -> dict[str, str]:
+    """Which trials' models are told the truth.
+
+    Args:
+        trials: by id what `run.json` knows of them.
+
+    Returns:
+        By id one of `TOLD`.
+    """
+    looking = {
+        trial: about["value"].get("model", {}).get("part")
+        for trial, about in trials.items()
+        if about["labels"].get("model") != NOT_USED
+    }
+    return {trial: part for trial, part in looking.items() if part in TOLD}
+
+
 def competing(rows: pd.DataFrame) -> pd.Series:
     """Tells which trials of a block compete for the best.
 
     What is told the truth is a yardstick and no rival, unless nothing else is there that looks at a prediction.
 
     Args:
-        rows: of the summary, of one block.
+        rows: of the summary, of one block, with `told` as of `against_best`.
 
     Returns:
         Bool, by the index of `rows`.
     """
     for out in (list(TOLD), list(TOLD)[:1]):
-        left = ~rows["model"].isin(out)
+        left = ~rows["told"].isin(out)
         if (left & (rows["model"] != NOT_USED)).any():
             return left
     return pd.Series(True, index=rows.index)
 
 
-def against_best(episodes: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
+def against_best(
+    episodes: pd.DataFrame, summary: pd.DataFrame, told: Mapping[str, str] | None = None
+) -> pd.DataFrame:
     """Compares the best trial of each block with all others that compete, map by map.
 
     All of them on the episodes that they have in common, so that one which was run on more maps is not judged by
@@ -48,15 +67,18 @@ def against_best(episodes: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
     Args:
         episodes: rows of episodes.
         summary: of them, from `summary.summarise`.
+        told: from `told_the_truth`; none where not given.
 
     Returns:
-        A row a trial, in the order of the summary: `trial`; `best`, the trial that is the best of its block;
+        A row a trial, in the order of the summary: `trial`; `told`, what is told the truth, of `TOLD`, empty
+        where nothing is; `best`, the trial that is the best of its block;
         `best_rivals`, how many others compete; `best_episodes`, of each of them in common; `best_difference`, by how
         much the best's success rate is higher, with its 95 % interval `_low`, `_high`; `best_p_holm`; `best_shown`,
         the smallest difference that so many maps show with a chance of 80 %; and `best_alike`, true where the best is
         not told from it. NaN and false where a trial does not compete, NaN and true for the best itself.
     """
     groups = dict(list(episodes.groupby("trial", sort=False)))
+    summary = summary.assign(told=summary["trial"].map(told or {}).fillna(""))
     found: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
         rivals = _in_common({trial: groups[trial] for trial in rows.loc[competing(rows), "trial"]})
@@ -79,7 +101,7 @@ def against_best(episodes: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
     columns = ["trial", "best", "best_rivals", "best_episodes", "best_difference", "best_low", "best_high"]
     columns += ["best_p_holm", "best_shown", "best_alike"]
     table = pd.DataFrame(found).reindex(columns=columns)
-    return summary[["trial"]].merge(table, on="trial", how="left", validate="1:1")
+    return summary[["trial", "told"]].merge(table, on="trial", how="left", validate="1:1")
 
 
 def _in_common(trials: Mapping[str, pd.DataFrame]) -> Mapping[str, pd.DataFrame]:

@@ -85,6 +85,14 @@ class Simulation:
         return self._realisation.field
 
     @property
+    def holding(self) -> Tensor:
+        """Cells that hold a robot for good, bool, shape [B, H, W]; none where λ is resampled or nothing holds."""
+        if self.field is None or self._immobile is None:
+            size = (len(self._goal_m), *self._grid.shape)
+            return torch.zeros(size, dtype=torch.bool, device=self._goal_m.device)
+        return self.field < self._immobile.below
+
+    @property
     def attempts(self) -> Tensor:
         """How many fields were drawn until ground joined start and goal, int64, shape [B]."""
         return self._realisation.attempts

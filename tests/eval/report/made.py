@@ -9,7 +9,8 @@ import torch
 
 from benchnav.eval.report.drawn_plan import drawn_plan
 from benchnav.eval.report.recording import Recording
-from benchnav.eval.stats.summary import LABELS
+from benchnav.eval.stats.best import against_best, told_the_truth
+from benchnav.eval.stats.summary import LABELS, summarise
 from benchnav.terrain import Grid
 
 PAPER = {
@@ -52,11 +53,23 @@ def rows(*episodes: dict[str, Any] | Iterable[dict[str, Any]]) -> pd.DataFrame:
 def trials(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """What `run.json` says of the trials; `follows` and `remarks` by planner."""
     return {
-        name: {"value": PAPER, "labels": {label: group[label].iloc[0] for label in LABELS}}
+        name: {"value": PAPER | _model(group), "labels": {label: group[label].iloc[0] for label in LABELS}}
         | {"follows": "", "remarks": [], "seeds": sorted(set(group["seed"].tolist()))}
         | notes.get(group["planner"].iloc[0], {})
         for name, group in episodes.groupby("trial", sort=False)
     }
+
+
+def _model(rows: pd.DataFrame) -> dict[str, Any]:
+    """The model by its label; of planners that look at nothing, the stand-in."""
+    label = rows["model"].iloc[0]
+    return {"model": {"part": "oracle" if label == "–" else label, "options": {}}}
+
+
+def summary(episodes: pd.DataFrame) -> pd.DataFrame:
+    """What a report makes of rows."""
+    table = summarise(episodes)
+    return table.merge(against_best(episodes, table, told_the_truth(trials(episodes))), on="trial")
 
 
 def recording(

@@ -6,7 +6,14 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 
-from benchnav.eval.report.driven import GROUND, MOST_PATHS, Ground, driven_figure, telling_map, write_driven
+from benchnav.eval.report.driven import (
+    GROUND,
+    MOST_PATHS,
+    DrivenGround,
+    driven_figure,
+    telling_map,
+    write_driven,
+)
 from benchnav.eval.report.ground import HOLDING
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
@@ -14,7 +21,7 @@ from tests.eval.report.test_write import run_folder
 RISKS = ("mean", "cvar:0.5", "cvar:0.9")
 
 
-def ground(**changes: Any) -> Ground:
+def ground(**changes: Any) -> DrivenGround:
     field = np.linspace(0, 1, 40 * 60, dtype=np.float32).reshape(40, 60)
     about = {
         "data": "paper-v1",
@@ -28,7 +35,7 @@ def ground(**changes: Any) -> Ground:
         "about": about, "resolution_m": 0.5, "rgb": np.full((3, 40, 60), 100, np.uint8), "field": field,
         "holding": field < 0.1, "goal_m": np.array([24.0, 15.0], np.float32),
     }  # fmt: skip
-    return Ground(**(given | changes))
+    return DrivenGround(**(given | changes))
 
 
 def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
@@ -184,7 +191,7 @@ def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: P
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
     for one in (ground(), ground(field=None)):
         one.save(tmp_path / "a.npz")
-        again = Ground.load(tmp_path / "a.npz")
+        again = DrivenGround.load(tmp_path / "a.npz")
         assert (again.about, again.resolution_m) == (one.about, 0.5)
         assert (again.field is None) == (one.field is None)
         np.testing.assert_array_equal(again.holding, one.holding)

@@ -4,8 +4,6 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.report.findings import findings, p_in_words
-from benchnav.eval.stats.best import against_best
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 NONE = pd.DataFrame({"trial": [], "last_traversability": []})
@@ -24,9 +22,7 @@ def said(*trials: list[dict[str, Any]], failures: pd.DataFrame = NONE, told: Any
 
 
 def summary_of(*trials: list[dict[str, Any]]) -> pd.DataFrame:
-    rows = made.rows(*trials)
-    summary = summarise(rows)
-    return summary.merge(against_best(rows, summary), on="trial")
+    return made.summary(made.rows(*trials))
 
 
 def test_a_best_that_is_told_apart_from_all_others() -> None:

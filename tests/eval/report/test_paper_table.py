@@ -3,8 +3,6 @@ import re
 import pytest
 
 from benchnav.eval.report.paper_table import paper_table
-from benchnav.eval.stats.best import against_best
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 
@@ -12,8 +10,7 @@ def table_of(*trials: tuple[dict[str, str], int]) -> str:
     rows = made.rows(
         *([made.row(labels, i, 20.0 if i < n else None) for i in range(40)] for labels, n in trials)
     )
-    summary = summarise(rows)
-    return paper_table(summary.merge(against_best(rows, summary), on="trial"), "run_1")
+    return paper_table(made.summary(rows), "run_1")
 
 
 def body(text: str) -> list[list[str]]:

@@ -6,21 +6,19 @@ import pandas as pd
 import pytest
 
 from benchnav.errors import BenchnavError
-from benchnav.eval.report.charts.failure_sheet import Ground
+from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.sheets import Sheets, collect_sheets
-from benchnav.eval.stats.best import against_best
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 RATES = {"mean": 2, "var": 5, "cvar": 8}
 
 
-def ground_of(failures: pd.DataFrame) -> Ground:
+def ground_of(failures: pd.DataFrame) -> FailedGround:
     """λ̂ is a hundredth of the instance; the goal's x is the instance."""
     count = len(failures)
     instance = failures["instance"].to_numpy(dtype=float)
-    return Ground(
+    return FailedGround(
         predicted=np.ones((count, 8, 8)) * instance[:, None, None] / 100,
         holding=np.zeros((count, 8, 8), bool),
         resolution_m=1.0,
@@ -47,8 +45,7 @@ def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, di
             for row in rows.to_dict("records")
         ]
         pd.concat(parts).to_parquet(folder / "steps.parquet", index=False)
-    summary = summarise(rows)
-    summary = summary.merge(against_best(rows, summary), on="trial")
+    summary = made.summary(rows)
     sheets = collect_sheets(folder, summary, failures_table(folder, rows), ground)
     return sheets, dict(zip(summary["risk"], summary["trial"], strict=True))
 
@@ -78,7 +75,7 @@ def test_a_planner_that_is_told_nothing_has_no_sheet(tmp_path: Path, monkeypatch
 
 
 def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:
-    def gone(failures: pd.DataFrame) -> Ground:
+    def gone(failures: pd.DataFrame) -> FailedGround:
         raise BenchnavError("Expected a dataset, got none.")
 
     sheets, _ = collected(tmp_path, gone)

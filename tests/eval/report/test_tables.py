@@ -5,7 +5,6 @@ import pytest
 
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.tables import failures_in_words, result_table
-from benchnav.eval.stats.best import against_best
 from benchnav.eval.stats.summary import LABELS, summarise
 from tests.eval.report import made
 
@@ -13,9 +12,7 @@ BLIND = {"planner": "straight", "risk": "–", "model": "–"}
 
 
 def table_of(episodes, **notes):  # type: ignore[no-untyped-def]
-    summary = summarise(episodes)
-    summary = summary.merge(against_best(episodes, summary), on="trial")
-    return result_table(summary, made.trials(episodes, **notes))
+    return result_table(made.summary(episodes), made.trials(episodes, **notes))
 
 
 def test_golden_table() -> None:

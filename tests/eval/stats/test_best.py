@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from benchnav.eval.stats.best import against_best, competing
+from benchnav.eval.stats.best import TOLD, against_best, competing, told_the_truth
 from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
@@ -18,7 +18,7 @@ def episodes(labels: dict[str, str], successes: range, **changes: object) -> lis
 def compared(*trials: list[dict]) -> pd.DataFrame:  # type: ignore[type-arg]
     rows = made.rows(*trials)
     summary = summarise(rows)
-    found = against_best(rows, summary)
+    found = against_best(rows, summary, told_the_truth(made.trials(rows)))
     assert list(found["trial"]) == list(summary["trial"])
     return found.assign(risk=summary["risk"], model=summary["model"]).set_index("risk")
 
@@ -117,8 +117,21 @@ def test_the_difference_that_can_be_shown_is_at_the_level_of_the_first_step() ->
 def test_what_is_told_the_truth_competes_only_where_nothing_else_does(
     models: list[str], left: list[str]
 ) -> None:
-    rows = pd.DataFrame({"model": models})
+    rows = pd.DataFrame({"model": models, "told": [model if model in TOLD else "" for model in models]})
     assert list(rows["model"][competing(rows)]) == left
+
+
+def test_a_yardstick_is_known_by_its_part_and_not_by_its_name() -> None:
+    def about(part: str, label: str) -> dict[str, object]:
+        return {"value": {"model": {"part": part, "options": {}}}, "labels": {"model": label}}
+
+    trials = {
+        "a": about("oracle", "truth"),
+        "b": about("checkpoints/mine", "oracle"),
+        "c": about("oracle", "–"),
+    }
+    old = {"d": {"value": {}, "labels": {}}}  # as format version 1 had it
+    assert told_the_truth(trials | old) == {"a": "oracle"}
 
 
 def test_yardsticks_are_not_compared() -> None:

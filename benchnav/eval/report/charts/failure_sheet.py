@@ -20,7 +20,7 @@ ACROSS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ground:
+class FailedGround:
     """The ground of failed episodes of one trial.
 
     Args:
@@ -59,7 +59,7 @@ class Shown:
 
     name: str
     failures: pd.DataFrame
-    ground: Ground
+    ground: FailedGround
     tracks: Sequence[np.ndarray]
     among: int
 

@@ -8,12 +8,9 @@ ended, and time series; and a blueprint that arranges them.
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from benchnav.eval.report.contenders import contender_names, trial_colours
 from benchnav.eval.report.playback.blueprint import arrange
 from benchnav.eval.report.playback.robot import (
-    TIMELINE,
     Driver,
     log_driven,
     log_outcome,
@@ -72,31 +69,6 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
         Driver(recording=recording, name=name, colour=colour)
         for recording, name, colour in zip(recordings, names, colours, strict=True)
     ]
-
-
-def read_path(path: Path, entity: str = "/world/robot") -> tuple[np.ndarray, np.ndarray]:
-    """Reads a robot's path back from a file.
-
-    Args:
-        path: an `.rrd` file.
-        entity: the robot.
-
-    Returns:
-        Times in seconds, shape [N + 1], and positions (x, y, z) in metres, float32, shape [N + 1, 3].
-    """
-    from rerun.chunk import RrdReader
-
-    times, positions = [], []
-    for chunk in RrdReader(path).stream():
-        if chunk.entity_path != entity or TIMELINE not in chunk.timeline_names:
-            continue
-        batch = chunk.to_record_batch()
-        column = next(name for name in batch.schema.names if name.endswith("positions"))
-        times.append(batch.column(TIMELINE).to_numpy(zero_copy_only=False).astype("timedelta64[ns]"))
-        positions += [row[0] for row in batch.column(column).to_pylist()]
-    when = np.concatenate(times).astype(np.int64) * 1e-9
-    order = np.argsort(when, kind="stable")
-    return when[order], np.asarray(positions, dtype=np.float32)[order]
 
 
 def _title(drivers: Sequence[Driver]) -> str:

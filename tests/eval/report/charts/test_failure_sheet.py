@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.eval.report.charts.failure_sheet import Ground, Shown, choose, failure_sheet
+from benchnav.eval.report.charts.failure_sheet import FailedGround, Shown, choose, failure_sheet
 
 GENERATOR = np.random.default_rng(0)
 
@@ -18,12 +18,12 @@ def failures(outcomes: list[str], **changes: Any) -> pd.DataFrame:
     return pd.DataFrame(columns | changes)
 
 
-def ground(count: int, **changes: Any) -> Ground:
+def ground(count: int, **changes: Any) -> FailedGround:
     made = {
         "predicted": GENERATOR.random((count, 8, 12)), "holding": np.zeros((count, 8, 12), bool),
         "resolution_m": 0.5, "goal_m": np.full((count, 2), 3.0),
     }  # fmt: skip
-    return Ground(**(made | changes))
+    return FailedGround(**(made | changes))
 
 
 def shown(rows: pd.DataFrame, **changes: Any) -> Shown:

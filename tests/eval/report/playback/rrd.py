@@ -51,3 +51,9 @@ def static(path: Path, entity: str, name: str) -> np.ndarray:
 def image(path: Path, entity: str, shape: tuple[int, int] = (40, 60)) -> np.ndarray:
     """An image as the map has it: its first row is at the bottom."""
     return static(path, entity, "buffer").astype(np.uint8).reshape(*shape, 3)[::-1]
+
+
+def read_path(path: Path, entity: str = "/world/robot") -> tuple[np.ndarray, np.ndarray]:
+    """A robot's path: times in seconds, [N + 1], and positions (x, y, z) in metres, [N + 1, 3]."""
+    times, positions = column(path, entity, "positions")
+    return times, np.array([place for (place,) in positions], np.float32)  # type: ignore[misc]

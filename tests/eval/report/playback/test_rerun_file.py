@@ -9,10 +9,10 @@ import pytest
 
 from benchnav.eval.report.drawn_plan import MOST_POINTS, DrawnPlan, thinned
 from benchnav.eval.report.ground import HOLDING, field_colours, hatching, outline
-from benchnav.eval.report.playback.rerun_file import read_path, write_rerun
+from benchnav.eval.report.playback.rerun_file import write_rerun
 from benchnav.eval.report.recording import Recording
 from tests.eval.report import made
-from tests.eval.report.playback.rrd import chunks, column, image, static, verify
+from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
 
 
 def written(folder: Path, *recordings: Recording) -> Path:
