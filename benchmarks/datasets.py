@@ -22,10 +22,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchnav.datagen import schema
-from benchnav.datagen.create import create
-from benchnav.datagen.generate import generate
-from benchnav.datagen.maps import TerrainMaps
-from benchnav.datagen.scenario import Recipe, load_recipe
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.maps import TerrainMaps
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.datagen.synth.generate import generate
 
 REPEATS = 7
 READS = 3000

@@ -27,17 +27,18 @@ from rich.table import Table
 from torch import Tensor
 
 from benchnav import rng
-from benchnav.datagen.create import create
-from benchnav.datagen.latent import TerrainClass, latent_mean
-from benchnav.datagen.scenario import load_recipe
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.recipe.latent import latent_mean
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.cells import Cells, read_cells
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.scores import coverage, crps, pit, tail_rate
-from benchnav.models.slope_sums import SlopeSums, sum_cells, sum_split
-from benchnav.models.slope_table import SlopeTable
-from benchnav.models.training import fit_gps
+from benchnav.models.quality.scores import coverage, crps, pit, tail_rate
+from benchnav.models.slope_gp.cells import Cells, read_cells
+from benchnav.models.slope_gp.sums import SlopeSums, sum_cells, sum_split
+from benchnav.models.slope_gp.table import SlopeTable
+from benchnav.models.training.train import fit_gps
 from benchnav.terrain import Terrain
 
 REPEATS = 5

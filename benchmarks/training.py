@@ -19,13 +19,13 @@ from lightning.pytorch.callbacks import Callback
 from rich.console import Console
 from rich.table import Table
 
-from benchnav.datagen.create import create
-from benchnav.datagen.scenario import load_recipe
-from benchnav.datagen.store import TerrainDataset
-from benchnav.models.classifier import TerrainClassifier
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.data import MapData
-from benchnav.models.fitting import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.training.data import MapData
+from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
 
 EPOCHS = 2
 

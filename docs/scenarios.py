@@ -21,14 +21,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchnav import rng
-from benchnav.datagen.generate import generate
-from benchnav.datagen.latent import latent_mean, latent_std
-from benchnav.datagen.scenario import Recipe, load_recipe, recipe_from_dict
+from benchnav.datagen.recipe.latent import latent_mean, latent_std
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
+from benchnav.datagen.synth.generate import generate
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.calibration import pit
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import find_checkpoint
+from benchnav.models.quality.measure import pit
 from benchnav.terrain import Observation
 
 DOCS, MODEL = Path(__file__).parent, "paper-v1"

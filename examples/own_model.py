@@ -21,14 +21,14 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from benchnav.datagen.create import create
-from benchnav.datagen.scenario import load_recipe
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.calibration import evaluate
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
 from benchnav.models.contract import check_model
 from benchnav.models.predictor import load_model
+from benchnav.models.quality.measure import evaluate
 from benchnav.registry import register
 from benchnav.terrain import Observation
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
-from benchnav.datagen.create import create
-from benchnav.datagen.scenario import Recipe, load_recipe
+from benchnav.datagen.files.create import create
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective

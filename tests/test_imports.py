@@ -10,24 +10,43 @@ PACKAGE = Path(__file__).parent.parent / "benchnav"
 # The values that the drawers of `planning` share, and the shells that Gymnasium is given.
 VALUES = ("free_space", "objective", "problem", "risk", "robots")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
+SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
+# Whatever is known of models beside their training and their quality.
+MODELS = tuple(
+    f"models.{name}"
+    for name in ("slope_gp", "nets", "checkpoint", "config", "fused", "predictor", "probabilities")
+)
+# Of reports, how an episode is recorded and the map that a figure shows is kept.
+RECORDED = ("eval.report.recorded", "eval.report.playback.files", "eval.report.charts.driven")
+VALUES_OF_EVAL = ("eval.suite", "eval.trial", "eval.unit", "eval.keep")
 
 # What the modules of a drawer may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "": (),
     "datagen": ("datagen",),
+    "datagen/schema.py": (),
+    "datagen/recipe": ("datagen.recipe", "datagen.schema"),
+    "datagen/synth": ("datagen.synth", "datagen.recipe", "datagen.schema"),
+    "datagen/files": ("datagen.files", *SYNTHESIS),
+    "datagen/dem": ("datagen.dem", "datagen.files", *SYNTHESIS),
     "models": ("models", "datagen"),
+    "models/slope_gp": ("models.slope_gp", "models.config", "datagen"),
+    "models/nets": ("models.nets", "models.checkpoint", "models.config", "datagen"),
+    "models/training": ("models.training", *MODELS, "datagen"),
+    "models/quality": ("models.quality", *MODELS, "datagen"),
     "planning": PLANNING,
     "planning/world": (*PLANNING, "planning.world"),
     "planning/planners": (*PLANNING, "planning.planners"),
     "planning/env.py": (*PLANNING, "planning.world", "planning.env_batch"),
-    "planning/env_batch.py": (*PLANNING, "planning.world", "datagen.store"),
+    "planning/env_batch.py": (*PLANNING, "planning.world", "datagen.files.reader"),
     "eval": ("eval", "models", "planning", "datagen"),
-    "eval/run": ("eval.run", "eval.suite", "eval.trial", "models", "planning", "datagen"),
+    "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
+    "eval/run": ("eval.run", "eval.folder", *RECORDED, *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/stats": ("eval.stats", "eval.trial", "planning"),
     "eval/report": (
-        *("eval.report", "eval.stats", "eval.run.folder", "eval.run.steps", "eval.suite", "eval.trial"),
+        *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
         "planning",
-        "models.quality_report",  # how scenarios are named that make a ladder
+        "models.quality.report",  # how scenarios are named that make a ladder
     ),
 }
 
@@ -89,14 +108,14 @@ def test_imports_go_one_way(place: Path) -> None:
     [
         ("registry.py", "benchnav.errors", True),
         ("registry.py", "benchnav.planning.robots", False),
-        ("datagen/store.py", "benchnav.models.config", False),
-        ("models/data.py", "benchnav.datagen.store", True),
+        ("datagen/files/reader.py", "benchnav.models.config", False),
+        ("models/training/data.py", "benchnav.datagen.files.reader", True),
         ("models/fused.py", "benchnav.planning.risk", False),
         ("planning/problem.py", "benchnav.planning.objective", True),
         ("planning/problem.py", "benchnav.planning.planners.planner", False),
-        ("planning/problem.py", "benchnav.datagen.store", False),
-        ("planning/env_batch.py", "benchnav.datagen.store", True),
-        ("planning/env_batch.py", "benchnav.datagen.generate", False),
+        ("planning/problem.py", "benchnav.datagen.files.reader", False),
+        ("planning/env_batch.py", "benchnav.datagen.files.reader", True),
+        ("planning/env_batch.py", "benchnav.datagen.synth.generate", False),
         ("planning/env.py", "benchnav.planning.planners.mppi", False),
         ("planning/world/simulation.py", "benchnav.planning.problem", True),
         ("planning/world/simulation.py", "benchnav.planning.planners.planner", False),
@@ -108,11 +127,20 @@ def test_imports_go_one_way(place: Path) -> None:
         ("eval/stats/summary.py", "benchnav.eval.run.rows", False),
         ("eval/stats/summary.py", "benchnav.eval.report.tables", False),
         ("eval/report/tables.py", "benchnav.eval.stats.summary", True),
-        ("eval/report/tables.py", "benchnav.eval.run.folder", True),
+        ("eval/report/tables.py", "benchnav.eval.folder.folder", True),
         ("eval/report/tables.py", "benchnav.eval.run.rollout", False),
         ("eval/report/tables.py", "benchnav.models.predictor", False),
-        ("eval/runner.py", "benchnav.eval.report.write", True),
-        ("eval/runner.py", "benchnav.eval.cli", False),
+        ("eval/run/runner.py", "benchnav.eval.report.write", False),
+        ("eval/run/runner.py", "benchnav.eval.cli", False),
+        ("eval/run/recorder.py", "benchnav.eval.report.recorded.recording", True),
+        ("eval/folder/folder.py", "benchnav.eval.run.runner", False),
+        ("datagen/recipe/recipe.py", "benchnav.datagen.synth.generate", False),
+        ("datagen/synth/generate.py", "benchnav.datagen.files.reader", False),
+        ("datagen/files/reader.py", "benchnav.datagen.dem.importer", False),
+        ("models/nets/classifier.py", "benchnav.models.training.fit", False),
+        ("models/slope_gp/gp.py", "benchnav.models.training.fit", False),
+        ("models/training/fit.py", "benchnav.models.quality.measure", False),
+        ("models/quality/measure.py", "benchnav.models.nets.classifier", True),
         ("eval/cli.py", "benchnav.models.cli", False),
     ],
 )

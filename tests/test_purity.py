@@ -8,14 +8,16 @@ import pytest
 import torch
 
 from benchnav import gridgraph, registry, rng
-from benchnav.datagen import appearance, elevation, latent
-from benchnav.datagen.block import Block
-from benchnav.datagen.generate import generate
-from benchnav.datagen.scenario import load_recipe
+from benchnav.datagen.files.block import Block
+from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.schema import entry_digests
+from benchnav.datagen.synth import appearance, slope
+from benchnav.datagen.synth.generate import generate
 from benchnav.planning import risk
-from benchnav.planning.planners import astar, mppi
-from benchnav.planning.planners.dwa import DWAConfig, judge, velocity_window
+from benchnav.planning.planners import mppi
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.planners.astar.dwa import DWAConfig, judge, velocity_window
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, end
@@ -52,7 +54,7 @@ def test_datagen() -> None:
     light = appearance.light_direction(np.zeros(2), np.full(2, 0.5))
     classes = load_recipe("paper-v1").classes
     colours = np.full((10, 3), 99.0)
-    same_after(lambda: elevation.slope_deg(z, 0.5), z)
+    same_after(lambda: slope.slope_deg(z, 0.5), z)
     same_after(lambda: appearance.shade(z, 0.5, light, 0.1), z, light)
     same_after(lambda: appearance.paint(class_id, colours, z), class_id, colours, z)
     same_after(lambda: appearance.class_bands(z, np.array([0.5, 0.5])), z)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from benchnav.command import INTERRUPTED, Command, run
 
 if TYPE_CHECKING:
-    from benchnav.datagen.store import TerrainDataset
+    from benchnav.datagen.files.reader import TerrainDataset
 
 
 def create(
@@ -37,10 +37,10 @@ def create(
     from rich.console import Console
 
     from benchnav.command import show_progress
-    from benchnav.datagen.create import create as create_dataset
     from benchnav.datagen.difficulty import explain, table
-    from benchnav.datagen.scenario import load_recipe
-    from benchnav.datagen.store import TerrainDataset
+    from benchnav.datagen.files.create import create as create_dataset
+    from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.datagen.recipe.recipe import load_recipe
     from benchnav.errors import ConfigError
 
     if jobs < 1:
@@ -76,8 +76,8 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
-    from benchnav.datagen.scenario import load_recipe, shipped_recipes
-    from benchnav.datagen.store import TerrainDataset, dataset_folders
+    from benchnav.datagen.files.reader import TerrainDataset, dataset_folders
+    from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
     from benchnav.errors import DatasetError
 
     print("recipes:")
@@ -110,8 +110,8 @@ def show(file: str, json: bool = False) -> None:
 
     from rich.console import Console
 
-    from benchnav.datagen.describe import describe, tables
-    from benchnav.datagen.store import TerrainDataset, find_dataset
+    from benchnav.datagen.files.describe import describe, tables
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
     described = describe(TerrainDataset(find_dataset(file)))
     if json:
@@ -128,8 +128,8 @@ def validate(file: str) -> int:
     Args:
         file: Path or id of a dataset.
     """
-    from benchnav.datagen.store import TerrainDataset, find_dataset
-    from benchnav.datagen.validate import find_faults, summarise
+    from benchnav.datagen.files.check import find_faults, summarise
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.errors import DatasetError
 
     path = find_dataset(file)
@@ -155,10 +155,10 @@ def repair(file: str) -> None:
         file: Path or id of a dataset.
     """
     from benchnav.command import show_progress
-    from benchnav.datagen.repair import maps_to_make
-    from benchnav.datagen.repair import repair as repair_dataset
-    from benchnav.datagen.store import TerrainDataset, find_dataset
-    from benchnav.datagen.validate import find_faults
+    from benchnav.datagen.files.check import find_faults
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+    from benchnav.datagen.files.repair import maps_to_make
+    from benchnav.datagen.files.repair import repair as repair_dataset
 
     path = find_dataset(file)
     faults = find_faults(path)
@@ -184,8 +184,8 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
         overwrite: Replace a file that is there.
     """
     from benchnav.command import show_progress
-    from benchnav.datagen.merge import merge as merge_datasets
-    from benchnav.datagen.store import TerrainDataset, find_dataset
+    from benchnav.datagen.files.merge import merge as merge_datasets
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
     path = Path(out).expanduser()
     sources = [find_dataset(file) for file in files]
@@ -222,9 +222,9 @@ def import_dem(
         overwrite: Replace a file that is there.
     """
     from benchnav.command import show_progress
-    from benchnav.datagen.dem import import_dem as import_maps
-    from benchnav.datagen.scenario import load_recipe
-    from benchnav.datagen.store import TerrainDataset
+    from benchnav.datagen.dem.importer import import_dem as import_maps
+    from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.datagen.recipe.recipe import load_recipe
 
     path = Path(out).expanduser()
     steps = import_maps(
@@ -263,8 +263,8 @@ def preview(
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
         contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.datagen.preview import save_contact_sheet, save_preview
-    from benchnav.datagen.store import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
     from benchnav.files import replacing
 

@@ -11,11 +11,11 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from benchnav.datagen import latent
-from benchnav.datagen.block import BLOCK_MAPS, spans
-from benchnav.datagen.generate import Maps
-from benchnav.datagen.scenario import Recipe
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.block import BLOCK_MAPS, spans
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.recipe import Recipe
+from benchnav.datagen.synth.generate import Maps
 from benchnav.terrain import Grid
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")

@@ -23,9 +23,9 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 
-from benchnav.datagen.appearance import light_direction, shade
-from benchnav.datagen.latent import TerrainClass
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.errors import ConfigError
 from benchnav.terrain import Grid
 

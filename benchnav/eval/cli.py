@@ -12,7 +12,7 @@ from benchnav.eval.suite import RENAMED, Suite
 
 if TYPE_CHECKING:
     from benchnav.eval.report.write import Report
-    from benchnav.eval.runner import Workers
+    from benchnav.eval.run.runner import Workers
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -42,8 +42,8 @@ def run_command(
     """
     from benchnav.command import show_progress
     from benchnav.errors import ConfigError
-    from benchnav.eval.run.shard import read_shard
-    from benchnav.eval.runner import run_suite
+    from benchnav.eval.folder.shard import read_shard
+    from benchnav.eval.run.runner import run_suite
 
     workers = _workers(jobs, backend, scheduler)
     share = read_shard(shard)
@@ -69,7 +69,7 @@ def merge(out: str, parts: list[str]) -> int:
         parts: Folders of all the run's shards, in any order.
     """
     from benchnav.command import show_progress
-    from benchnav.eval.merge import merge_shards
+    from benchnav.eval.run.merge import merge_shards
 
     folder = Path(out)
     show_progress(merge_shards([Path(part) for part in parts], folder), "units")
@@ -95,8 +95,8 @@ def rerun(
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
     from benchnav.command import show_progress
-    from benchnav.eval.rerun import compare
-    from benchnav.eval.rerun import rerun as rerun_all
+    from benchnav.eval.run.rerun import compare
+    from benchnav.eval.run.rerun import rerun as rerun_all
 
     workers = _workers(jobs, backend, scheduler)
     original = Path(folder)
@@ -178,7 +178,7 @@ def compare(
 
 def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
     from benchnav.errors import ConfigError
-    from benchnav.eval.runner import Workers
+    from benchnav.eval.run.runner import Workers
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
@@ -223,7 +223,7 @@ def _print_recorded(folder: Path) -> None:
 def _print_replay(folder: Path) -> None:
     import yaml
 
-    from benchnav.eval.run.folder import open_run
+    from benchnav.eval.folder.folder import open_run
     from benchnav.eval.trial import NOT_USED
 
     every = [trial.labels for trial, _ in open_run(folder).trials.values()]
@@ -239,7 +239,7 @@ def _print_replay(folder: Path) -> None:
 
 def _failed(folder: Path) -> int:
     """Exit status of a finished run: 1 where a planner or model failed, which one line says."""
-    from benchnav.eval.run.folder import EPISODES, ERRORS, read_table
+    from benchnav.eval.folder.folder import EPISODES, ERRORS, read_table
 
     rows = read_table(folder, EPISODES)
     faults = {kind: int((rows["outcome"] == kind).sum()) for kind in ("planner_error", "model_error")}
@@ -255,7 +255,7 @@ def _failed(folder: Path) -> int:
 
 def _failed_shard(folder: Path) -> int:
     """Exit status of a finished shard, which has no table yet."""
-    from benchnav.eval.run.folder import ERRORS
+    from benchnav.eval.folder.folder import ERRORS
 
     if not (folder / ERRORS).exists():
         return 0

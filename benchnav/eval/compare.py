@@ -10,10 +10,10 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import EPISODES, Run, open_run, read_table
 from benchnav.eval.report.comparison import comparison_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import ResultTable
-from benchnav.eval.run.folder import EPISODES, Run, open_run, read_table
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, Pair, find_pairs
 from benchnav.eval.stats.summary import LABELS

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.folder import provenance
+from benchnav.eval.folder.folder import Run, open_run
 from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.sheets import GroundOf
-from benchnav.eval.run import provenance
 from benchnav.eval.run.episode import build, one_thread
-from benchnav.eval.run.folder import Run, open_run
-from benchnav.eval.run.unit import Unit
 from benchnav.eval.trial import Trial
+from benchnav.eval.unit import Unit
 from benchnav.sources import digest_of
 
 

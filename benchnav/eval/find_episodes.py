@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchnav.errors import ConfigError
-from benchnav.eval.run.folder import open_run
-from benchnav.eval.run.keep import Keep
-from benchnav.eval.run.unit import Extent, Unit, units
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.keep import Keep
 from benchnav.eval.trial import NOT_USED, Trial
+from benchnav.eval.unit import Extent, Unit, units
 
 _COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
 

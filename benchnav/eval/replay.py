@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from benchnav.errors import ConfigError
 
 if TYPE_CHECKING:
-    from benchnav.eval.report.recording import Recording
-    from benchnav.eval.run.unit import Unit
+    from benchnav.eval.report.recorded.recording import Recording
+    from benchnav.eval.unit import Unit
 
 VIDEO = ".mp4"
 
@@ -110,7 +110,7 @@ def program(name: str) -> str:
 
 
 def _recordings(folder: Path, found: "list[tuple[Unit, int]]") -> "list[Recording]":
-    from benchnav.eval.recorder import find_recording
+    from benchnav.eval.run.recorder import find_recording
 
     return [find_recording(folder, unit, member) for unit, member in found]
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from benchnav.errors import ConfigError
-from benchnav.eval.run.keep import Keep, Record, Steps
+from benchnav.eval.keep import Keep, Record, Steps
 
 PartSpec = str | dict[str, Any]
 

@@ -73,7 +73,7 @@ class Checkpoint:
         class_names: names of the C classes, in the order of their ids.
         parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
         model: registered name of the family that rebuilds the model.
-        pool_temperature: of the averaged probabilities of several classifiers (see `models.temperature`);
+        pool_temperature: of the averaged probabilities of several classifiers (see `models.training.temperature`);
             1 changes nothing.
     """
 

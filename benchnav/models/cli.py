@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from benchnav.command import INTERRUPTED, Command, run
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig
-from benchnav.models.evaluate import evaluate
+from benchnav.models.quality.command import evaluate
 
 if TYPE_CHECKING:
-    from benchnav.datagen.store import TerrainDataset
+    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.models.checkpoint import Part
-    from benchnav.models.fitting import FitOptions
-    from benchnav.models.latent_gp import LatentGPs
-    from benchnav.models.target import Target
+    from benchnav.models.slope_gp.gp import LatentGPs
+    from benchnav.models.training.fit import FitOptions
+    from benchnav.models.training.target import Target
 
 _HELD_OUT = 0.1  # of slip logs
 _FEW_ROWS = 10  # of a class in slip logs
@@ -74,7 +74,7 @@ def train_gp(
         trainer: Settings of Lightning's trainer, of which the accelerator alone counts.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
-    from benchnav.models.fitting import FitOptions
+    from benchnav.models.training.fit import FitOptions
 
     options = FitOptions(trainer=trainer or {})
     if data.endswith((".csv", ".parquet")):
@@ -142,9 +142,10 @@ def train_mdn(
         overwrite: Replace a checkpoint that is there.
     """
     from benchnav.models.checkpoint import Checkpoint, Part
-    from benchnav.models.mdn import MDN, fit_mdn
-    from benchnav.models.target import open_target
-    from benchnav.models.training import training_digest
+    from benchnav.models.nets.mdn import MDN
+    from benchnav.models.training.target import open_target
+    from benchnav.models.training.train import training_digest
+    from benchnav.models.training.train_mdn import fit_mdn
 
     dataset = _open_dataset(data)
     mdn, options = _options(out, mdn, trainer, resume)
@@ -170,7 +171,7 @@ def train_mdn(
 
 
 def _open_dataset(data: str) -> "TerrainDataset":
-    from benchnav.datagen.store import TerrainDataset, find_dataset
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.errors import DatasetError
 
     dataset = TerrainDataset(find_dataset(data))
@@ -187,7 +188,7 @@ def _options(
 ) -> "tuple[Config, FitOptions]":
     """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
     from benchnav.models.checkpoint import training_folder
-    from benchnav.models.fitting import FitOptions
+    from benchnav.models.training.fit import FitOptions
 
     settings = dict(trainer or {})
     if "max_epochs" in settings:
@@ -208,8 +209,8 @@ def _open_target(
     out: str, dataset: "TerrainDataset", parts: list[str], options: "FitOptions", overwrite: bool
 ) -> "Target":
     from benchnav.models.checkpoint import Checkpoint
-    from benchnav.models.target import open_target
-    from benchnav.models.training import training_digest
+    from benchnav.models.training.target import open_target
+    from benchnav.models.training.train import training_digest
 
     fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes))
     return open_target(Path(out), fresh, parts, training_digest(dataset), options, overwrite)
@@ -234,10 +235,10 @@ def _train_members(
 def _calibrate_pool(target: "Target", dataset: "TerrainDataset", seed: int) -> None:
     """Fits the temperature of the pool of all classifiers that are there, as they are kept."""
     from benchnav.models.checkpoint import as_stored, member_names
-    from benchnav.models.classifier import TerrainClassifier
-    from benchnav.models.data import VALID, read_maps
-    from benchnav.models.fitting import is_first_process
-    from benchnav.models.temperature import fit_pool_temperature
+    from benchnav.models.nets.classifier import TerrainClassifier
+    from benchnav.models.training.data import VALID, read_maps
+    from benchnav.models.training.fit import is_first_process
+    from benchnav.models.training.temperature import fit_pool_temperature
 
     there = target.checkpoint
     parts = [there.part(name) for name in member_names(there)]
@@ -262,7 +263,7 @@ def _fit_classifier(
     half_precision: bool,
 ) -> "Part":
     from benchnav.models.checkpoint import Part
-    from benchnav.models.training import fit_classifier, training_digest
+    from benchnav.models.training.train import fit_classifier, training_digest
 
     model, metrics = fit_classifier(config, dataset, seed, options, part, half_precision)
     _say(
@@ -282,10 +283,10 @@ def _fit_classifier(
 
 
 def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions") -> "Part":
-    from benchnav.models.calibration import measure_latent, read_chunks
     from benchnav.models.checkpoint import Part
-    from benchnav.models.slope_sums import sum_split
-    from benchnav.models.training import fit_gps, training_digest
+    from benchnav.models.quality.measure import measure_latent, read_chunks
+    from benchnav.models.slope_gp.sums import sum_split
+    from benchnav.models.training.train import fit_gps, training_digest
 
     model = fit_gps(config, sum_split(dataset, "train"), options)
     _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
@@ -308,12 +309,12 @@ def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, option
 def _train_gp_on_logs(
     data: str, out: str, config: LatentGPConfig, seed: int, options: "FitOptions", overwrite: bool
 ) -> None:
-    from benchnav.models.cells import cell_nll, hold_out
     from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
-    from benchnav.models.slip_logs import read_slip_logs
-    from benchnav.models.slope_sums import SlopeSums
-    from benchnav.models.target import open_target
-    from benchnav.models.training import fit_gps
+    from benchnav.models.slope_gp.cells import cell_nll, hold_out
+    from benchnav.models.slope_gp.slip_logs import read_slip_logs
+    from benchnav.models.slope_gp.sums import SlopeSums
+    from benchnav.models.training.target import open_target
+    from benchnav.models.training.train import fit_gps
 
     logs = read_slip_logs(data)
     there = load_checkpoint(out) if (Path(out) / CONFIG).is_file() else None
@@ -384,7 +385,7 @@ def _say_soft_modes(model: "LatentGPs", class_names: "Sequence[str]") -> None:
 
 
 def _say(line: str) -> None:
-    from benchnav.models.fitting import is_first_process
+    from benchnav.models.training.fit import is_first_process
 
     if is_first_process():
         print(line)

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.datagen.generate import generate
-from benchnav.datagen.scenario import Split, load_recipe
-from benchnav.datagen.store import terrain_of
+from benchnav.datagen.files.reader import terrain_of
+from benchnav.datagen.recipe.recipe import Split, load_recipe
+from benchnav.datagen.synth.generate import generate
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import AnyModel, predict

@@ -14,7 +14,7 @@ from benchnav.errors import BenchnavError, CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import GP, Checkpoint, member_names
 from benchnav.models.probabilities import sharpen
-from benchnav.models.slope_table import SlopeTable
+from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.terrain import Observation
 
 CHUNK_CELLS = 2**17
@@ -30,7 +30,7 @@ class FusedModel:
         classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         table: the GPs over slope.
         class_names: names of the C classes.
-        pool_temperature: of the averaged probabilities (see `models.temperature`).
+        pool_temperature: of the averaged probabilities (see `models.training.temperature`).
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class FusedModel:
         Raises:
             CheckpointError: a half is missing, or its tensors do not fit its settings.
         """
-        from benchnav.models.classifier import TerrainClassifier
+        from benchnav.models.nets.classifier import TerrainClassifier
 
         names = checkpoint.class_names
         members = [checkpoint.part(name) for name in member_names(checkpoint)]

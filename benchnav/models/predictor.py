@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+import benchnav
 from benchnav import registry
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
@@ -29,8 +30,8 @@ from benchnav.models.checkpoint import (
 from benchnav.terrain import Observation, Terrain
 
 if TYPE_CHECKING:
-    from benchnav.datagen.scenario import Recipe
-    from benchnav.datagen.store import TerrainDataset
+    from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.datagen.recipe.recipe import Recipe
 
 
 class Model(Protocol):
@@ -302,7 +303,7 @@ def _as_part(source: Source) -> registry.Part | Path:
 
 
 def _checkpoint_folders() -> tuple[Path, Path]:
-    return Path("checkpoints"), Path(__file__).parents[2] / "checkpoints"
+    return Path("checkpoints"), Path(benchnav.__file__).parents[1] / "checkpoints"
 
 
 def _near_path(path: Path) -> str:

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from benchnav import registry, rng
-from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.errors import ConfigError
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective, distance

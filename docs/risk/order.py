@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchnav.eval.compare import read_trials
-from benchnav.eval.run.folder import open_run
+from benchnav.eval.folder.folder import open_run
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Pair, find_pairs
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
-from benchnav.datagen.latent import SoftSpots, TerrainClass
-from benchnav.datagen.places import PlacesRule
-from benchnav.datagen.scenario import Recipe, Split, load_recipe
+from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass
+from benchnav.datagen.recipe.places import PlacesRule
+from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe
 
 SOFT = SoftSpots(weight=0.1, mean=0.05, std=0.05)
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from benchnav.datagen import cli
-from benchnav.datagen.block import Block
-from benchnav.datagen.latent import SoftSpots
-from benchnav.datagen.scenario import load_recipe, shipped_recipes
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.block import Block
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import SoftSpots
+from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.errors import ConfigError
 
 Call = Callable[..., int]
 
 SMALL = ["id=small", "splits.train.maps=3", "splits.valid.maps=1"]
-RECIPE = (Path(cli.__file__).parent / "recipes" / "tiny-v1.yaml").read_text()
+RECIPE = (Path(cli.__file__).parent / "recipe" / "tiny-v1.yaml").read_text()
 
 
 @pytest.fixture

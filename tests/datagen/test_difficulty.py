@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from benchnav.datagen import difficulty, latent
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen import difficulty
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe import latent
 from benchnav.terrain import Grid
 from tests.datagen.small import SOFT, small_stakes, terrain_class
 from tests.factories import tiny_dataset

@@ -10,9 +10,9 @@ from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
-from benchnav.eval.run.folder import open_run
-from benchnav.eval.run.shard import Shard
-from benchnav.eval.runner import run_suite
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.shard import Shard
+from benchnav.eval.run.runner import run_suite
 
 SMALL = (
     "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1",
@@ -90,7 +90,7 @@ def test_the_options_of_run_are_those_that_the_suite_is_run_with(
         given.append(inspect.signature(run_suite).bind(*args, **options).arguments)
         raise ConfigError("enough")
 
-    monkeypatch.setattr("benchnav.eval.runner.run_suite", begin)
+    monkeypatch.setattr("benchnav.eval.run.runner.run_suite", begin)
     assert evaluate(monkeypatch, "run", "--out", str(tmp_path / "run"), *SMALL, *words) == 2
     (told,) = given
     expected = {

@@ -6,10 +6,10 @@ import pytest
 
 from benchnav.errors import ConfigError
 from benchnav.eval.find_episodes import find_episodes
-from benchnav.eval.run.folder import FORMAT, FORMAT_VERSION
-from benchnav.eval.run.unit import Extent
+from benchnav.eval.folder.folder import FORMAT, FORMAT_VERSION
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
+from benchnav.eval.unit import Extent
 
 DRAWS = ((4, 0, 60), (4, 1, 60), (9, 0, 2))
 

@@ -10,13 +10,13 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 
 from benchnav import rng
-from benchnav.datagen.store import TerrainDataset, find_dataset
-from benchnav.datagen.validate import find_faults
-from benchnav.eval.runner import run_suite
+from benchnav.datagen.files.check import find_faults
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.calibration import evaluate
 from benchnav.models.predictor import find_checkpoint, load_model, predict
+from benchnav.models.quality.measure import evaluate
 
 
 @pytest.mark.parametrize("planner", ["astar_dwa", "astar_mppi", "cl_rrt", "mppi"])

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from benchnav.datagen.store import TerrainDataset
-
-from .support import make_dataset
+from benchnav.datagen.files.reader import TerrainDataset
+from tests.models.support import make_dataset
 
 
 @pytest.fixture(scope="session")

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from benchnav.datagen.latent import TerrainClass
-from benchnav.datagen.scenario import load_recipe
+from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.slope_table import SlopeTable, table_slopes
+from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 from benchnav.terrain import Observation
 
 

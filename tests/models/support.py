@@ -5,13 +5,13 @@ from pathlib import Path
 
 import torch
 
-from benchnav.datagen.create import create
-from benchnav.datagen.scenario import load_recipe
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.cells import Cells
-from benchnav.models.slope_sums import SlopeSums
-from benchnav.models.slope_table import SlopeTable, table_slopes
+from benchnav.models.slope_gp.cells import Cells
+from benchnav.models.slope_gp.sums import SlopeSums
+from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 from benchnav.terrain import Grid, Terrain
 
 NAMES = ("a", "b", "c")

@@ -10,13 +10,12 @@ import torch
 from benchnav.errors import CheckpointError
 from benchnav.models import checkpoint as module
 from benchnav.models.checkpoint import Part, as_stored, load_checkpoint, save_checkpoint
-from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.contract import check_model
 from benchnav.models.fused import FusedModel
+from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model, predict
-from benchnav.models.slope_table import SlopeTable, SoftModes
-
-from .support import make_terrain
+from benchnav.models.slope_gp.table import SlopeTable, SoftModes
+from tests.models.support import make_terrain
 
 
 @pytest.fixture

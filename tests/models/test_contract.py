@@ -14,7 +14,7 @@ from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import load_checkpoint, member_name
 from benchnav.models.config import MDNConfig
 from benchnav.models.contract import check_model
-from benchnav.models.mdn import MixtureDensityModel, MixtureDensityNetwork
+from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
 from benchnav.models.predictor import ModelFamily, load_model, open_checkpoint
 from benchnav.terrain import Observation
 

@@ -9,9 +9,8 @@ from benchnav.models import fused
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import EnsembleModel
 from benchnav.models.probabilities import class_probabilities
-from benchnav.models.slope_table import SoftModes
-
-from .support import NAMES, linear_table, make_terrain
+from benchnav.models.slope_gp.table import SoftModes
+from tests.models.support import NAMES, linear_table, make_terrain
 
 
 class Linear(nn.Module):

@@ -7,18 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
-from benchnav.models.classifier import TerrainClassifier
 from benchnav.models.cli import main
-from benchnav.models.data import read_maps
 from benchnav.models.fused import FusedModel
+from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
-from benchnav.models.temperature import fit_pool_temperature, fit_temperature, sample_logits
-from benchnav.models.training import measure_classifier
-
-from .support import make_dataset
+from benchnav.models.training.data import read_maps
+from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.training.train import measure_classifier
+from tests.models.support import make_dataset
 
 QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
 QUICK_CLASSIFIER = [

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from benchnav import registry
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models import fused
@@ -26,8 +26,7 @@ from benchnav.models.predictor import (
     predict,
 )
 from benchnav.terrain import Observation, Terrain
-
-from .support import NAMES, linear_table, make_terrain
+from tests.models.support import NAMES, linear_table, make_terrain
 
 
 class Fixed(nn.Module):

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 
 from benchnav import registry
-from benchnav.planning.planners.boundary import act, begin
+from benchnav.planning.planners.check.boundary import act, begin
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, pose_problem

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 import benchnav  # noqa: F401 - registers the environment
 from benchnav import registry
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.robots import DifferentialDrive, Unicycle

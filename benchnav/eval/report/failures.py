@@ -7,7 +7,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from benchnav.eval.run.steps import open_steps
+from benchnav.eval.folder.steps import open_steps
 
 _KEYS = ["trial", "seed", "realisation", "instance"]
 _LAST_S = 2.0

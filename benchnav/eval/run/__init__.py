@@ -1,1 +1,1 @@
-"""Running trials: episodes, units of work, run folders and their provenance."""
+"""Running a suite: its episodes, in one process or many, and again."""

@@ -6,13 +6,13 @@ from typing import Any
 import torch
 
 from benchnav import registry
-from benchnav.datagen.scenario import load_recipe, shipped_recipes
-from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.check_world import Say, check_budgets, check_luck
-from benchnav.eval.run.unit import Extent
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
+from benchnav.eval.unit import Extent
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint, predict

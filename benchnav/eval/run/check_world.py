@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from benchnav.datagen.store import TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval.run.episode import luck_key, read_maps
-from benchnav.eval.run.unit import BLOCK_INSTANCES
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial
+from benchnav.eval.unit import BLOCK_INSTANCES
 from benchnav.planning.world.frozen import check_correlation, draw_frozen
 
 Say = Callable[[str], None]

@@ -20,8 +20,8 @@ from urllib.parse import urlparse
 import joblib
 
 from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.run import provenance
-from benchnav.eval.run.unit import Extent, Unit
+from benchnav.eval.folder import provenance
+from benchnav.eval.unit import Extent, Unit
 from benchnav.files import replacing
 
 RunUnit = Callable[[Unit, Path, str, float], None]

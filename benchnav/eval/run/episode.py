@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from benchnav import rng
-from benchnav.datagen.store import TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
-from benchnav.eval.run.unit import Unit
 from benchnav.eval.trial import Trial
+from benchnav.eval.unit import Unit
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import Clairvoyant, predict
 from benchnav.planning import risk

@@ -15,7 +15,7 @@ from torch import Tensor
 from benchnav.errors import BenchnavError
 from benchnav.options import one_line
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.boundary import act, begin
+from benchnav.planning.planners.check.boundary import act, begin
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome, tell_standstill

@@ -1,17 +1,20 @@
-"""Rows of tables: an episode's metrics.
+"""Rows of tables: an episode's metrics, and its steps.
 
 Sources: paper IV-A for success rate, total time and average traversability; Perille et al. (2020),
 "Benchmarking metric ground navigation" (BARN), for the score.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from torch import Tensor
 
+from benchnav.eval.folder.steps import LAST_COLUMN
 from benchnav.eval.run.rollout import Episodes
-from benchnav.eval.run.unit import Unit
+from benchnav.eval.unit import Unit
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 
@@ -150,3 +153,41 @@ def score(time_s: float, reference_s: float) -> float:
     """
     least = reference_s / 2
     return least / min(max(time_s, 2 * least), 8 * least)
+
+
+def step_table(unit: Unit, problem: Problem, episodes: Episodes, members: Sequence[int]) -> pa.Table:
+    """Tabulates driven paths, a row a state: one a step and one for the last state.
+
+    Args:
+        unit: what was run.
+        problem: what was to be solved.
+        episodes: what happened.
+        members: which of the unit's episodes.
+
+    Returns:
+        `seed`, `realisation`, `instance`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
+        name, and `traversability` as met; actions and `traversability` are NaN at the last state.
+    """
+    counts = [int(episodes.steps[member]) + 1 for member in members]
+    step = np.concatenate([np.arange(count) for count in counts])
+
+    def stacked(values: Any, extra: bool) -> np.ndarray:
+        """One value a row; NaN at the last state of each episode where it has none."""
+        rows = []
+        for member, count in zip(members, counts, strict=True):
+            own = values[member, : count if extra else count - 1].cpu().numpy().astype(np.float32)
+            rows.append(own if extra else np.append(own, np.float32(np.nan)))
+        return np.concatenate(rows)
+
+    columns: dict[str, Any] = {
+        "seed": np.full(len(step), unit.seed),
+        "realisation": np.full(len(step), unit.realisation, np.int32),
+        "instance": np.repeat(np.array(unit.instances, np.int32)[list(members)], counts),
+        "step": step.astype(np.int32),
+        "time_s": step * problem.dt_s,
+    }
+    for index, name in enumerate(("x_m", "y_m", "heading_rad")):
+        columns[name] = stacked(episodes.states[..., index], True)
+    for index, name in enumerate(problem.robot.action_names):
+        columns[name] = stacked(episodes.actions[..., index], False)
+    return pa.table(columns | {LAST_COLUMN: stacked(episodes.traversability, False)})

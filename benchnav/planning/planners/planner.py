@@ -84,7 +84,7 @@ State = TypeVar("State")
 
 
 class Planner(Protocol[State]):
-    """The contract of a planner, which `benchnav.planning.planners.contract.check_planner` tries.
+    """The contract of a planner, which `benchnav.planning.planners.check.contract.check_planner` tries.
 
     It may also have these attributes:
 

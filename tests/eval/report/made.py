@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchnav.eval.report.drawn_plan import drawn_plan
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.drawn_plan import drawn_plan
+from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.stats.best import against_best, told_the_truth
 from benchnav.eval.stats.summary import LABELS, summarise
 from benchnav.terrain import Grid

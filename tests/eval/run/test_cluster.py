@@ -13,11 +13,12 @@ import pytest
 
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval import cli
-from benchnav.eval.run import cluster, provenance
+from benchnav.eval.folder import provenance
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.steps import read_steps
+from benchnav.eval.run import cluster
 from benchnav.eval.run.cluster import check_worker
-from benchnav.eval.run.folder import open_run
-from benchnav.eval.run.steps import read_steps
-from benchnav.eval.runner import run_suite
+from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 
 distributed = pytest.importorskip("distributed")

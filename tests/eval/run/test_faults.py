@@ -6,8 +6,8 @@ import pandas as pd
 import pytest
 
 from benchnav.errors import BenchnavError
-from benchnav.eval.run.folder import ERRORS
-from benchnav.eval.runner import run_suite
+from benchnav.eval.folder.folder import ERRORS
+from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 
 

@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from benchnav import rng
-from benchnav.datagen.store import TerrainDataset
-from benchnav.eval.runner import run_suite
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 from tests import factories
 

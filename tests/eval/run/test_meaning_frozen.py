@@ -15,9 +15,9 @@ import torch
 
 from benchnav import rng
 from benchnav.copula import correlated_normal
-from benchnav.datagen.places import PlacesRule
-from benchnav.datagen.store import TerrainDataset
-from benchnav.eval.runner import run_suite
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.places import PlacesRule
+from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 from tests import factories
 

@@ -4,9 +4,9 @@ import torch
 
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, score
-from benchnav.eval.run.unit import Unit
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
+from benchnav.eval.unit import Unit
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories

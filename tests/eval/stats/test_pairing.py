@@ -100,6 +100,20 @@ def test_what_only_one_trial_met_is_left_out_and_counted() -> None:
     assert pair.left_out == 6 + 5 - 2 * 4
 
 
+def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
+    again = [[row(trial("mppi", risk), 0, seed=5)] for risk in ("mean", "cvar")]
+    plain = [[row(trial("mppi", risk), instance) for instance in range(4)] for risk in ("mean", "cvar")]
+    (pair,) = find_pairs(
+        [
+            compared(risk=risk, episodes=own + more)
+            for risk, own, more in zip(("mean", "cvar"), plain, again, strict=True)
+        ]
+    )
+    # Of four maps the one that has two draws is left out, not the three that have one.
+    assert sorted(pair.episodes["instance"]) == [1, 2, 3]
+    assert pair.left_out == 4
+
+
 def test_runs_that_share_trials_are_compared_with_each_other() -> None:
     trials = [compared(run=run, risk=risk) for run in ("before", "after") for risk in ("mean", "var")]
     assert names(find_pairs(trials)) == [("after", "before")] * 2

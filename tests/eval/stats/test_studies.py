@@ -19,14 +19,14 @@ def generator() -> np.random.Generator:
 def test_intervals_of_success_hold_it(generator: np.random.Generator, draws: int) -> None:
     cover = list(studies.cover_of_success(generator, 400, 50, draws, (0.05, 0.35, 0.5, 0.65)))
     assert 0.93 < np.mean(cover) < 0.97
-    assert min(cover) > 0.89  # 400 studies of a cover of 0.935 lie above this
+    assert min(cover) >= 0.9
 
 
 @pytest.mark.parametrize("draws", [1, 3])
 def test_intervals_of_differences_hold_them(generator: np.random.Generator, draws: int) -> None:
     cover = list(studies.cover_of_differences(generator, 400, 50, draws, (0.1, 0.5, 0.9)))
     assert 0.93 < np.mean(cover) < 0.97
-    assert min(cover) > 0.89
+    assert min(cover) >= 0.9
 
 
 def test_intervals_of_times_hold_them(generator: np.random.Generator) -> None:

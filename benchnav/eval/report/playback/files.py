@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from benchnav.eval.report.playback.rerun_file import write_rerun
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.recording import Recording
 
 
 def playback_path(folder: Path, stem: str, suffix: str = ".rrd") -> Path:

@@ -20,7 +20,7 @@ from benchnav.eval.report.playback.robot import (
 )
 from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
 from benchnav.eval.report.playback.words import describe
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.recording import Recording
 from benchnav.files import replacing
 
 APPLICATION = "benchnav"

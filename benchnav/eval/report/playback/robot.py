@@ -6,11 +6,11 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from benchnav.eval.report.drawn_plan import STYLES, DrawnPlan, drawing_interval, thinned
 from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
-from benchnav.eval.report.ground import immobilised_at
 from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.drawn_plan import STYLES, DrawnPlan, drawing_interval, thinned
+from benchnav.eval.report.recorded.ground import immobilised_at
+from benchnav.eval.report.recorded.recording import Recording
 
 TIMELINE = "time"
 

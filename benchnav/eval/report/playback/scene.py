@@ -10,8 +10,8 @@ import matplotlib
 import numpy as np
 
 from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
-from benchnav.eval.report.ground import SOFT, field_colours, hatching, outline
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, outline
+from benchnav.eval.report.recorded.recording import Recording
 from benchnav.terrain import Grid
 
 START, GOAL = (230, 30, 30), (255, 0, 255)

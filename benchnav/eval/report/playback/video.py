@@ -7,7 +7,7 @@ import numpy as np
 
 from benchnav.errors import ConfigError
 from benchnav.eval.report.playback.frames import Frames
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.recording import Recording
 from benchnav.files import replacing
 
 FRAMES_A_SECOND = 20

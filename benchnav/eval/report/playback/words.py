@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from benchnav.eval.report.contenders import NAMING
 from benchnav.eval.report.playback.robot import Driver
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.report.tables import NOT_USED
 
 

@@ -6,7 +6,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from benchnav.eval.report.playback.files import playback_path, write_playback
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 
 

@@ -7,10 +7,10 @@ import matplotlib
 import numpy as np
 import pytest
 
-from benchnav.eval.report.drawn_plan import MOST_POINTS, DrawnPlan, thinned
-from benchnav.eval.report.ground import HOLDING, field_colours, hatching, outline
 from benchnav.eval.report.playback.rerun_file import write_rerun
-from benchnav.eval.report.recording import Recording
+from benchnav.eval.report.recorded.drawn_plan import MOST_POINTS, DrawnPlan, thinned
+from benchnav.eval.report.recorded.ground import HOLDING, field_colours, hatching, outline
+from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
 

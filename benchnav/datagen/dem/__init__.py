@@ -1,0 +1,1 @@
+"""Real elevation models and photos, into datasets of the same schema."""

@@ -1,0 +1,1 @@
+"""Datasets on disk: reading, writing, making, checking and merging them."""

@@ -1,0 +1,105 @@
+"""What a dataset holds, as plain data and as tables."""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+import h5py
+from rich.markup import escape
+from rich.table import Table
+
+from benchnav.datagen import schema
+from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset
+
+
+def describe(dataset: TerrainDataset) -> dict[str, Any]:
+    """Gathers what `show` shows, ready for JSON."""
+    manifest, recipe = dataset.manifest, dataset.recipe
+    with dataset.open() as file:
+        stored = {split: _stored_bytes(dataset, file, split) for split in dataset.splits}
+    return {
+        "path": str(dataset.path),
+        "bytes": dataset.path.stat().st_size,
+        "id": dataset.id,
+        "format_version": manifest["format_version"],
+        "generator": manifest["generator"],
+        "grid": asdict(dataset.grid),
+        "environments": recipe.environments,
+        "stuck_threshold": recipe.stuck_threshold,
+        "synthesis": recipe.synthesis,
+        "places": None if recipe.places is None else asdict(recipe.places),
+        "correlation_m": recipe.correlation_m,
+        "splits": {name: {**entry, "stored_bytes": stored[name]} for name, entry in dataset.splits.items()},
+        "classes": [asdict(item) for item in recipe.classes],
+        "fields": manifest["fields"],
+        "recipes": manifest["recipes"],
+    }
+
+
+def _stored_bytes(dataset: TerrainDataset, file: h5py.File, split: str) -> int:
+    total, name = 0, ""
+    try:
+        for name in schema.FIELDS:
+            total += file[split][name].id.get_storage_size()
+    except READ_ERRORS as error:
+        raise dataset.damage(split, name, error) from error
+    return total
+
+
+def tables(described: dict[str, Any]) -> Iterator[Table | str]:
+    """Lays out what `describe` gathered, for a terminal."""
+    grid, generator = described["grid"], described["generator"]
+    yield (
+        f"{described['path']}: {described['id']}, format {described['format_version']}, "
+        f"{described['bytes'] / 1e6:.1f} MB, written by {generator['package']} {generator['version']}"
+    )
+    yield (
+        f"maps of {grid['height']} × {grid['width']} cells of {grid['resolution_m']:g} m, "
+        f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
+    )
+    yield _making(described)
+    splits = Table("split", "scenario", "maps", "MB", "made from", title="splits")
+    for name, entry in described["splits"].items():
+        origin = ", ".join(_origin(described, part) for part in entry["parts"])
+        splits.add_row(
+            name, entry["scenario"], str(entry["maps"]), f"{entry['stored_bytes'] / 1e6:.1f}", origin
+        )
+    yield splits
+    yield "content digests"
+    yield from (f"  {name:12} {entry['digest']}" for name, entry in described["splits"].items())
+    soft = any(item["soft"] for item in described["classes"])
+    heads = ["id", "class", "colour", "a", "b", "o", "σ"]
+    if soft:
+        heads.append("soft spots")
+    classes = Table(*heads, title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
+    for number, item in enumerate(described["classes"]):
+        colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
+        numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
+        if soft:
+            numbers.append(_soft_spots(item["soft"]))
+        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers)
+    yield classes
+
+
+def _making(described: dict[str, Any]) -> str:
+    """One line on how the maps were made."""
+    words, places = [f"synthesis {described['synthesis']}"], described["places"]
+    if places:
+        words.append(
+            f"start and goal drawn a map, at least {places['least_distance_m']:g} m apart and "
+            f"{places['margin_m']:g} m from the edges"
+        )
+    if described["correlation_m"]:
+        words.append(f"λ correlated over {described['correlation_m']:g} m")
+    return ", ".join(words)
+
+
+def _soft_spots(spots: dict[str, float] | None) -> str:
+    return f"{spots['weight']:.0%} N({spots['mean']:g}, {spots['std']:g})" if spots else ""
+
+
+def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
+    if "recipe" not in part:
+        return f"{part['maps']} of {part['source']['file']}"
+    recipe = described["recipes"][part["recipe"]]
+    return f"{part['maps']} of {recipe['id']} {part['split']}, seed {recipe['seed']}"

@@ -1,0 +1,94 @@
+"""A split as a map-style PyTorch dataset, for training loops of one's own."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from benchnav.datagen import schema
+from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, find_dataset
+from benchnav.errors import DatasetError
+
+
+class TerrainMaps(Dataset[dict[str, Tensor]]):
+    """The maps of a split, each a dict of tensors by field.
+
+    Safe under DataLoader workers, forked or spawned: each process opens the file for itself, at its
+    first map. Only the fields asked for are read.
+
+    Args:
+        path: dataset file, or the id of one at hand.
+        split: name of one of its splits.
+        fields: names of `schema.FIELDS`.
+        in_memory: read all maps at once, here; worth it for what is read many times.
+
+    Raises:
+        DatasetError: no such file, split or field; when a map is read: its data are damaged.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        split: str,
+        fields: Sequence[str] = ("rgb", "class_id"),
+        in_memory: bool = False,
+    ) -> None:
+        """Checks split and fields, and reads the maps where that is asked for."""
+        self.dataset, self.split, self.fields = (
+            TerrainDataset(find_dataset(path).resolve()),
+            split,
+            tuple(fields),
+        )
+        unknown = sorted(set(fields) - set(schema.FIELDS))
+        if unknown or not fields:
+            raise DatasetError(
+                f"Expected `fields` among {list(schema.FIELDS)}, got {unknown or list(fields)}."
+            )
+        self._maps = self.dataset.map_count(split)
+        self._memory: dict[str, Tensor] | None = None
+        if in_memory:
+            read = self.dataset.read(split, fields=self.fields)
+            self._memory = {name: torch.from_numpy(values) for name, values in read.items()}
+        self._opened: tuple[int, dict[str, h5py.Dataset]] | None = None
+
+    def __len__(self) -> int:
+        """Number of maps."""
+        return self._maps
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """Reads a map; negative indices count from the end.
+
+        Returns:
+            Tensors by field, each of the field's entry shape.
+
+        Raises:
+            IndexError: there is no such map.
+        """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"Expected a map index in 0–{len(self) - 1}, got {index}.")
+        index = int(index) % len(self)
+        if self._memory is not None:
+            return {name: values[index].clone() for name, values in self._memory.items()}
+        sample, name = {}, self.fields[0]
+        try:
+            for name, array in self._arrays().items():
+                sample[name] = torch.from_numpy(np.asarray(array[index]))
+        except READ_ERRORS as error:
+            raise self.dataset.damage(self.split, name, error) from error
+        return sample
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the open file, so that it may be sent to other processes."""
+        return self.__dict__ | {"_opened": None}
+
+    def _arrays(self) -> dict[str, h5py.Dataset]:
+        if self._opened is None or self._opened[0] != os.getpid():
+            group = self.dataset.open()[self.split]
+            self._opened = os.getpid(), {name: group[name] for name in self.fields}
+        return self._opened[1]

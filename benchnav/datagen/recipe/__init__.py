@@ -1,0 +1,1 @@
+"""What is to be made: recipes, scenarios and the class table."""

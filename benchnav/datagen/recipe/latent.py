@@ -1,0 +1,135 @@
+"""Latent traversability (LT) functions: how a class's traversability falls with slope.
+
+f_c(ψ) = clip(1 − (a_c·10⁻³·ψ^b_c + o_c), 0, 1), ψ in degrees; observed λ = clip(f_c(ψ) + ε_c, 0, 1)
+with ε_c zero-mean Gaussian of standard deviation σ_c. Source: paper III-A.
+
+Beyond the paper, a class may have soft spots, a second mode of λ that neither colour nor slope shows, and
+classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
+"""
+
+import numpy as np
+from scipy.special import ndtr
+
+from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, twins
+
+_BISECTIONS = 24  # leave an error of at most 2⁻²⁵
+
+Parameters = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def latent_mean(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]) -> np.ndarray:
+    """f_c(ψ) of each cell, in [0, 1], shape of `class_id`."""
+    scale, exponent, offset = (
+        np.array([getattr(c, name) for c in classes]) for name in ("scale", "exponent", "offset")
+    )
+    loss = slope_deg ** np.take(exponent, class_id)
+    loss *= np.take(scale * 1e-3, class_id)
+    loss += np.take(offset, class_id)
+    return np.minimum(np.maximum(1 - loss, 0), 1)
+
+
+def latent_std(class_id: np.ndarray, classes: tuple[TerrainClass, ...]) -> np.ndarray:
+    """σ_c of each cell, shape of `class_id`."""
+    return np.take(np.array([c.noise for c in classes]), class_id)
+
+
+def truth(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+    """The true distribution of λ in each cell, as a Gaussian mixture before clipping.
+
+    Args:
+        class_id: shape [B, H, W].
+        slope_deg: shape [B, H, W].
+        classes: the class table.
+
+    Returns:
+        Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2 where the table has
+        soft spots; a class without them has them at weight 0.
+    """
+    firm = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
+    if not any(c.soft for c in classes):
+        return np.ones((len(firm[0]), 1, *firm[0].shape[1:])), firm[0][:, None], firm[1][:, None]
+    none = SoftSpots(weight=0.5, mean=0.0, std=1.0)
+    spots = [c.soft or none for c in classes]
+    weight = np.take([c.soft.weight if c.soft else 0.0 for c in classes], class_id)
+    soft = np.take([s.mean for s in spots], class_id), np.take([s.std for s in spots], class_id)
+    weights, means, stds = ((1 - weight, weight), (firm[0], soft[0]), (firm[1], soft[1]))
+    return np.stack(weights, 1), np.stack(means, 1), np.stack(stds, 1)
+
+
+def look_alikes(
+    class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]
+) -> Parameters | None:
+    """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
+
+    They are shown together, and which of them takes which ground is drawn anew in each map, so that each
+    weighs the same.
+
+    Returns:
+        As `truth`, with a component for each of the most classes that look alike; None where no two do.
+    """
+    alike = twins(classes)
+    most = max(len(own) for own in alike)
+    if most == 1:
+        return None
+    pieces = []
+    for place in range(most):
+        other = np.take([own[place % len(own)] for own in alike], class_id)
+        share = np.take([1 / len(own) if place < len(own) else 0.0 for own in alike], class_id)
+        weights, means, stds = truth(other, slope_deg, classes)
+        pieces.append((weights * share[:, None], means, stds))
+    weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
+    return weights, means, stds
+
+
+def expected_of(parameters: Parameters) -> np.ndarray:
+    """E[λ] of the clipped mixture, shape [B, H, W], from parameters of shape [B, K, H, W]."""
+    weights, means, stds = parameters
+    return (weights * expected_traversability(means, stds)).sum(1)
+
+
+def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """E[λ] of the clipped Gaussian N(mean, std), shape of `mean`.
+
+    The integral of 1 − Φ from 0 to 1; `TraversabilityMixture.mean` says the same for mixtures of tensors.
+    """
+    below = (np.array([[1.0], [0.0]]) - mean.ravel()) / std.ravel()
+    integral = below * ndtr(below) + np.exp(-0.5 * below * below) / np.sqrt(2 * np.pi)
+    return 1 - std * (integral[0] - integral[1]).reshape(mean.shape)
+
+
+def quantile_of(parameters: Parameters, normal: np.ndarray) -> np.ndarray:
+    """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1), F the mixture's CDF.
+
+    In closed form where one component has all the weight, else by bisection to within 2⁻²⁵;
+    `TraversabilityMixture.from_normal` says the same of tensors.
+
+    Args:
+        parameters: weights, means and standard deviations, each of shape [B, K, H, W].
+        normal: z, shape [B, H, W].
+
+    Returns:
+        λ in [0, 1], shape [B, H, W].
+    """
+    weights, means, stds = parameters
+    heaviest = weights.argmax(axis=1)[:, None]
+    mean, std = (np.take_along_axis(values, heaviest, axis=1)[:, 0] for values in (means, stds))
+    value = np.clip(mean + std * normal, 0, 1)
+    mixed = weights.max(axis=1) < 1
+    if mixed.any():
+        own = tuple(np.moveaxis(values, 1, 0)[:, mixed] for values in parameters)
+        value[mixed] = _bisected_quantile(own, ndtr(normal[mixed]))
+    return value
+
+
+def _bisected_quantile(parameters: tuple[np.ndarray, ...], rank: np.ndarray) -> np.ndarray:
+    """clip(F⁻¹(rank), 0, 1) from parameters of shape [K, N], shape [N]."""
+    weights, means, stds = parameters
+
+    def below(value: np.ndarray | float) -> np.ndarray:
+        return (weights * ndtr((value - means) / stds)).sum(axis=0)
+
+    low, width = np.zeros_like(rank), 1.0
+    for _ in range(_BISECTIONS):
+        width /= 2
+        low = np.where(below(low + width) < rank, low + width, low)
+    return np.where(below(0.0) >= rank, 0.0, np.where(below(1.0) <= rank, 1.0, low + width / 2))

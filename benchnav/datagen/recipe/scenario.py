@@ -1,0 +1,118 @@
+"""Scenarios, the geometry and light of a family of maps, and the shipped ones that recipes build on.
+
+`presets.yaml` holds the shipped class table and scenarios, which a recipe may name or replace. A
+scenario's `severity` s moves every number of it from `std` (s = 0) to the preset (s = 1), and beyond.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from benchnav.datagen.recipe.plain_data import parse, plain
+from benchnav.errors import ConfigError
+
+RECIPES = Path(__file__).parent
+PRESETS = RECIPES / "presets.yaml"
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """Geometry and light of a family of maps; each range is drawn from uniformly, a value a map.
+
+    Args:
+        relief_m: highest minus lowest elevation of the fractal ground.
+        roughness: Hurst exponent of the fractal ground.
+        crater_count: fewest and most craters a map.
+        crater_radius_m: smallest and largest radius of a crater's rim.
+        crater_depth_ratio: depth below the rim over diameter.
+        light_height: z of the unit vector toward the light; 1 is overhead.
+        ambient: share of ambient light.
+    """
+
+    relief_m: Range = (1.4, 1.7)
+    roughness: float = 0.75
+    crater_count: Range = (0.0, 0.0)
+    crater_radius_m: Range = (2.0, 4.5)
+    crater_depth_ratio: float = 0.1
+    light_height: Range = (0.8, 1.0)
+    ambient: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuses ranges that are not finite, ordered, or physical."""
+        limits: dict[str, Range] = {
+            "relief_m": (0, 1000),
+            "roughness": (0, 1),
+            "crater_count": (0, 1000),
+            "crater_radius_m": (1e-6, 1e4),
+            "crater_depth_ratio": (0, 1),
+            "light_height": (0, 1),
+            "ambient": (0, 1),
+        }
+        for name, (least, most) in limits.items():
+            value = getattr(self, name)
+            low, high = value if isinstance(value, tuple) else (value, value)
+            if not (np.isfinite(low) and np.isfinite(high) and least <= low <= high <= most):
+                raise ConfigError(
+                    f"Expected scenario `{name}` finite, ordered and within [{least:g}, {most:g}], got {value}."
+                )
+
+    @property
+    def mean_crater_area_m2(self) -> float:
+        """Mean area inside a rim; radii are uniform in their logarithm."""
+        low, high = self.crater_radius_m
+        if low == high:
+            return float(np.pi * low**2)
+        return float(np.pi * (high**2 - low**2) / (2 * np.log(high / low)))
+
+
+def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
+    """Moves every number of a scenario from `base` (severity 0) to `full` (severity 1)."""
+
+    def between(low: Any, high: Any) -> Any:
+        if isinstance(low, tuple):
+            return tuple(between(a, b) for a, b in zip(low, high, strict=True))
+        return low + severity * (high - low)
+
+    return replace(
+        base, **{f.name: between(getattr(base, f.name), getattr(full, f.name)) for f in fields(base)}
+    )
+
+
+def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
+    """Reads the shipped class table and the scenarios shipped for a synthesis, as plain data."""
+    data = yaml.safe_load(PRESETS.read_text())
+    return data["classes"], data["scenarios-2" if synthesis == 2 else "scenarios"]
+
+
+def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
+    """Gives a scenario's numbers in full.
+
+    Args:
+        entry: plain data of a scenario; where it names a `preset`, that one's numbers at its `severity`,
+            with what else the entry says in their place.
+        presets: the presets' plain data by name, `std` among them.
+        name: the scenario's name, for messages.
+
+    Raises:
+        ConfigError: there is no such preset, or the severity is no number.
+    """
+    if not isinstance(entry, dict) or "preset" not in entry:
+        return entry
+    preset, severity = entry["preset"], entry.get("severity", 1.0)
+    if not isinstance(preset, str) or preset not in presets:
+        raise ConfigError(
+            f"Expected `preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}."
+        )
+    if not isinstance(severity, int | float) or not np.isfinite(severity):
+        raise ConfigError(
+            f"Expected `severity` of scenario {name!r} to be a finite number, got {severity!r}."
+        )
+    base, full = (parse(Scenario, presets[key]) for key in ("std", preset))
+    changes = {key: value for key, value in entry.items() if key not in ("preset", "severity")}
+    return {**plain(asdict(blend(base, full, severity))), **changes}

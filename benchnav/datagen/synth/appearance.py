@@ -1,0 +1,87 @@
+"""What terrain looks like: where each class lies, and its colour shaded by the light.
+
+Shading is Lambert's law with ambient light, as in paper III-A. Letters in shapes: B maps, H×W
+cells, M classes that a map shows.
+"""
+
+import numpy as np
+
+from benchnav.datagen.synth.slope import horn_gradient
+
+
+def class_bands(noise: np.ndarray, occupancy: np.ndarray) -> np.ndarray:
+    """Cuts noise at the quantiles that give each band its share of the cells.
+
+    Args:
+        noise: shape [B, H, W].
+        occupancy: share of each band, summing to 1, shape [M].
+
+    Returns:
+        Band index in [0, M), int64, shape [B, H, W]; each share is met to within one cell.
+    """
+    flat = noise.reshape(len(noise), -1)
+    edges = np.round(np.cumsum(occupancy)[:-1] * flat.shape[1]).astype(int)
+    levels = np.sort(flat, axis=1)[:, edges[edges < flat.shape[1]]]
+    bands = np.zeros(flat.shape, dtype=np.int64)
+    for level in levels.T:
+        bands += flat >= level[:, None]
+    return bands.reshape(noise.shape)
+
+
+def light_direction(azimuth_rad: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Unit vectors toward the light.
+
+    Args:
+        azimuth_rad: direction in the plane, shape [B].
+        height: z of the unit vector, in [0, 1], shape [B].
+
+    Returns:
+        (x, y, z), shape [B, 3].
+    """
+    across = np.sqrt(1 - height**2)
+    return np.stack([across * np.cos(azimuth_rad), across * np.sin(azimuth_rad), height], axis=-1)
+
+
+def shade(elevation_m: np.ndarray, resolution_m: float, light: np.ndarray, ambient: float) -> np.ndarray:
+    """Brightness of the ground: ambient + (1 − ambient)·max(0, n·l).
+
+    Args:
+        elevation_m: shape [B, H, W].
+        resolution_m: cell width.
+        light: unit vectors toward the light, shape [B, 3].
+        ambient: share of ambient light, in [0, 1].
+
+    Returns:
+        Brightness in [0, 1], shape [B, H, W].
+    """
+    return lambert(*horn_gradient(elevation_m, resolution_m), light, ambient)
+
+
+def lambert(along_x: np.ndarray, along_y: np.ndarray, light: np.ndarray, ambient: float) -> np.ndarray:
+    """Brightness of ground of the given ∂z/∂x and ∂z/∂y; see `shade`, shape [B, H, W]."""
+    x, y, z = (light[:, k, None, None] for k in range(3))
+    cosine = z - x * along_x - y * along_y
+    cosine /= np.sqrt(1 + along_x * along_x + along_y * along_y)
+    np.maximum(cosine, 0, out=cosine)
+    cosine *= 1 - ambient
+    cosine += ambient
+    return cosine
+
+
+def paint(class_id: np.ndarray, colours: np.ndarray, brightness: np.ndarray) -> np.ndarray:
+    """Colours each cell by its class under the given brightness.
+
+    Args:
+        class_id: shape [B, H, W].
+        colours: RGB of each class in full light, 0–255, shape [C, 3].
+        brightness: in [0, 1], shape [B, H, W].
+
+    Returns:
+        Image, uint8, shape [B, 3, H, W].
+    """
+    image = np.empty((len(class_id), 3, *class_id.shape[1:]), dtype=np.uint8)
+    for channel in range(3):
+        lit = np.take(colours[:, channel], class_id)
+        lit *= brightness
+        image[:, channel] = np.rint(lit, out=lit)
+    return image

@@ -1,0 +1,143 @@
+"""Rough ground: fractal elevation and craters.
+
+Batched NumPy in float64: NumPy's Fourier transform gives the same numbers on every machine, those
+that PyTorch links to do not. Letters in shapes: B maps, H×W cells.
+
+Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) for the proportions of craters.
+"""
+
+import numpy as np
+
+from benchnav import rng
+
+
+def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: float) -> np.ndarray:
+    """Synthesises fractal surfaces from a power-law spectrum.
+
+    Args:
+        key: stream key.
+        indices: elements of the stream, shape [B].
+        shape: (H, W).
+        roughness: Hurst exponent in (0, 1); amplitude falls with frequency to the −(roughness + 1).
+
+    Returns:
+        Surfaces scaled to a relief (highest minus lowest) of 1, float64, shape [B, H, W].
+    """
+    height, width = shape
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.normal(key, indices, shape)) * frequency ** -(roughness + 1)
+    surface = np.fft.irfft2(spectrum, s=shape)
+    low = surface.min(axis=(1, 2), keepdims=True)
+    return (surface - low) / (surface.max(axis=(1, 2), keepdims=True) - low)
+
+
+def open_fractal(
+    key: int,
+    indices: np.ndarray,
+    shape: tuple[int, int],
+    roughness: float,
+    reference_cells: int,
+) -> np.ndarray:
+    """Synthesises pieces of fractal ground that goes on beyond the map.
+
+    The spectrum is `fractal`'s for wavelengths under the reference side and levels off above it (von
+    Kármán's), so that the ground is as steep on a map of any size. The surface is made on twice the
+    extent, as a torus, and cropped: the map's opposite edges are no neighbours.
+
+    Args:
+        key: stream key.
+        indices: elements of the stream, shape [B].
+        shape: (H, W).
+        roughness: Hurst exponent in (0, 1).
+        reference_cells: side of the square that relief is measured on, in cells.
+
+    Returns:
+        Surfaces scaled so that highest minus lowest is 1 on the mean of the squares that cover the map
+        from its corner, the last of them reaching beyond it; float64, shape [B, H, W].
+
+    Source: von Kármán (1948), "Progress in the statistical theory of turbulence", for the spectrum.
+    """
+    tiles_y, tiles_x = (-(-cells // reference_cells) for cells in shape)
+    covered = tiles_y * reference_cells, tiles_x * reference_cells
+    height, width = 2 * covered[0], 2 * covered[1]
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    amplitude = np.hypot(frequency, 1 / reference_cells) ** -(roughness + 1)
+    spectrum = np.fft.rfft2(rng.normal(key, indices, (height, width))) * amplitude
+    surface = np.fft.irfft2(spectrum, s=(height, width))[:, : covered[0], : covered[1]]
+    tiles = surface.reshape(len(surface), tiles_y, reference_cells, tiles_x, reference_cells)
+    relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
+    low = surface.min(axis=(1, 2))
+    return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
+
+
+def place_craters(
+    key: int,
+    indices: np.ndarray,
+    extent_m: tuple[float, float],
+    count: np.ndarray,
+    radius_m: tuple[float, float],
+    most: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws centres and radii of craters whose rims do not overlap, by sequential rejection.
+
+    Args:
+        key: stream key.
+        indices: elements of the stream, shape [B].
+        extent_m: size of the map along x and y.
+        count: craters asked for in each map, shape [B]; a map too crowded for them gets fewer.
+        radius_m: smallest and largest radius of a rim.
+        most: most craters of any map of the stream; fixes how many numbers a map draws.
+
+    Returns:
+        Centres (x, y) in metres, shape [B, N, 2], and radii, shape [B, N]; radius 0 means no crater.
+    """
+    tries = 12 * most
+    draws = rng.uniform(key, indices, (max(tries, 1), 3))
+    centres = draws[..., :2] * np.asarray(extent_m)
+    # Small craters are the more frequent: uniform in log radius.
+    low, high = np.log(radius_m)
+    radii = np.exp(low + (high - low) * draws[..., 2])
+    kept = np.zeros_like(radii)
+    for i in range(tries):
+        gap = np.hypot(*np.moveaxis(centres[:, :i] - centres[:, i : i + 1], -1, 0))
+        apart = ((kept[:, :i] == 0) | (gap > kept[:, :i] + radii[:, i : i + 1])).all(axis=1)
+        wanted = (kept[:, :i] > 0).sum(axis=1) < count
+        kept[:, i] = np.where(apart & wanted, radii[:, i], 0)
+    return centres, kept
+
+
+def crater_elevation(
+    centres_m: np.ndarray,
+    radii_m: np.ndarray,
+    shape: tuple[int, int],
+    resolution_m: float,
+    depth_ratio: float,
+) -> np.ndarray:
+    """Raises rims and sinks parabolic bowls.
+
+    Args:
+        centres_m: shape [B, N, 2].
+        radii_m: radius of each rim, 0 for none, shape [B, N].
+        shape: (H, W).
+        resolution_m: cell width.
+        depth_ratio: depth of a bowl below its rim over its diameter; the rim stands a fifth of the
+            depth over the plain and falls off outside with the cube of the distance.
+
+    Returns:
+        Elevation to be added, metres, shape [B, H, W].
+    """
+    y, x = ((np.arange(n) + 0.5) * resolution_m for n in shape)
+    added = np.zeros((len(radii_m), *shape))
+    for i in range(radii_m.shape[1]):
+        radius = radii_m[:, i, None, None]
+        if not radius.any():
+            continue
+        centre_x, centre_y = (centres_m[:, i, k, None, None] for k in (0, 1))
+        distance = np.hypot(x[None, None, :] - centre_x, y[None, :, None] - centre_y)
+        ratio = distance / np.where(radius > 0, radius, 1)
+        depth = 2 * radius * depth_ratio
+        bowl = depth * (ratio**2 - 0.8)
+        rim = 0.2 * depth * np.maximum(ratio, 1) ** -3.0
+        added += np.where(ratio < 1, bowl, rim)
+    return added

@@ -1,0 +1,218 @@
+"""From a recipe to maps: each map is a pure function of (recipe, split, index).
+
+Elevation is quantised first; slope, shading and λ are derived from what is stored. Batched NumPy in
+float64. Letters in shapes: B maps, H×W cells.
+"""
+
+import numpy as np
+
+from benchnav import copula, gridgraph, rng
+from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.places import draw_places
+from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
+from benchnav.datagen.recipe.scenario import Scenario
+from benchnav.datagen.schema import FIELDS, quantise
+from benchnav.datagen.synth import appearance, elevation
+from benchnav.datagen.synth.noise import fractal_perlin
+from benchnav.datagen.synth.slope import horn_gradient, inclination_deg
+from benchnav.errors import ConfigError
+
+MOST_ATTEMPTS = 200
+_PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
+_PIECE_CELLS = 2**20
+
+Maps = dict[str, np.ndarray]
+
+
+def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
+    """Makes some maps of a split.
+
+    Args:
+        recipe: what to make.
+        split: name of one of its splits.
+        indices: which maps, ascending integers ≥ 0, shape [B].
+
+    Returns:
+        The fields of `schema.FIELDS`, each of shape [B, *entry shape].
+
+    Raises:
+        ConfigError: a split asks for solvable maps and the recipe yields none for some index.
+    """
+    indices = np.asarray(indices, dtype=np.int64)
+    size = max(1, min(_PIECE, _PIECE_CELLS // (recipe.height * recipe.width)))
+    pieces = [
+        _generate_piece(recipe, split, indices[i : i + size]) for i in range(0, max(len(indices), 1), size)
+    ]
+    return {
+        name: np.concatenate([piece[name] for piece in pieces]).astype(field.dtype, copy=False)
+        for name, field in FIELDS.items()
+    }
+
+
+def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
+    if not recipe.splits[split].solvable:
+        maps = _attempt(recipe, split, indices, 0)
+        maps["reference_time_s"] = np.full(len(indices), np.nan)
+        return maps
+    pending = np.arange(len(indices))
+    maps = {}
+    for attempt in range(MOST_ATTEMPTS):
+        drawn = _attempt(recipe, split, indices[pending], attempt)
+        drawn["reference_time_s"] = reference_time_s(recipe, drawn)
+        for name, values in drawn.items():
+            maps.setdefault(name, np.empty((len(indices), *values.shape[1:]), values.dtype))[pending] = values
+        pending = pending[~np.isfinite(drawn["reference_time_s"])]
+        if len(pending) == 0:
+            return maps
+    raise ConfigError(
+        f"Expected split {split!r} to have maps whose goal can be reached; {MOST_ATTEMPTS} draws gave none "
+        f"for map {int(indices[pending[0]])}. Ease its scenario or lower `stuck_threshold`."
+    )
+
+
+def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
+    """Grid reference time: least time from start to goal over truly free cells at a commanded 1 m/s.
+
+    A yardstick, not a bound: the grid has eight headings, and noise is at its mean.
+
+    Returns:
+        Seconds, infinite where no free path joins start and goal, shape [B].
+    """
+    expected = latent.expected_of(latent.truth(maps["class_id"], maps["slope_deg"], recipe.classes))
+    costs = gridgraph.travel_time_costs(expected, expected > recipe.stuck_threshold, recipe.resolution_m)
+    every = np.arange(len(expected))
+    goals = np.zeros(expected.shape, dtype=bool)
+    goals[(every, *recipe.cells_of(maps["goal_m"]))] = True
+    cost, _ = gridgraph.cost_to_go(costs, goals, recipe.grid.shape)
+    return cost[(every, *recipe.cells_of(maps["start_m"]))]
+
+
+def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0) -> np.ndarray:
+    """Lays out the classes of each map's environment, `environment_of(recipe, indices)`.
+
+    Returns:
+        Class indices, shape [B, H, W].
+    """
+    periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
+    noise = fractal_perlin(recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods)
+    # Which class takes which band differs from map to map, so no two classes are neighbours always.
+    order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
+    order = rng.permutation(order_key, indices, len(recipe.occupancy))
+    table = np.stack([recipe.environment_classes(e) for e in range(recipe.environments)])
+    shown = np.take_along_axis(table[environment_of(recipe, indices)], order, axis=1)
+    bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
+    return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(bands.shape)
+
+
+def environment_of(recipe: Recipe, indices: np.ndarray) -> np.ndarray:
+    """The environment that each map shows: they take turns. Shape of `indices`."""
+    return indices % recipe.environments
+
+
+def complete(
+    recipe: Recipe,
+    scenario: Scenario,
+    split: str,
+    indices: np.ndarray,
+    class_id: np.ndarray,
+    elevation_m: np.ndarray,
+    attempt: int = 0,
+) -> Maps:
+    """Derives all else from classes and elevation: slope, colour under a random light, λ.
+
+    Args:
+        recipe: class table, seed, start and goal.
+        scenario: its light.
+        split: name of the maps' split, for their random streams.
+        indices: which maps of the split, shape [B].
+        class_id: shape [B, H, W].
+        elevation_m: shape [B, H, W]; it is quantised first, and everything follows what is stored.
+        attempt: how many draws of these maps were rejected before.
+
+    Returns:
+        The fields of `schema.FIELDS` but `reference_time_s`.
+    """
+
+    def key(purpose: str) -> int:
+        return rng.stream_key(recipe.seed, split, purpose, attempt)
+
+    height = quantise(elevation_m, 13)
+    gradient = horn_gradient(height, recipe.resolution_m)
+    slope = quantise(inclination_deg(*gradient), 10)
+    direction = rng.uniform(key("light"), indices, (2,))
+    light = appearance.light_direction(
+        2 * np.pi * direction[:, 0], _within(scenario.light_height, direction[:, 1])
+    )
+    brightness = appearance.lambert(*gradient, light, scenario.ambient)
+    colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
+    start_m, goal_m = _places(recipe, key("places"), indices)
+    return {
+        "rgb": appearance.paint(class_id, colours, brightness),
+        "class_id": class_id,
+        "elevation_m": height,
+        "slope_deg": slope,
+        "traversability": quantise(_realised(recipe, key("traversability"), indices, class_id, slope), 16),
+        "environment": environment_of(recipe, indices),
+        "start_m": start_m,
+        "goal_m": goal_m,
+    }
+
+
+def _realised(
+    recipe: Recipe, key: int, indices: np.ndarray, class_id: np.ndarray, slope_deg: np.ndarray
+) -> np.ndarray:
+    """Draws λ from the truth of each cell, shape [B, H, W]."""
+    if recipe.synthesis == 1:
+        mean = latent.latent_mean(class_id, slope_deg, recipe.classes)
+        noise = rng.normal(key, indices, recipe.grid.shape)
+        noise *= latent.latent_std(class_id, recipe.classes)
+        return np.minimum(np.maximum(mean + noise, 0), 1)
+    correlation_cells = recipe.correlation_m / recipe.resolution_m
+    luck = copula.correlated_normal(key, indices, recipe.grid.shape, correlation_cells)
+    return latent.quantile_of(latent.truth(class_id, slope_deg, recipe.classes), luck)
+
+
+def _places(recipe: Recipe, key: int, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Start and goal of each map, each of shape [B, 2]."""
+    if recipe.places is not None:
+        return draw_places(recipe.places, recipe.grid, key, indices)
+    start_m, goal_m = (np.asarray(end, np.float64) for end in (recipe.start_m, recipe.goal_m))
+    return np.tile(start_m, (len(indices), 1)), np.tile(goal_m, (len(indices), 1))
+
+
+def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
+    scenario = recipe.scenarios[recipe.splits[split].scenario]
+    class_id = class_map(recipe, split, indices, attempt)
+    height = _elevation(recipe, scenario, split, indices, attempt)
+    return complete(recipe, scenario, split, indices, class_id, height, attempt)
+
+
+def _elevation(
+    recipe: Recipe, scenario: Scenario, split: str, indices: np.ndarray, attempt: int
+) -> np.ndarray:
+    def key(purpose: str) -> int:
+        return rng.stream_key(recipe.seed, split, purpose, attempt)
+
+    draws = rng.uniform(key("relief"), indices, (2,))
+    if recipe.synthesis == 1:
+        ground = elevation.fractal(key("elevation"), indices, recipe.grid.shape, scenario.roughness)
+    else:
+        reference_cells = max(3, round(REFERENCE_M / recipe.resolution_m))
+        ground = elevation.open_fractal(
+            key("elevation"), indices, recipe.grid.shape, scenario.roughness, reference_cells
+        )
+    ground *= _within(scenario.relief_m, draws[:, 0])[:, None, None]
+    low, high = recipe.craters(scenario)
+    if high == 0:
+        return ground
+    count = low + np.floor((high - low + 1) * draws[:, 1])
+    centres, radii = elevation.place_craters(
+        key("craters"), indices, recipe.grid.extent_m, count, scenario.crater_radius_m, high
+    )
+    return ground + elevation.crater_elevation(
+        centres, radii, recipe.grid.shape, recipe.resolution_m, scenario.crater_depth_ratio
+    )
+
+
+def _within(limits: tuple[float, float], share: np.ndarray) -> np.ndarray:
+    return limits[0] + (limits[1] - limits[0]) * share

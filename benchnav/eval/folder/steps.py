@@ -1,0 +1,128 @@
+"""Steps of episodes: one Parquet file a unit, one partition a trial, `steps/trial=ID/SEED-REALISATION-BLOCK.parquet`.
+
+Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps", filters=[("trial", "==", id)])`.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.unit import Unit
+from benchnav.files import replacing
+
+STEPS = "steps"
+
+LAST_COLUMN = "traversability"
+_KEYS = ("seed", "realisation", "instance")
+_ORDER = ["trial", *_KEYS, "step"]
+
+
+def write_steps(folder: Path, unit: Unit, table: pa.Table) -> None:
+    """Writes the steps of a unit, whole or not at all.
+
+    Args:
+        folder: the run folder.
+        unit: what was run.
+        table: from `step_table`.
+    """
+    with replacing(folder / unit.steps_path) as partial:
+        pq.write_table(table, partial, compression="zstd")
+
+
+def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
+    """Gives all files of steps the same columns, whatever actions their robots have.
+
+    Readers of many files take the columns of the first.
+
+    Args:
+        folder: the run folder.
+        finished: units of the run.
+    """
+    paths = [path for unit in finished if (path := folder / unit.steps_path).exists()]
+    fields = {field.name: field for path in paths for field in pq.read_schema(path)}
+    names = [name for name in fields if name != LAST_COLUMN] + [LAST_COLUMN]
+    for path in paths:
+        if pq.read_schema(path).names == names:
+            continue
+        table = pq.read_table(path, partitioning=None)
+        none = pa.array(np.full(len(table), np.nan, np.float32))
+        full = {name: table[name] if name in table.column_names else none for name in names}
+        with replacing(path) as partial:
+            pq.write_table(pa.table(full), partial, compression="zstd")
+
+
+def open_steps(folder: Path) -> ds.Dataset | None:
+    """Opens the steps of a run, of this or an earlier format version; None where none were kept.
+
+    Args:
+        folder: the run folder.
+    """
+    if (folder / "steps.parquet").exists():
+        return ds.dataset(folder / "steps.parquet")
+    if not any((folder / STEPS).glob("*/*.parquet")):
+        return None
+    # By its type, since an id of digits alone would be taken for a number.
+    parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
+    return ds.dataset(folder / STEPS, partitioning=parts)
+
+
+def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
+    """Reads steps of a run, those of earlier format versions too.
+
+    Args:
+        folder: a run folder.
+        **filters: which; `trial` by its id or by its labels (`planner="mppi"`, `risk="mean"`, …), and `seed`,
+            `realisation`, `instance`, `step`. A list takes any of several.
+
+    Returns:
+        A row a state, in the order of trial, seed, realisation, instance and step; columns as of `step_table`,
+        and `trial`.
+
+    Raises:
+        ConfigError: the run has no steps, or nothing by that filter's name.
+    """
+    run = open_run(folder)
+    wanted = {name: _several(value) for name, value in filters.items()}
+    if run.trials:
+        wanted = _by_trial({i: trial.labels for i, (trial, _) in run.trials.items()}, wanted)
+    source = open_steps(folder)
+    if source is None:
+        raise ConfigError(
+            f"Expected a run with steps, got {folder} without any. Make them with `--steps all`."
+        )
+    unknown = [name for name in wanted if name not in source.schema.names]
+    if unknown:
+        raise ConfigError(f"Expected filters among {', '.join(source.schema.names)}, got {unknown[0]!r}.")
+    condition = None
+    for name, values in wanted.items():
+        own = ds.field(name).isin(pa.array(values, source.schema.field(name).type))
+        condition = own if condition is None else condition & own
+    rows = source.to_table(filter=condition).to_pandas()
+    order = [name for name in _ORDER if name in rows]
+    rows = rows.sort_values(order, kind="stable", ignore_index=True)
+    return rows[[*order, *(name for name in rows if name not in order)]]
+
+
+def _several(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple | set | range | np.ndarray) else [value]
+
+
+def _by_trial(
+    labels: Mapping[str, Mapping[str, str]], wanted: Mapping[str, list[Any]]
+) -> dict[str, list[Any]]:
+    """Turns filters by labels into one by the trials' ids."""
+    names = next(iter(labels.values()))
+    asked = {name: values for name, values in wanted.items() if name in names}
+    rest = {name: values for name, values in wanted.items() if name not in names}
+    fitting = [i for i, own in labels.items() if all(own[name] in values for name, values in asked.items())]
+    if asked:
+        rest["trial"] = [i for i in fitting if i in rest.get("trial", fitting)]
+    return rest

@@ -1,0 +1,1 @@
+"""What was recorded of an episode, as figures and playback read it."""

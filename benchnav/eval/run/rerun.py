@@ -1,0 +1,201 @@
+"""Repeating a run from its provenance, and telling whether every row came out the same.
+
+What is repeated are the trials of `run.json`, each as often as it was run, whatever commands they came by.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from benchnav import registry
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.folder import provenance
+from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, RUN, Run, open_run, read_table
+from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
+from benchnav.eval.keep import Keep
+from benchnav.eval.run.check import check_everywhere
+from benchnav.eval.run.check_world import Say
+from benchnav.eval.run.runner import Work, Workers, run_work
+from benchnav.eval.trial import PART_KINDS, Trial
+from benchnav.files import sole_writer
+
+_SHOWN = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """How a run that was repeated came out.
+
+    Args:
+        episodes: how many were compared.
+        different: those that are not the same.
+        lines: all that is to be told.
+    """
+
+    episodes: int
+    different: tuple[Difference, ...]
+    lines: tuple[str, ...]
+
+    @property
+    def same(self) -> bool:
+        """Whether every row came out the same."""
+        return not self.different
+
+
+def rerun(
+    run_folder: Path, folder: Path, workers: Workers, overwrite: bool = False, say: Say = lambda line: None
+) -> Iterator[tuple[int, int]]:
+    """Runs all of a finished run again, yielding (units done, units in all); to be iterated to the end.
+
+    Args:
+        run_folder: what is repeated.
+        folder: where to; a rerun that is there is gone on with.
+        workers: who runs the units.
+        overwrite: drop the run that is there.
+        say: is told what a user should know, a line at a time.
+
+    Raises:
+        ConfigError: the run is not finished, or a part of it is no longer there.
+    """
+    run = _open(run_folder)
+    if folder.resolve() == run_folder.resolve():
+        raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
+    _check_there(run)
+    if not overwrite and (folder / RUN).exists() and set(open_run(folder).trials) != set(run.trials):
+        raise ConfigError(
+            f"Expected `out` to be new or an earlier rerun of {run_folder}, but {folder} has other trials. Choose "
+            "another `out`."
+        )
+    if workers.elsewhere or run.about["planner_limit_s"]:
+        check_everywhere(trial for trial, _ in run.trials.values())
+    limit_s = run.about["planner_limit_s"]
+    work = Work(suite=run.about["suite"], trials=run.trials, keep=Keep(), planner_limit_s=limit_s)
+    with sole_writer(folder, str(folder)):
+        yield from run_work(work, folder, workers, overwrite, say)
+
+
+def compare(run_folder: Path, folder: Path) -> Comparison:
+    """Compares a run with its rerun, row by row.
+
+    Args:
+        run_folder: what was repeated.
+        folder: what came out.
+
+    Raises:
+        ConfigError: one of them is not finished.
+    """
+    run, again = _open(run_folder), open_run(folder)
+    first, second = read_table(run_folder, EPISODES), read_table(folder, EPISODES)
+    different = differences(first, second)
+    trials = {trial_id: trial for trial_id, (trial, _) in (*again.trials.items(), *run.trials.items())}
+    lines = _verdict(trials, len(first), different)
+    lines += [
+        f"only one of the two tables has the column {name}" for name in differing_columns(first, second)
+    ]
+    lines += _environment(run.about, again.about)
+    return Comparison(episodes=len(first), different=tuple(different), lines=tuple(lines))
+
+
+def _open(folder: Path) -> Run:
+    run = open_run(folder)
+    if run.version != FORMAT_VERSION:
+        raise ConfigError(
+            f"Expected a run of format version {FORMAT_VERSION} to repeat, got {folder} of version {run.version}."
+        )
+    read_table(folder, EPISODES)
+    return run
+
+
+def _check_there(run: Run) -> None:
+    """Refuses a run of which something is no longer there, with all that is not."""
+    lacking: dict[str, str] = {}
+    for trial, extent in run.trials.values():
+        for name, find in _needs(trial, extent.instances).items():
+            if name in lacking:
+                continue
+            try:
+                find()
+            except BenchnavError as error:
+                lacking[name] = str(error)
+    if lacking:
+        told = " ".join(f"{name}: {reason}" for name, reason in lacking.items())
+        raise ConfigError(f"{run.folder} cannot be repeated here, since something is no longer there. {told}")
+
+
+def _needs(trial: Trial, instances: int) -> Mapping[str, Callable[[], Any]]:
+    """What a trial needs, by name, each as a call that fails where it is not there."""
+
+    def maps() -> None:
+        dataset = TerrainDataset(find_dataset(trial.data))
+        there = dataset.map_count(trial.split)
+        if there < instances:
+            raise ConfigError(f"Expected {instances} maps, got {there}.")
+
+    def part(kind: str) -> Callable[[], Any]:
+        return lambda: registry.find(kind, getattr(trial, kind).part)
+
+    kinds = {f"{kind} {getattr(trial, kind).part}": part(kind) for kind in PART_KINDS if kind != "model"}
+    models = {} if trial.blind else {f"model {trial.model.part}": trial.make_model}
+    return {f"maps of {trial.data} {trial.split}": maps, **models, **kinds}
+
+
+def _verdict(trials: Mapping[str, Trial], rows: int, different: list[Difference]) -> list[str]:
+    if not different:
+        return [f"all {rows} rows came out the same"]
+    counts = Counter(difference.episode[0] for difference in different)
+    lines = [
+        f"{len(different)} of {rows} rows came out differently, in {len(counts)} of {len(trials)} trials:"
+    ]
+    for trial_id, count in counts.items():
+        lines.append(f"  {_label(trials[trial_id])}: {count} rows")
+    lines.append("first of them:")
+    for difference in islice(different, _SHOWN):
+        trial_id, *place = difference.episode
+        where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
+        lines.append(f"  {_label(trials[trial_id])}, {where}: {_by_how_much(difference)}")
+    greatest = _greatest(different)
+    if greatest:
+        lines.append(f"greatest differences: {', '.join(greatest)}")
+    return lines
+
+
+def _label(trial: Trial) -> str:
+    return ", ".join(f"{name} {label}" for name, label in trial.labels.items())
+
+
+def _by_how_much(difference: Difference) -> str:
+    if not difference.columns:
+        return "in one of the tables alone"
+    return ", ".join(f"{name} {_text(a)} → {_text(b)}" for name, (a, b) in difference.columns.items())
+
+
+def _text(value: object) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _greatest(different: list[Difference]) -> list[str]:
+    """The greatest difference of each column of numbers."""
+    greatest: dict[str, float] = {}
+    for difference in different:
+        for name, (a, b) in difference.columns.items():
+            if isinstance(a, float) and isinstance(b, float) and not pd.isna(a - b):
+                greatest[name] = max(abs(a - b), greatest.get(name, 0.0))
+    return [f"{name} {value:.3g}" for name, value in greatest.items()]
+
+
+def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    changed = provenance.differences(before, now)
+    machines = [
+        f"{about['machine']['processor']}, {about['machine']['cores']} cores" for about in (before, now)
+    ]
+    if machines[0] != machines[1]:
+        changed.append(f"machine ({machines[0]} to {machines[1]})")
+    if not changed:
+        return ["nothing that is known of the environment differs"]
+    return [f"what differs in the environment: {'; '.join(changed)}"]

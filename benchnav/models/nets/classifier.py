@@ -1,0 +1,162 @@
+"""The terrain classifier: from a colour image to class probabilities of every cell.
+
+Any architecture and encoder of segmentation-models-pytorch fits; the default is the U-Net with a
+ResNet-18 encoder of paper III-B. Letters in shapes: B maps, H×W cells, C classes.
+"""
+
+from typing import Any
+
+import lightning
+import segmentation_models_pytorch as smp
+import torch
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+from torchmetrics import MetricCollection
+from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
+
+from benchnav.errors import ConfigError
+from benchnav.models.config import ClassifierConfig
+from benchnav.models.nets.network import build_network
+from benchnav.models.nets.schedule import one_cycle
+
+
+class CrossEntropyWithDice(nn.Module):
+    """Cross-entropy plus a soft Dice loss, which weighs rare classes as much as frequent ones.
+
+    Source: Milletari et al. (2016), "V-Net".
+
+    Args:
+        dice: weight of the Dice loss.
+        label_smoothing: of the cross-entropy's targets.
+    """
+
+    def __init__(self, dice: float, label_smoothing: float) -> None:
+        """Sets the two losses up."""
+        super().__init__()
+        self.dice = dice
+        self.cross_entropy = nn.CrossEntropyLoss(label_smoothing=label_smoothing)
+        self.overlap = smp.losses.DiceLoss("multiclass")
+
+    def forward(self, logits: Tensor, class_id: Tensor) -> Tensor:
+        """Computes the loss of logits [B, C, H, W] where the classes are `class_id` [B, H, W]."""
+        return self.cross_entropy(logits, class_id) + self.dice * self.overlap(logits, class_id)
+
+
+class TerrainClassifier(lightning.LightningModule):
+    """Predicts the terrain class of every cell from colour.
+
+    Args:
+        config: what it is.
+        class_count: C.
+        colour_mean: of the training maps, 0–255, shape [3].
+        colour_std: of the training maps, shape [3].
+        seed: root seed of the initial weights.
+        temperature: by which logits are divided once training is over (see `models.training.temperature`).
+    """
+
+    colour_mean: Tensor
+    colour_std: Tensor
+
+    def __init__(
+        self,
+        config: ClassifierConfig,
+        class_count: int,
+        colour_mean: Tensor,
+        colour_std: Tensor,
+        seed: int = 0,
+        temperature: float = 1.0,
+    ) -> None:
+        """Builds the network with fresh weights."""
+        super().__init__()
+        self.config, self.class_count, self.temperature = config, class_count, temperature
+        self.register_buffer("colour_mean", colour_mean.clone().view(3, 1, 1))
+        self.register_buffer("colour_std", colour_std.clone().view(3, 1, 1))
+        self.network = self.configure_network(seed)
+        self.loss = self.configure_losses()
+        self.metrics = self.configure_metrics()
+
+    def configure_network(self, seed: int) -> nn.Module:
+        """Builds the network; leaves PyTorch's global generator as it was.
+
+        Raises:
+            ConfigError: there is no such architecture or encoder, or they do not take these settings.
+        """
+        return build_network(self.config, self.class_count, seed)
+
+    def configure_losses(self) -> nn.Module:
+        """The training loss: cross-entropy, a proper score, unless more is asked for."""
+        if self.config.dice:
+            return CrossEntropyWithDice(self.config.dice, self.config.label_smoothing)
+        return nn.CrossEntropyLoss(label_smoothing=self.config.label_smoothing)
+
+    def configure_metrics(self) -> MetricCollection:
+        """What is measured on the validation maps."""
+        return MetricCollection(
+            {
+                "accuracy": MulticlassAccuracy(self.class_count, average="micro"),
+                "miou": MulticlassJaccardIndex(self.class_count, average="macro"),
+            },
+            prefix="valid_",
+        )
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """AdamW under a one-cycle schedule over all steps."""
+        return one_cycle(self, self.config.learning_rate, self.config.weight_decay)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        """Computes the logits of the classes; maps of any size are padded and the result cropped.
+
+        Args:
+            rgb: uint8, shape [B, 3, H, W].
+
+        Returns:
+            Shape [B, C, H, W]; in evaluation divided by the temperature.
+        """
+        height, width = rgb.shape[-2:]
+        image = (rgb.to(self.colour_mean.dtype) - self.colour_mean) / self.colour_std
+        stride = 2**self.config.encoder_depth
+        image = nn.functional.pad(image, (0, -width % stride, 0, -height % stride), mode="replicate")
+        logits = self.network(image.contiguous(memory_format=torch.channels_last))
+        logits = logits[..., :height, :width]
+        return logits if self.training else logits / self.temperature
+
+    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
+        """Computes the loss of a batch with `rgb` and `class_id`."""
+        rgb, class_id = batch["rgb"], batch["class_id"].long()
+        loss = self.loss(self(rgb), class_id)
+        self.log("train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(rgb))
+        return loss
+
+    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
+        """Measures a batch with `rgb` and `class_id`."""
+        logits, class_id = self(batch["rgb"]).float(), batch["class_id"].long()
+        loss = self.loss(logits, class_id)
+        self.metrics.update(logits.argmax(1), class_id)
+        self.log("valid_loss", loss, on_epoch=True, batch_size=len(logits), sync_dist=True)
+        self.log_dict(dict(self.metrics.items()), on_epoch=True, batch_size=len(logits))
+
+    @classmethod
+    def from_tensors(
+        cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]
+    ) -> "TerrainClassifier":
+        """Rebuilds a trained classifier, downloading nothing.
+
+        Args:
+            config: fields of `ClassifierConfig`, and `temperature`.
+            class_count: C.
+            tensors: a state dict.
+
+        Raises:
+            ConfigError: the settings are not those of a classifier.
+            RuntimeError: the tensors do not fit them.
+        """
+        try:
+            settings = {name: value for name, value in config.items() if name != "temperature"}
+            channels = tuple(settings.get("decoder_channels", ()))
+            built = ClassifierConfig(**{**settings, "pretrained": False, "decoder_channels": channels})
+            temperature = float(config.get("temperature", 1.0))
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"Expected the settings of a classifier, got {sorted(config)}.") from error
+        model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=temperature)
+        model.load_state_dict(tensors)
+        return model.eval()

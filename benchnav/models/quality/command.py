@@ -1,0 +1,222 @@
+"""The command `benchnav-train evaluate`: whether a model's probabilities can be trusted."""
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.models.predictor import AnyModel
+    from benchnav.models.quality.measure import Quality
+    from benchnav.models.slope_gp.table import SlopeTable
+
+REPORT, CSV, PAGE, FIGURES = "quality.json", "quality.csv", "quality.md", "figures"
+
+_WIDTH = 124  # of the table where there is no terminal to fill
+
+
+def evaluate(
+    checkpoint: str,
+    data: str,
+    splits: list[str] | None = None,
+    out: str = "",
+    json: str = "",
+    maps: int = 3,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> None:
+    """Measure a model on the test splits of a dataset.
+
+    Args:
+        checkpoint: Checkpoint folder, or a model by NAME such as oracle, package.module:Name or path/to/file.py:Name.
+        data: Path or id of a dataset.
+        splits: Which splits, for example [test/std,valid]; every test split when not given.
+        out: Folder for quality.json, quality.csv, quality.md and figures; none when not given.
+        json: File for what quality.json holds, without the rest.
+        maps: How many maps of each split the map sheets among the figures show.
+        seed: Root seed of the draws that place clipped values within their atoms.
+        overwrite: Replace an evaluation that is in `out`.
+    """
+    from rich.console import Console
+
+    from benchnav import __version__
+    from benchnav.command import show_progress
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+    from benchnav.errors import ConfigError
+    from benchnav.files import write_text
+
+    if maps < 0:
+        raise ConfigError(f"Expected `maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
+    _check_targets(out, json, overwrite)
+    dataset = TerrainDataset(find_dataset(data))
+    for split in splits or ():
+        dataset.map_count(split)  # refuses an unknown one before the slow imports
+
+    from benchnav.models.predictor import load_model
+    from benchnav.models.quality.baseline import nearest_colour_accuracy
+    from benchnav.models.quality.measure import choose_splits
+    from benchnav.models.quality.measure import evaluate as evaluate_model
+    from benchnav.models.quality.report import quality_csv, quality_json, quality_markdown, quality_table
+
+    model = load_model(checkpoint)
+    chosen = choose_splits(model, dataset, splits or ())
+    qualities: dict[str, Quality] = {}
+
+    def steps() -> Iterator[tuple[int, int]]:
+        for split, quality in evaluate_model(model, dataset, chosen, seed):
+            qualities[split] = quality
+            yield len(qualities), len(chosen)
+
+    show_progress(steps(), "splits")
+    title, notes = f"{checkpoint} on {dataset.id}", []
+    console = Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False)
+    console.print(quality_table(title, qualities))
+    by_colour: dict[str, float] = {}
+    if all(quality.classes for quality in qualities.values()):
+        by_colour = {split: nearest_colour_accuracy(dataset, split) for split in chosen}
+        listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
+        notes.append(f"accuracy of the class of the nearest colour, without a model: {listed}")
+        console.print(notes[0], soft_wrap=True)
+    about = {
+        "model": checkpoint,
+        "dataset": {"id": dataset.id, "digest": dataset.digest},
+        "seed": seed,
+        "package_version": __version__,
+        "nearest_colour_accuracy": by_colour,
+    }
+    report = quality_json(about, qualities)
+    if json:
+        write_text(Path(json), report)
+        print(f"wrote {json}")
+    if not out:
+        print(f"what the columns mean: with --out FOLDER, {PAGE} there says so")
+        return
+    folder = Path(out)
+    write_text(folder / REPORT, report)
+    write_text(folder / CSV, quality_csv(qualities))
+    for old in (folder / FIGURES).glob("*.png"):
+        old.unlink()
+    notes += _absent(model, qualities)
+    name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
+    about_maps = f"model {name} on dataset {dataset.id}"
+    figures = _save_figures(about_maps, model, dataset, qualities, maps, folder / FIGURES)
+    write_text(folder / PAGE, quality_markdown(title, qualities, notes, figures))
+    for note in notes[len(by_colour) > 0 :]:
+        print(note)
+    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(figures)} figures in {out}")
+    print(f"what the columns and figures mean: {folder / PAGE}")
+
+
+def _check_targets(out: str, json: str, overwrite: bool) -> None:
+    """Refuses what cannot be written to before any work is done."""
+    from benchnav.errors import ConfigError
+
+    target, folder = Path(json), Path(out)
+    if json and (not target.parent.is_dir() or target.is_dir()):
+        raise ConfigError(
+            f"Expected `json` to be a file in a folder that exists, got {json}. Make {target.parent} first."
+        )
+    there = {item.name for item in folder.iterdir()} if out and folder.is_dir() else set()
+    if there - {REPORT, CSV, PAGE, FIGURES} or (out and folder.exists() and not folder.is_dir()):
+        raise ConfigError(
+            f"Expected `out` to be a new folder or an earlier evaluation, got {out}, which is something else."
+        )
+    if there and not overwrite:
+        raise ConfigError(
+            f"Expected `out` to be a new folder, got {out} with an earlier evaluation. Choose another, or "
+            "pass --overwrite to replace it."
+        )
+    for path in [target] * bool(json) + [folder / REPORT] * bool(out):
+        nearest = next(parent for parent in path.absolute().parents if parent.exists())
+        try:
+            with tempfile.TemporaryFile(dir=nearest):
+                pass
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
+    """Says which figures do not apply, and why."""
+    from benchnav.models.quality.report import find_ladders
+
+    lines = []
+    if not all(quality.classes for quality in qualities.values()):
+        lines.append("no confusion matrix, reliability diagram or entropy: the model predicts no classes")
+    if _slope_table(model) is None:
+        lines.append("no latent functions: the model has no Gaussian processes over slope")
+    if not find_ladders(qualities):
+        lines.append("no ladder of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
+    return lines
+
+
+def _save_figures(
+    title: str,
+    model: "AnyModel",
+    dataset: "TerrainDataset",
+    qualities: "Mapping[str, Quality]",
+    maps: int,
+    folder: Path,
+) -> list[str]:
+    """Draws what applies; returns paths from the page's folder."""
+    from benchnav.command import show_progress
+    from benchnav.models.quality.figures import save_figure
+
+    written: list[str] = []
+
+    def steps() -> Iterator[tuple[int, int]]:
+        drawn = list(_figures(title, model, dataset, qualities, maps))
+        for name, draw in drawn:
+            save_figure(draw(), folder / f"{name}.png")
+            written.append(f"{folder.name}/{name}.png")
+            yield len(written), len(drawn)
+
+    show_progress(steps(), "figures")
+    return written
+
+
+def _figures(
+    title: str, model: "AnyModel", dataset: "TerrainDataset", qualities: "Mapping[str, Quality]", maps: int
+) -> "Iterator[tuple[str, Callable[[], Figure]]]":
+    """Names the figures that apply, each with what draws it."""
+    from functools import partial
+
+    from benchnav.models.quality import figures, map_sheet
+    from benchnav.models.quality.report import find_ladders
+    from benchnav.models.quality.words import sheet_name
+
+    by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
+    by_cell = {split: quality.traversability for split, quality in qualities.items()}
+    classes, table = dataset.recipe.classes, _slope_table(model)
+    if by_class:
+        yield "confusion", partial(figures.confusion_figure, by_class, [item.name for item in classes])
+        yield "reliability", partial(figures.reliability_figure, by_class)
+    yield "pit", partial(figures.pit_figure, by_cell)
+    if ladders := find_ladders(qualities):
+        yield "ladder", partial(figures.ladder_figure, ladders, qualities)
+    if table is not None and by_class:
+        cells = [
+            [sum(counts) for counts in zip(*rows, strict=True)]
+            for rows in zip(*(quality.slope_cells for quality in by_class.values()), strict=True)
+        ]
+        yield "latent", partial(figures.latent_figure, table, classes, cells)
+    if maps:
+        sheets = [
+            map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))
+            for split in qualities
+        ]
+        scales = map_sheet.shared_scales(sheets, classes)
+        for sheet in sheets:
+            draw = partial(map_sheet.map_sheet_figure, sheet, scales, classes, title)
+            yield sheet_name(sheet.split), draw
+
+
+def _slope_table(model: "AnyModel") -> "SlopeTable | None":
+    """The GPs of a model that has them as `table`."""
+    from benchnav.models.slope_gp.table import SlopeTable
+
+    table = getattr(model, "table", None)
+    return table if isinstance(table, SlopeTable) else None

@@ -1,0 +1,242 @@
+"""Map sheets: truth, prediction, error and uncertainty of a few maps side by side, a row a map.
+
+A quantity has one scale in all sheets of an evaluation, so that splits compare. Letters in shapes: B
+maps, H×W cells.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.preview import class_colours
+from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
+from benchnav.models.probabilities import class_probabilities
+from benchnav.models.quality.figures import TEXT
+from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
+
+TITLES = {
+    "rgb": "Image",
+    "class_true": "True class",
+    "class_found": "Most likely class",
+    "expected_true": "True E[λ]",
+    "expected": "Predicted E[λ]",
+    "error": "Error of E[λ]",
+    "width": "90 % interval of λ",
+    "entropy": "Entropy",
+    "information": "Mutual information",
+}
+
+_UNITS = {
+    "expected_true": "λ",
+    "expected": "λ",
+    "error": "predicted − true",
+    "width": "width",
+    "entropy": "nats",
+    "information": "nats",
+}
+_PANEL, _GAP = 1.2, 0.1
+_LEFT, _RIGHT, _TOP, _FOOT = 0.5, 0.08, 0.45, 0.8
+_LEGEND_COLUMNS = 3
+_SHOWN_SHARE = 0.995
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapSheet:
+    """What a sheet shows.
+
+    Args:
+        split: where the maps are from.
+        indices: which maps.
+        extent_m: size of a map along x and y.
+        layers: by the keys of `TITLES`, those that the model has, each of shape [B, H, W]; `rgb` is of
+            shape [B, H, W, 3].
+    """
+
+    split: str
+    indices: tuple[int, ...]
+    extent_m: tuple[float, float]
+    layers: dict[str, np.ndarray]
+
+
+def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Sequence[int]) -> MapSheet:
+    """Predicts some maps of a split.
+
+    Args:
+        model: any model.
+        dataset: where the maps are.
+        split: name of a split.
+        indices: which maps.
+
+    Raises:
+        DatasetError: there is no such split or map, or its data are damaged.
+    """
+    terrain = dataset.terrain(split, indices)
+    with torch.inference_mode():
+        mixture = predict(model, terrain)
+        true = Oracle().predict_terrain(terrain).mean()
+        layers = {"rgb": terrain.rgb.movedim(1, -1)}
+        if isinstance(model, ClassModel):
+            classes = class_probabilities(mixture, len(model.class_names))
+            layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
+        layers |= {
+            "expected_true": true,
+            "expected": mixture.mean(),
+            "error": mixture.mean() - true,
+            "width": mixture.var(0.05) - mixture.var(0.95),
+        }
+        if isinstance(model, ClassModel):
+            layers["entropy"] = predictive_entropy(classes)
+        if isinstance(model, EnsembleModel):
+            members = model.member_probabilities(terrain.observe())
+            layers |= {"information": mutual_information(members)} if len(members) > 1 else {}
+    return MapSheet(
+        split=split,
+        indices=tuple(indices),
+        extent_m=terrain.grid.extent_m,
+        layers={name: layer.cpu().numpy() for name, layer in layers.items()},
+    )
+
+
+def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -> dict[str, dict[str, Any]]:
+    """Finds how each layer is drawn in all sheets: keywords of `imshow`, by layer.
+
+    Scales that are not of a fixed range hold 99.5 % of the cells.
+
+    Args:
+        sheets: at least one.
+        classes: of the dataset.
+    """
+    kinds: dict[str, Any] = {
+        "cmap": ListedColormap(list(class_colours(classes))), "vmin": -0.5, "vmax": len(classes) - 0.5
+    }  # fmt: skip
+    share = {"cmap": "viridis", "vmin": 0, "vmax": 1}
+    scales: dict[str, dict[str, Any]] = {
+        "rgb": {}, "class_true": kinds, "class_found": kinds, "expected_true": share, "expected": share
+    }  # fmt: skip
+    for name, palette in (
+        ("error", "RdBu_r"),
+        ("width", "magma"),
+        ("entropy", "magma"),
+        ("information", "magma"),
+    ):
+        values = [np.abs(sheet.layers[name]).ravel() for sheet in sheets if name in sheet.layers]
+        if values:
+            most = _round_up(float(np.quantile(np.concatenate(values), _SHOWN_SHARE)))
+            scales[name] = {"cmap": palette, "vmin": -most if name == "error" else 0, "vmax": most}
+    return scales
+
+
+def map_sheet_figure(
+    sheet: MapSheet, scales: dict[str, dict[str, Any]], classes: Sequence[TerrainClass], title: str
+) -> Figure:
+    """Draws a sheet, a row a map and a column a layer; the panel of a layer has the label `LAYER ROW`.
+
+    Args:
+        sheet: the maps.
+        scales: from `shared_scales`.
+        classes: of the dataset.
+        title: which model and dataset; the split follows.
+    """
+    names = [name for name in TITLES if name in sheet.layers]
+    width_m, height_m = sheet.extent_m
+    high = _PANEL * float(np.clip(height_m / width_m, 0.3, 3))
+    shown = _shown_classes(sheet)
+    legend_rows = -(-len(shown) // _LEGEND_COLUMNS)
+    bottom = _TOP + len(sheet.indices) * (high + _GAP) - _GAP
+    size = (
+        _LEFT + len(names) * (_PANEL + _GAP) - _GAP + _RIGHT,
+        bottom + max(_FOOT, 0.42 + 0.14 * legend_rows),
+    )
+    figure = Figure(figsize=size)
+    extent = (0.0, width_m, 0.0, height_m)
+    for column, name in enumerate(names):
+        left = _LEFT + column * (_PANEL + _GAP)
+        middle = left + _PANEL / 2
+        for row, index in enumerate(sheet.indices):
+            top = _TOP + row * (high + _GAP)
+            panel = _add_axes(figure, (left, top, _PANEL, high), f"{name} {row}")
+            image = panel.imshow(
+                sheet.layers[name][row],
+                origin="lower",
+                extent=extent,
+                aspect="auto",
+                interpolation="none",
+                **scales[name],
+            )
+            for axis in (panel.xaxis, panel.yaxis):
+                axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="upper"))
+            _tick(panel)
+            panel.tick_params(labelleft=column == 0, labelbottom=row == len(sheet.indices) - 1)
+            if column == 0:
+                _write(figure, 0.1, top + high / 2, f"map {index}", rotation=90, ha="center", va="center")
+        _write(figure, middle, _TOP - 0.06, TITLES[name], size=TEXT + 1, ha="center", va="bottom")
+        _write(figure, middle, bottom + 0.2, "x [m]", ha="center", va="top")
+        if name in _UNITS:
+            bar = _add_axes(figure, (left + 0.06, bottom + 0.42, _PANEL - 0.12, 0.07), f"{name} bar")
+            extend = {"error": "both", "expected": "neither", "expected_true": "neither"}.get(name, "max")
+            drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
+            drawn.outline.set_linewidth(0.5)
+            bar.xaxis.set_major_locator(MaxNLocator(2 if name == "error" else 4, steps=[1, 2, 2.5, 5, 10]))
+            bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            _tick(bar)
+            _write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")
+    _write(figure, _LEFT, 0.06, f"{title}, split {sheet.split}", size=TEXT + 1, weight="bold", va="top")
+    _write(figure, 0.26, (_TOP + bottom) / 2, "y [m]", rotation=90, ha="center", va="center")
+    if shown:
+        colours = class_colours(classes)
+        patches = [
+            Patch(facecolor=colours[n], ec="0.3", lw=0.4, label=classes[n].name.replace("_", " "))
+            for n in shown
+        ]
+        legend = figure.legend(
+            handles=patches, loc="upper left", ncols=_LEGEND_COLUMNS, fontsize=TEXT, frameon=False,
+            bbox_to_anchor=(_LEFT / size[0], 1 - (bottom + 0.38) / size[1]), borderaxespad=0, borderpad=0,
+            handlelength=1.1, handletextpad=0.4, columnspacing=1.6, labelspacing=0.3,
+        )  # fmt: skip
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+    return figure
+
+
+def _shown_classes(sheet: MapSheet) -> list[int]:
+    layers = [sheet.layers[name] for name in ("class_true", "class_found") if name in sheet.layers]
+    return np.unique(layers).tolist() if layers else []
+
+
+def _add_axes(figure: Figure, place: tuple[float, float, float, float], label: str) -> Axes:
+    """Adds a panel at (left, top, width, height) in inches from the upper left corner."""
+    left, top, wide, high = place
+    width, height = figure.get_size_inches()
+    return figure.add_axes(
+        (left / width, 1 - (top + high) / height, wide / width, high / height), label=label
+    )
+
+
+def _write(figure: Figure, left: float, top: float, text: str, size: float = TEXT, **style: Any) -> None:
+    width, height = figure.get_size_inches()
+    figure.text(left / width, 1 - top / height, text, size=size, parse_math=False, **style)
+
+
+def _tick(panel: Axes) -> None:
+    panel.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
+    panel.spines[:].set_linewidth(0.5)
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8 and 10 times a power of ten; 1 for 0."""
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(
+        next(step * power for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= 0.999 * value)
+    )

@@ -1,0 +1,364 @@
+"""How good a model's predictions are, a split at a time: of classes, and of traversability.
+
+One pass over the maps with sums and counts alone, so that memory does not grow with them. The scores
+themselves stand in `scores` and `uncertainty`. Letters in shapes: B maps, H×W cells, C classes, N
+cells of all maps.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchmetrics import MetricCollection
+from torchmetrics.classification import (
+    MulticlassAccuracy,
+    MulticlassConfusionMatrix,
+    MulticlassJaccardIndex,
+)
+
+from benchnav import rng
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.classes import twins
+from benchnav.errors import CheckpointError, DatasetError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, predict
+from benchnav.models.probabilities import class_probabilities
+from benchnav.models.quality.scores import (
+    LEVEL,
+    PIT_BINS,
+    BrierScore,
+    ReliabilityCurve,
+    calibration_error,
+    coverage,
+    crps,
+    pit,
+    pit_counts,
+    tail_rate,
+)
+from benchnav.models.quality.twins import TwinQuality, TwinTally
+from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
+from benchnav.models.slope_gp.table import SlopeTable
+from benchnav.terrain import Terrain
+
+CHUNK_CELLS = 2**17
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reliability:
+    """How often the most likely class is right, by its probability, in equal bins of [0, 1].
+
+    Args:
+        cells: how many cells have their most likely class in each bin.
+        confidence: its mean probability; 0 in an empty bin.
+        accuracy: how often it is right; 0 in an empty bin.
+    """
+
+    cells: tuple[int, ...]
+    confidence: tuple[float, ...]
+    accuracy: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassQuality:
+    """Quality of class probabilities.
+
+    Args:
+        accuracy: share of cells whose most likely class is right.
+        miou: intersection over union, averaged over the classes that occur.
+        ece: expected calibration error of the most likely class, 15 bins.
+        brier: Brier score, the squared distance of the probabilities to the class that is there, 0–2.
+        entropy: mean predictive entropy, in nats.
+        mutual_information: mean mutual information of class and member, in nats; not a number for a
+            model without several members.
+        entropy_auroc: how often the entropy is higher in a wrongly than in a rightly classified cell;
+            not a number where all or none are wrong.
+        mutual_information_auroc: the same of mutual information.
+        confusion: cells by true class (row) and most likely class (column), [C][C].
+        reliability: the curve that the ECE sums up.
+        slope_cells: cells by true class and whole degree of slope, [C][90].
+        twins: with classes that look alike merged; None where no two do.
+    """
+
+    accuracy: float
+    miou: float
+    ece: float
+    brier: float
+    entropy: float
+    mutual_information: float
+    entropy_auroc: float
+    mutual_information_auroc: float
+    confusion: tuple[tuple[int, ...], ...]
+    reliability: Reliability
+    slope_cells: tuple[tuple[int, ...], ...]
+    twins: TwinQuality | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraversabilityQuality:
+    """Quality of predicted distributions of traversability; lower is better but for the last three.
+
+    Args:
+        rmse_observed: root mean square of E[λ] − λ as realised.
+        rmse_expected: root mean square of E[λ] − E[λ] in truth.
+        nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1.
+        crps: continuous ranked probability score of λ as realised.
+        coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
+        tail_rate: share of λ under the VaR at level 0.9; ideally 0.1.
+        pit: cells in 20 equal bins of the randomised PIT; ideally all alike.
+    """
+
+    rmse_observed: float
+    rmse_expected: float
+    nll: float
+    crps: float
+    coverage: float
+    tail_rate: float
+    pit: tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """Quality of a model on one split.
+
+    Args:
+        maps: how many maps were predicted.
+        traversability: of the distributions.
+        classes: of the class probabilities; empty for a model that predicts no classes.
+    """
+
+    maps: int
+    traversability: TraversabilityQuality
+    classes: tuple[ClassQuality, ...]
+
+
+def choose_splits(model: AnyModel, dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
+    """Tells which splits are to be measured, and refuses what cannot be.
+
+    Args:
+        model: any model.
+        dataset: the maps.
+        splits: which splits; every test split when empty.
+
+    Raises:
+        DatasetError: there is no such split, or no test split.
+        CheckpointError: the model was trained on another class table.
+    """
+    chosen = list(dict.fromkeys(splits)) or [name for name in dataset.splits if name.startswith("test/")]
+    if not chosen:
+        raise DatasetError(
+            f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. Name one in `splits`."
+        )
+    for split in chosen:
+        dataset.map_count(split)
+    names = tuple(item.name for item in dataset.recipe.classes)
+    if isinstance(model, ClassModel) and model.class_names != names:
+        raise CheckpointError(
+            f"Expected a model of the classes {', '.join(names)}, got one of {', '.join(model.class_names)}. "
+            "Train it on a dataset with this class table."
+        )
+    return chosen
+
+
+def evaluate(
+    model: AnyModel, dataset: TerrainDataset, splits: Iterable[str] = (), seed: int = 0
+) -> Iterator[tuple[str, Quality]]:
+    """Measures a model, a split at a time.
+
+    Args:
+        model: any model.
+        dataset: the maps.
+        splits: which splits; every test split when empty.
+        seed: root seed of the draws within atoms.
+
+    Yields:
+        Name of the split and the quality on it.
+
+    Raises:
+        DatasetError: there is no such split, or no test split.
+        CheckpointError: the model was trained on another class table.
+    """
+    alike = twins(dataset.recipe.classes)
+    for split in choose_splits(model, dataset, splits):
+        chunks = read_chunks(dataset, split)
+        generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
+        yield split, measure(model, chunks, generator, alike)
+
+
+def read_chunks(dataset: TerrainDataset, split: str) -> Iterator[Terrain]:
+    """Reads the maps of a split, some at a time."""
+    step = max(1, CHUNK_CELLS // (dataset.grid.height * dataset.grid.width))
+    count = dataset.map_count(split)
+    for start in range(0, count, step):
+        yield dataset.terrain(split, range(start, min(start + step, count)))
+
+
+def measure(
+    model: AnyModel,
+    chunks: Iterable[Terrain],
+    generator: torch.Generator,
+    alike: Sequence[tuple[int, ...]] = (),
+) -> Quality:
+    """Measures a model on some maps.
+
+    Args:
+        model: any model.
+        chunks: the maps, at least one, a few at a time.
+        generator: of the draws within atoms, on the CPU.
+        alike: of each class those that look like it, itself among them; empty where none do.
+    """
+    maps, cells, sums = 0, 0, torch.zeros(6, dtype=torch.float64)
+    histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
+    classes: list[_ClassTally] = []
+    for terrain in chunks:
+        mixture = predict(model, terrain)
+        scores, transformed = _score_cells(mixture, terrain, generator)
+        sums += scores.cpu()
+        histogram += pit_counts(transformed)
+        maps, cells = maps + len(terrain), cells + transformed.numel()
+        if isinstance(model, ClassModel):
+            classes = classes or [_ClassTally(model, terrain, alike)]
+            classes[0].add(class_probabilities(mixture, len(model.class_names)), terrain)
+    if not cells:
+        raise DatasetError("Expected maps with an observed λ to measure on, got none.")
+    squared_observed, squared_expected, nll, score, covered, in_tail = (sums / cells).tolist()
+    return Quality(
+        maps=maps,
+        traversability=TraversabilityQuality(
+            rmse_observed=squared_observed**0.5,
+            rmse_expected=squared_expected**0.5,
+            nll=nll,
+            crps=score,
+            coverage=covered,
+            tail_rate=in_tail,
+            pit=tuple(histogram.tolist()),
+        ),
+        classes=tuple(tally.quality() for tally in classes),
+    )
+
+
+def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, float]:
+    """Measures the GPs apart from the classifier, each cell read with its true class.
+
+    Args:
+        table: the GPs over slope.
+        chunks: the maps, at least one, a few at a time.
+
+    Returns:
+        `latent_rmse` to f_c(ψ), `noise_error` (largest relative error of a class's σ_c that occurs) and
+        `nll` of λ as realised.
+    """
+    squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
+    for terrain in chunks:
+        table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
+        own = table.own(terrain.class_id, terrain.slope_deg)
+        squares += float((own.means[:, 0] - terrain.truth.means[:, 0]).double().square().sum())
+        cells += terrain.class_id.numel()
+        observed = terrain.traversability[known].unsqueeze(0)
+        surprise -= float(_choose(own, known).log_prob(observed).double().sum())
+        seen += int(known.sum())
+        ratio = table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0]
+        noise_error = max(noise_error, float((ratio - 1).abs().max()))
+    return {
+        "latent_rmse": (squares / cells) ** 0.5,
+        "noise_error": noise_error,
+        "nll": surprise / max(1, seen),
+    }
+
+
+class _ClassTally:
+    """Counts of a model's class probabilities over maps."""
+
+    def __init__(self, model: ClassModel, first: Terrain, alike: Sequence[tuple[int, ...]]) -> None:
+        count, device = len(model.class_names), first.rgb.device
+        self.members: list[EnsembleModel] = []
+        if isinstance(model, EnsembleModel):
+            one = first.select(torch.zeros(1, dtype=torch.int64, device=device))
+            self.members = [model] if len(model.member_probabilities(one.observe())) > 1 else []
+        self.by_class = MetricCollection(
+            {
+                "accuracy": MulticlassAccuracy(count, average="micro"),
+                "miou": MulticlassJaccardIndex(count, average="macro"),
+                "confusion": MulticlassConfusionMatrix(count),
+            }
+        ).to(device)
+        self.brier, self.reliability = BrierScore().to(device), ReliabilityCurve().to(device)
+        self.rankings = [ErrorRanking().to(device) for _ in range(1 + len(self.members))]
+        self.uncertainty = [0.0 for _ in self.rankings]
+        self.cells = 0
+        self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
+        self.twins = TwinTally(alike, device) if any(len(own) > 1 for own in alike) else None
+
+    def add(self, probabilities: Tensor, terrain: Terrain) -> None:
+        """Adds maps: class probabilities [B, C, H, W] and the truth."""
+        found = probabilities.argmax(1)
+        self.by_class.update(found, terrain.class_id)
+        self.brier.update(probabilities, terrain.class_id)
+        self.reliability.update(probabilities, terrain.class_id)
+        measures = [predictive_entropy(probabilities)]
+        measures += [mutual_information(m.member_probabilities(terrain.observe())) for m in self.members]
+        for place, measure in enumerate(measures):
+            self.rankings[place].update(measure, found != terrain.class_id)
+            self.uncertainty[place] += float(measure.double().sum())
+        self.cells += found.numel()
+        degree = terrain.slope_deg.floor().long().clamp(0, 89)
+        counted = torch.bincount(
+            (90 * terrain.class_id + degree).flatten(), minlength=self.slope_cells.numel()
+        )
+        self.slope_cells += counted.view_as(self.slope_cells)
+        if self.twins is not None:
+            self.twins.add(probabilities, terrain.class_id)
+
+    def quality(self) -> ClassQuality:
+        by_class, curve = self.by_class.compute(), self.reliability.compute().cpu()
+        uncertainty = [total / self.cells for total in self.uncertainty]
+        auroc = [float(ranking.compute()) for ranking in self.rankings]
+        single = [float("nan")]
+        return ClassQuality(
+            accuracy=float(by_class["accuracy"]),
+            miou=float(by_class["miou"]),
+            ece=calibration_error(curve),
+            brier=float(self.brier.compute()),
+            entropy=uncertainty[0],
+            mutual_information=(uncertainty[1:] or single)[0],
+            entropy_auroc=auroc[0],
+            mutual_information_auroc=(auroc[1:] or single)[0],
+            confusion=tuple(tuple(row) for row in by_class["confusion"].tolist()),
+            reliability=Reliability(
+                cells=tuple(int(cells) for cells in curve[0]),
+                confidence=tuple(curve[1].tolist()),
+                accuracy=tuple(curve[2].tolist()),
+            ),
+            slope_cells=tuple(tuple(row) for row in self.slope_cells.tolist()),
+            twins=None if self.twins is None else self.twins.quality(),
+        )
+
+
+def _choose(mixture: TraversabilityMixture, cells: Tensor) -> TraversabilityMixture:
+    """The chosen ones (bool, shape [B, H, W]) of a mixture's cells, as a map of one row: [K, 1, N]."""
+    parameters = (mixture.weights, mixture.means, mixture.stds)
+    weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
+    return TraversabilityMixture(weights, means, stds, mixture.group)
+
+
+def _score_cells(
+    mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Sums of squared errors, NLL, CRPS, covered and tail cells, float64, shape [6]; and every PIT.
+
+    Cells whose λ was not observed are left out.
+    """
+    known = ~terrain.traversability.isnan()
+    mixture, observed = _choose(mixture, known), terrain.traversability[known].unsqueeze(0)
+    truth = _choose(terrain.truth, known).mean()
+    expected, transformed = mixture.mean(), pit(mixture, observed, generator)
+    cells = transformed.numel()
+    sums = [
+        (expected - observed).double().square().sum(),
+        (expected - truth).double().square().sum(),
+        -mixture.log_prob(observed).double().sum(),
+        crps(mixture, observed).double().sum(),
+        torch.as_tensor(coverage(transformed) * cells, device=observed.device),
+        torch.as_tensor(tail_rate(transformed, LEVEL) * cells, device=observed.device),
+    ]
+    return torch.stack([total.double() for total in sums]), transformed

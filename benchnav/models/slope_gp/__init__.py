@@ -1,0 +1,1 @@
+"""Traversability over slope, class by class: Gaussian processes and soft spots, and the cells they learn from."""

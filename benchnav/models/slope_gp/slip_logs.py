@@ -1,0 +1,176 @@
+"""A robot's own slip logs: a table with a row for each place driven over, CSV or Parquet.
+
+Columns: `class` (a class's name, or its integer id), `slope_deg` (0–90) and `traversability` (λ, 0–1;
+1 minus the slip ratio where the robot holds its commanded speed). Others are ignored, and so are rows
+in which slope or traversability is missing.
+"""
+
+import difflib
+import hashlib
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from benchnav.errors import DatasetError
+from benchnav.models.slope_gp.cells import Cells, observed_cells
+
+COLUMNS = ("class", "slope_deg", "traversability")
+
+_LIMITS = {"slope_deg": 90, "traversability": 1}
+_MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
+_MOST_CLASSES = 256  # class ids are stored in a byte
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipLogs:
+    """The rows of a slip log. Letters in shapes: N rows.
+
+    Args:
+        class_names: in alphabetical order; for integer ids "0", "1", … up to the largest.
+        by_id: whether the log names classes by integer ids.
+        class_id: index into `class_names`, int64, shape [N].
+        slope_deg: in [0, 90], float32, shape [N].
+        traversability: observed λ in [0, 1], float32, shape [N].
+        digest: SHA-256 of the file.
+    """
+
+    class_names: tuple[str, ...]
+    by_id: bool
+    class_id: Tensor
+    slope_deg: Tensor
+    traversability: Tensor
+    digest: str
+
+    def cells(self, class_names: tuple[str, ...]) -> Cells:
+        """Gives the rows with the ids of a class table.
+
+        Args:
+            class_names: the class table; integer ids of the log are indices into it.
+
+        Raises:
+            DatasetError: the log has a class that the table lacks.
+        """
+        if self.by_id:
+            if len(self.class_names) > len(class_names):
+                raise DatasetError(
+                    f"Expected class ids in 0–{len(class_names) - 1} in the slip log, got "
+                    f"{self.class_names[-1]}. Number the classes as in the class table."
+                )
+            ids = self.class_id
+        else:
+            places = [_find_class(name, class_names) for name in self.class_names]
+            ids = torch.tensor(places)[self.class_id]
+        return observed_cells(ids, self.slope_deg, self.traversability, len(class_names))
+
+
+def read_slip_logs(path: str | Path) -> SlipLogs:
+    """Reads a slip log.
+
+    Args:
+        path: a file that ends in .csv or .parquet.
+
+    Raises:
+        DatasetError: there is no such file, it cannot be read, lacks a column or rows, or a value is no
+            number or out of range.
+    """
+    path = Path(path)
+    rows = _read(path)
+    missing = [name for name in COLUMNS if name not in rows]
+    if missing:
+        raise DatasetError(
+            f"Expected columns {', '.join(COLUMNS)} in {path}, got no {' and no '.join(missing)}. "
+            f"It has {', '.join(str(name) for name in rows.columns) or 'none'}."
+        )
+    numbers = {name: _read_numbers(rows[name], name, most, path) for name, most in _LIMITS.items()}
+    observed = ~np.logical_or(*(np.isnan(column) for column in numbers.values()))
+    if not observed.any():
+        raise DatasetError(
+            f"Expected rows with a slope and a traversability in {path}, got none among {len(rows)}. "
+            "Log places that the robot has driven over."
+        )
+    names, by_id, ids = _read_classes(rows["class"], observed, path)
+    slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return SlipLogs(
+        class_names=names,
+        by_id=by_id,
+        class_id=torch.from_numpy(ids),
+        slope_deg=slope,
+        traversability=value,
+        digest=digest,
+    )
+
+
+def _read(path: Path) -> pd.DataFrame:
+    if path.suffix not in (".csv", ".parquet"):
+        raise DatasetError(f"Expected a slip log that ends in .csv or .parquet, got {path}.")
+    if not path.is_file():
+        raise DatasetError(f"Expected a slip log, got {path}, which is not there.")
+    try:
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            # As text: a class may be called NA, and a bad number is to be found in its row.
+            rows = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, index_col=False)
+        return rows.rename(columns=str.strip)
+    except (OSError, ValueError, pd.errors.ParserWarning) as error:
+        why = str(error).strip().splitlines()
+        raise DatasetError(
+            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be "
+            f"read: {why[0] if why else type(error).__name__}"
+        ) from error
+
+
+def _read_numbers(column: pd.Series, name: str, most: float, path: Path) -> np.ndarray:
+    """Gives the numbers of a column, float64, NaN where missing."""
+    text = (
+        column.str.strip() if column.dtype == object or isinstance(column.dtype, pd.StringDtype) else column
+    )
+    values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    absent = (text.isna() | text.isin(_MISSING)).to_numpy(dtype=bool)
+    bad = np.flatnonzero(~absent & ~((values >= 0) & (values <= most)))
+    if len(bad):
+        raise DatasetError(
+            f"Expected `{name}` to be numbers within [0, {most}] in {path}, got {column.iloc[bad[0]]!s} in row "
+            f"{bad[0] + 1} below the header. Mend that row, or leave the value out."
+        )
+    return np.where(absent, np.nan, values)
+
+
+def _read_classes(
+    column: pd.Series, observed: np.ndarray, path: Path
+) -> tuple[tuple[str, ...], bool, np.ndarray]:
+    """Gives class names, whether they are ids, and the index of each observed row's class."""
+    text = column.astype("string").str.strip().fillna("")
+    absent = np.flatnonzero(observed & (text == "").to_numpy(dtype=bool))
+    if len(absent):
+        raise DatasetError(
+            f"Expected a `class` in every row of {path}, got none in row {absent[0] + 1} below the header."
+        )
+    found = text.to_numpy(dtype=str)[observed]
+    names, ids = np.unique(found, return_inverse=True)
+    by_id = all(name.isascii() and name.isdigit() for name in names)
+    count = max(int(name) for name in names) + 1 if by_id else len(names)
+    if count > _MOST_CLASSES:
+        raise DatasetError(
+            f"Expected at most {_MOST_CLASSES} classes in {path}, got {count}. Number classes from 0."
+        )
+    if by_id:
+        ids, names = names.astype(np.int64)[ids], np.arange(count)
+    return tuple(str(name) for name in names), by_id, ids.astype(np.int64)
+
+
+def _find_class(name: str, class_names: tuple[str, ...]) -> int:
+    if name in class_names:
+        return class_names.index(name)
+    close = difflib.get_close_matches(name, class_names, n=1)
+    hint = f"Did you mean {close[0]!r}?" if close else "Name classes as in the class table."
+    raise DatasetError(
+        f"Expected classes among {', '.join(class_names)} in the slip log, got {name!r}. {hint}"
+    )

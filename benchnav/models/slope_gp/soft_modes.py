@@ -1,0 +1,219 @@
+"""Finding a second mode of a class's traversability, one that slope does not explain: soft spots.
+
+A cell of the class is, with probability 1 − p, from a normal distribution about the class's function of
+slope f(ψ) with standard deviation σ, and else from N(m, s²), the same at any slope; what is observed is
+clipped to [0, 1]. The parameters are found by expectation maximisation over counts of cells by slope and
+by λ, in which a cell's share in each mode, and what lies beyond the clip, are the unknowns. Here f is
+any function of small bends; the GP is fitted afterwards to the cells of the main mode.
+
+A second mode is kept where there are 100 cells or more, it holds over 1 % of them, BIC very strongly
+prefers it, and every cell is told better by 0.002 nats on average. The last keeps away modes that only
+mend how the main one is drawn, which BIC would keep once there are cells enough. Sources: Dempster, Laird
+and Rubin (1977), "Maximum likelihood from incomplete data via the EM algorithm"; Tobin (1958),
+"Estimation of relationships for limited dependent variables"; Schwarz (1978), "Estimating the dimension
+of a model"; Kass and Raftery (1995), "Bayes factors". Letters in shapes: S starts, B bins of slope, V
+bins of λ, C classes.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchnav.models.slope_gp.sums import INSIDE_BINS, SlopeSums, levels
+from benchnav.models.slope_gp.table import SoftModes
+
+LEAST_CELLS, LEAST_WEIGHT, LEAST_GAIN = 100, 0.01, 2e-3
+
+_FREE_PARAMETERS = 3  # that a second mode adds
+_STRONG = 10.0  # difference of BIC from which evidence is called very strong
+_STARTS = (0.05, 0.35, 0.65, 0.95)  # means that a second mode is looked for from
+_FIRST_WEIGHT, _FIRST_STD = 0.1, 0.1
+_MOST_WEIGHT, _LEAST_STD = 0.5, 0.01
+_BEND_STD = 0.005  # of the second differences of f from bin to bin
+_FIRST_STEPS, _MOST_STEPS = 40, 300
+_MOST_ODDS = 200.0  # beyond, shares would be too small for quick arithmetic
+_SETTLED = 1e-8  # nats a cell and step
+
+
+@dataclass(frozen=True)
+class _Modes:
+    """Parameters of S fits: f of shape [S, B], all others of shape [S]; weight 0 for a single mode."""
+
+    main: Tensor
+    main_std: Tensor
+    weight: Tensor
+    mean: Tensor
+    std: Tensor
+
+    def select(self, which: int) -> "_Modes":
+        """Keeps one fit."""
+        one = slice(which, which + 1)
+        return _Modes(self.main[one], self.main_std[one], self.weight[one], self.mean[one], self.std[one])
+
+
+def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, Tensor]:
+    """Looks for a second mode of each class.
+
+    Args:
+        sums: of the observed cells of C classes.
+
+    Returns:
+        The second modes, None where no class has one; and the share of the cells in the main mode, by
+        class and bins as in `sums.cells`, float64, 1 throughout for a class without a second.
+    """
+    classes = len(sums.cells)
+    weight, mean, std = torch.zeros(classes), torch.zeros(classes), torch.ones(classes)
+    share = torch.ones(sums.cells.shape, dtype=torch.float64)
+    for c, counts in enumerate(sums.cells):
+        found = _find_in_class(counts)
+        if found is not None:
+            modes, share[c] = found
+            weight[c], mean[c], std[c] = modes.weight[0], modes.mean[0], modes.std[0]
+    soft = SoftModes(weight=weight, mean=mean, std=std) if bool(weight.any()) else None
+    return soft, share
+
+
+def main_bins(sums: SlopeSums, soft: SoftModes, share: Tensor) -> dict[str, Tensor]:
+    """Gives the sums that the censored likelihood takes, over the cells of the main modes.
+
+    Args:
+        sums: of the observed cells.
+        soft: the second modes.
+        share: of the cells in the main mode, by class and bins as in `sums.cells`.
+
+    Returns:
+        As `SlopeSums.bins`; of a class without a second mode what that gives.
+    """
+    bins = sums.bins(censored=True)
+    has_two, size, level = soft.weight > 0, bins["zeros"].shape[1], levels()[1:-1]
+    kept = (sums.cells[has_two] * share[has_two])[:, :size]
+    inside = kept[..., 1:-1]
+    bins["zeros"][has_two], bins["ones"][has_two] = kept[..., 0], kept[..., -1]
+    bins["inside"][has_two] = inside.sum(-1)
+    bins["total"][has_two], bins["squares"][has_two] = inside @ level, inside @ level**2
+    return bins
+
+
+def _find_in_class(counts: Tensor) -> tuple[_Modes, Tensor] | None:
+    """The second mode of a class and the main one's share of its cells [B, V]; None where it has one mode."""
+    total = int(counts.sum())
+    if total < LEAST_CELLS:
+        return None
+    size = int(counts.sum(1).nonzero().max()) + 1
+    cells = counts[:size].double()
+    single, single_fit = _maximise(cells, _first_guess(cells), _MOST_STEPS)
+    starts = _maximise(cells, _with_second(single), _FIRST_STEPS)
+    best = starts[0].select(int(starts[1].argmax()))
+    double, double_fit = _maximise(cells, best, _MOST_STEPS)
+    gain, weight = float(double_fit - single_fit), float(double.weight)
+    if weight <= LEAST_WEIGHT or gain <= LEAST_GAIN * total:
+        return None
+    if 2 * gain <= _FREE_PARAMETERS * math.log(total) + _STRONG:
+        return None
+    share = torch.ones(counts.shape, dtype=torch.float64)
+    share[:size] = 1 - _soft_share(double)[1][0]
+    return double, share
+
+
+def _first_guess(cells: Tensor) -> _Modes:
+    """One mode, level at the mean of all cells."""
+    level, every = levels(), cells.sum(0)
+    mean = (every * level).sum() / every.sum()
+    spread = ((every * (level - mean) ** 2).sum() / every.sum()).sqrt().clamp(min=_FIRST_STD)
+    none = torch.zeros(1, dtype=torch.float64)
+    return _Modes(mean.expand(1, len(cells)), spread.view(1), none, none, none + _FIRST_STD)
+
+
+def _with_second(single: _Modes) -> _Modes:
+    """Starts with a small second mode at several places."""
+    mean = torch.tensor(_STARTS, dtype=torch.float64)
+    return _Modes(
+        single.main.expand(len(mean), -1),
+        single.main_std.expand(len(mean)),
+        torch.full_like(mean, _FIRST_WEIGHT),
+        mean,
+        torch.full_like(mean, _FIRST_STD),
+    )
+
+
+def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Tensor]:
+    """Climbs from S starts at once; gives the last parameters and their log likelihoods [S]."""
+    before = torch.full_like(modes.weight, -math.inf)
+    for _ in range(most_steps):
+        log_prob, share = _soft_share(modes)
+        fit = (cells * log_prob).sum((1, 2))
+        if bool((fit - before < _SETTLED * cells.sum()).all()):
+            break
+        before, modes = fit, _improve(cells, modes, share)
+    return modes, (cells * _soft_share(modes)[0]).sum((1, 2))
+
+
+def _soft_share(modes: _Modes) -> tuple[Tensor, Tensor]:
+    """Log probability of a bin of λ, and the second mode's share in it, each of shape [S, B, V]."""
+    main = _log_prob(modes.main, modes.main_std.unsqueeze(1)) + torch.log1p(-modes.weight).view(-1, 1, 1)
+    soft = _log_prob(modes.mean.unsqueeze(1), modes.std.unsqueeze(1)) + modes.weight.log().view(-1, 1, 1)
+    odds = (soft - main).clamp(-_MOST_ODDS, _MOST_ODDS)
+    return main + torch.nn.functional.softplus(odds), odds.sigmoid()
+
+
+def _log_prob(mean: Tensor, std: Tensor) -> Tensor:
+    """Of the bins of λ under clipped normal distributions: shape [S, B, V] from means and deviations [S, B]."""
+    z = (levels()[1:-1] - mean.unsqueeze(-1)) / std.unsqueeze(-1)
+    inside = -0.5 * z**2 - (std * math.sqrt(2 * math.pi) * INSIDE_BINS).log().unsqueeze(-1)
+    at_0, at_1 = torch.special.log_ndtr(-mean / std), torch.special.log_ndtr((mean - 1) / std)
+    return torch.cat([at_0.unsqueeze(-1), inside, at_1.unsqueeze(-1)], -1)
+
+
+def _improve(cells: Tensor, modes: _Modes, share: Tensor) -> _Modes:
+    """The parameters of greatest expected likelihood, given the shares of the second mode [S, B, V]."""
+    soft = cells * share
+    count, total, squares = _moments(cells - soft, modes.main, modes.main_std.unsqueeze(1))
+    main = _smooth(count, total, modes.main_std)
+    gap = squares - 2 * main * total + main**2 * count
+    main_std = (gap.sum(1) / count.sum(1)).clamp(min=_LEAST_STD**2).sqrt()
+    if not bool(modes.weight.any()):
+        return _Modes(main, main_std, modes.weight, modes.mean, modes.std)
+    every = soft.sum(1, keepdim=True)
+    count, total, squares = _moments(every, modes.mean.unsqueeze(1), modes.std.unsqueeze(1))
+    some = count.clamp(min=1e-9)
+    mean = (total / some).squeeze(1)
+    std = (squares / some - mean.unsqueeze(1) ** 2).clamp(min=_LEAST_STD**2).sqrt().squeeze(1)
+    weight = (count.squeeze(1) / cells.sum()).clamp(max=_MOST_WEIGHT)
+    return _Modes(main, main_std, weight, mean, std)
+
+
+def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cells, and the sums of their λ and λ² before clipping as far as a normal distribution tells it.
+
+    Args:
+        cells: shape [S, B, V].
+        mean: of the normal distribution, shape [S, B].
+        std: of it, shape [S, 1].
+
+    Returns:
+        Each of shape [S, B].
+    """
+    level, inside = levels()[1:-1], cells[..., 1:-1]
+    total, squares = inside @ level, inside @ level**2
+    for clipped, edge, sign in ((cells[..., 0], -mean / std, -1), (cells[..., -1], (mean - 1) / std, 1)):
+        # Of a normal variable beyond the edge (Tobin): h = φ/Φ, mean m ± s·h, variance s²(1 − e·h − h²).
+        hazard = torch.exp(-0.5 * edge**2 - torch.special.log_ndtr(edge)) / math.sqrt(2 * math.pi)
+        beyond = mean + sign * std * hazard
+        total = total + clipped * beyond
+        squares = squares + clipped * (beyond**2 + std**2 * (1 - edge * hazard - hazard**2).clamp(min=0))
+    return cells.sum(-1), total, squares
+
+
+def _smooth(count: Tensor, total: Tensor, std: Tensor) -> Tensor:
+    """f of least squares, its bends held small, from counts and sums of λ by bins of slope, [S, B]."""
+    bins = count.shape[1]
+    bends = torch.eye(bins, dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD if bins > 2 else None
+    variance = (std**2).unsqueeze(1)
+    # A little of the level of all cells settles what the data leave open.
+    level = (total.sum(1) / count.sum(1)).unsqueeze(1)
+    precision = torch.diag_embed(count / variance + 1e-3)
+    if bends is not None:
+        precision = precision + bends.T @ bends
+    return torch.linalg.solve(precision, (total / variance + 1e-3 * level).unsqueeze(-1)).squeeze(-1)

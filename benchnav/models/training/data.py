@@ -1,0 +1,218 @@
+"""Training data in whole maps, held in memory.
+
+What a batch holds is a pure function of (seed, epoch, place in the epoch): order and augmentation
+come from named random streams, so a training that is resumed sees what it would have seen. Letters
+in shapes: B maps in memory, b maps in a batch, H×W cells.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, Sampler
+from torchvision.transforms.v2 import functional as photometry
+
+from benchnav import rng
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import ConfigError, DatasetError
+
+TRAIN, VALID = "train", "valid"
+
+_SYMMETRIES = tuple(range(8))  # of the square: four rotations, each as it is or mirrored
+_SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
+
+MapKey = tuple[Tensor, Tensor, Tensor]
+Batch = dict[str, Tensor]
+
+
+class MapDataset(Dataset[Batch]):
+    """Maps by field; indexed by a whole batch at a time.
+
+    Args:
+        fields: by name, each of shape [B, *, H, W]; `rgb` (uint8, [B, 3, H, W]) is among them.
+    """
+
+    def __init__(self, fields: dict[str, Tensor]) -> None:
+        """Keeps the tensors."""
+        self.fields = fields
+
+    def __len__(self) -> int:
+        """Number of maps."""
+        return len(self.fields["rgb"])
+
+    def __getitem__(self, key: MapKey) -> Batch:
+        """Gives every field of the maps in `key`, shape [b, *, H, W].
+
+        Args:
+            key: indices of maps and the symmetry to apply to each, both int64 of shape [b], and the
+                factors of `apply_jitter`, shape [b, 3].
+        """
+        index, symmetry, factors = key
+        batch = {name: _turn(values[index], symmetry) for name, values in self.fields.items()}
+        return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
+
+
+def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
+    """Changes brightness, contrast and saturation of each image, in this order.
+
+    Args:
+        rgb: uint8, shape [b, 3, H, W].
+        factors: of the three, each 1 where nothing is to change, shape [b, 3].
+    """
+    if bool((factors == 1).all()):
+        return rgb
+    changed = []
+    for image, (brightness, contrast, saturation) in zip(rgb, factors.tolist(), strict=True):
+        image = photometry.adjust_brightness(image, brightness)
+        image = photometry.adjust_contrast(image, contrast)
+        changed.append(photometry.adjust_saturation(image, saturation))
+    return torch.stack(changed)
+
+
+def apply_symmetry(maps: Tensor, which: int) -> Tensor:
+    """Turns maps by 90° `which // 2` times and then, if `which` is odd, mirrors them left to right.
+
+    Args:
+        maps: shape [*B, H, W].
+        which: 0–7; 0 changes nothing.
+    """
+    turned = torch.rot90(maps, which // 2, (-2, -1))
+    return turned.flip(-1) if which % 2 else turned
+
+
+def _turn(maps: Tensor, symmetry: Tensor) -> Tensor:
+    turned = torch.empty_like(maps)
+    for which in symmetry.unique().tolist():
+        chosen = symmetry == which
+        turned[chosen] = apply_symmetry(maps[chosen], which)
+    return turned
+
+
+class MapSampler(Sampler[MapKey]):
+    """Cuts the maps into batches of nearly equal size, in an order keyed by (seed, epoch).
+
+    Args:
+        maps: how many there are.
+        batch_size: most maps a batch.
+        seed: root seed.
+        symmetries: which symmetries to draw from; (0,) leaves maps as they are.
+        jitter: largest relative change of brightness, contrast and saturation.
+        shuffle: whether to change the order each epoch.
+        share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
+    """
+
+    def __init__(
+        self,
+        maps: int,
+        batch_size: int,
+        seed: int = 0,
+        *,
+        symmetries: tuple[int, ...] = (0,),
+        jitter: float = 0.0,
+        shuffle: bool = False,
+        share: tuple[int, int] = (0, 1),
+    ) -> None:
+        """Starts at epoch 0."""
+        self.maps, self.batch_size, self.seed = maps, batch_size, seed
+        self.symmetries, self.jitter, self.shuffle, self.share = symmetries, jitter, shuffle, share
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Chooses the epoch that the next iteration gives; the trainer calls this."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        """Batches an epoch."""
+        return -(-self.maps // self.batch_size)
+
+    def __iter__(self) -> Iterator[MapKey]:
+        """Yields the batches of the epoch."""
+        order, symmetry = np.arange(self.maps), np.zeros(self.maps, dtype=np.int64)
+        factors = np.ones((self.maps, 3))
+        if self.shuffle:
+            epoch = np.array([self.epoch])
+            order = rng.permutation(self._key("order"), epoch, self.maps)[0]
+            drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
+            symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
+        if self.jitter:
+            drawn = rng.uniform(self._key("jitter"), np.array([self.epoch]), (self.maps, 3))[0]
+            factors = 1 + self.jitter * (2 * drawn - 1)
+        first, step = self.share
+        pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
+        for batch in zip(*pieces, strict=True):
+            start = min(first, len(batch[0]) - 1)  # no process is left without a map
+            index, which, how = (torch.from_numpy(values[start::step]) for values in batch)
+            yield index, which, how
+
+    def _key(self, what: str) -> int:
+        return rng.stream_key(self.seed, "models", f"map {what}")
+
+
+class MapData(lightning.LightningDataModule):
+    """The maps of the splits `train` and `valid`.
+
+    Training maps are turned and mirrored at random, all fields alike. That stays physical: the light
+    comes from a random direction. Where processes train together, each takes its part of every batch.
+
+    Args:
+        dataset: where they are.
+        batch_size: most maps a batch.
+        seed: root seed of order and augmentation.
+        jitter: largest relative change of brightness, contrast and saturation of a training map.
+        fields: which fields to read beside `rgb`.
+
+    Raises:
+        DatasetError: a split is missing, or there are fewer than two maps to train on.
+    """
+
+    def __init__(
+        self,
+        dataset: TerrainDataset,
+        batch_size: int,
+        seed: int,
+        jitter: float = 0.0,
+        fields: tuple[str, ...] = ("class_id",),
+    ) -> None:
+        """Reads the maps into memory."""
+        super().__init__()
+        if batch_size < 2:
+            raise ConfigError(f"Expected `batch_size` ≥ 2, got {batch_size}.")
+        self.batch_size, self.seed, self.jitter = batch_size, seed, jitter
+        self.train, self.valid = (read_maps(dataset, split, fields) for split in (TRAIN, VALID))
+        if len(self.train) < 2:
+            raise DatasetError(f"Expected at least 2 training maps in {dataset.path}, got {len(self.train)}.")
+
+    def colour_statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
+        counts = torch.stack(
+            [channel.flatten().bincount(minlength=256) for channel in self.train.fields["rgb"].unbind(1)]
+        )
+        share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
+        mean = (share * level).sum(1)
+        variance = (share * level**2).sum(1) - mean**2
+        return mean.float(), variance.clamp(min=1).sqrt().float()
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Augmented batches in random order."""
+        height, width = self.train.fields["rgb"].shape[-2:]
+        symmetries = _SYMMETRIES if height == width else _SYMMETRIES_OF_RECTANGLE
+        return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """Batches as stored, in order."""
+        return self._load(self.valid)
+
+    def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
+        share = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        sampler = MapSampler(len(maps), self.batch_size, self.seed, share=share, **order)
+        # A generator of its own keeps the loader from drawing on PyTorch's global one.
+        return DataLoader(maps, batch_size=None, sampler=sampler, generator=torch.Generator())
+
+
+def read_maps(dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",)) -> MapDataset:
+    """Reads the colours and other fields of a split into memory."""
+    read = dataset.read(split, fields=("rgb", *fields))
+    return MapDataset({name: torch.from_numpy(values) for name, values in read.items()})

@@ -1,0 +1,374 @@
+"""One training with Lightning: quiet, with progress and logs, and able to go on after a kill.
+
+A training that is given a folder leaves there, after every epoch, all that it needs to go on
+(`last.ckpt`, a Lightning checkpoint) and what was measured (`metrics.csv`, and TensorBoard's events).
+Gone on from there it ends with the weights that an unbroken one would have, bit for bit on a CPU:
+what a batch holds depends on seed and epoch alone.
+"""
+
+import inspect
+import json
+import logging
+import os
+import pickle
+import signal
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pandas as pd
+import torch
+from lightning.fabric.plugins.io import TorchCheckpointIO
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from rich.console import Console
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+from torch import Tensor
+
+from benchnav.errors import CheckpointError, ConfigError
+from benchnav.files import replacing, sole_writer, write_text
+
+STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
+ACCELERATORS = ("auto", "cpu", "cuda", "gpu")
+
+_OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "barebones", "fast_dev_run"}
+_OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps"}
+_OWN |= {"use_distributed_sampler", "inference_mode", "enable_autolog_hparams", "model_registry", "profiler"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """How to train, whatever is trained.
+
+    Args:
+        folder: where logs and what is needed to go on are kept, in a folder for each part of a model;
+            nothing is written when None.
+        resume: go on with the training that was interrupted there, if there is one.
+        trainer: settings of Lightning's trainer by name.
+
+    Raises:
+        ConfigError: the trainer has no such setting, or it is set here.
+    """
+
+    folder: Path | None = None
+    resume: bool = False
+    trainer: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Checks the names of the trainer's settings."""
+        known = sorted(set(inspect.signature(lightning.Trainer.__init__).parameters) - _OWN)
+        unknown = sorted(set(self.trainer) - set(known))
+        if unknown:
+            raise ConfigError(f"Expected settings of `trainer` among {', '.join(known)}, got {unknown[0]!r}.")
+        accelerator = self.trainer.get("accelerator", "auto")
+        if accelerator not in ACCELERATORS:
+            raise ConfigError(
+                f"Expected `trainer.accelerator` among {', '.join(ACCELERATORS)}, got {accelerator!r}."
+            )
+        devices, processors = self.trainer.get("devices", 1), os.cpu_count() or 1
+        if not torch.cuda.is_available() and isinstance(devices, int) and not 1 <= devices <= processors:
+            raise ConfigError(
+                f"Expected `trainer.devices` in 1–{processors}, as many as there are processors, got {devices}."
+            )
+        if accelerator in ("cuda", "gpu") and not torch.cuda.is_available():
+            raise ConfigError(
+                f"Expected a CUDA device for `trainer.accelerator` {accelerator}, got none. Use cpu or auto."
+            )
+
+
+class KeepBest(Callback):
+    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end."""
+
+    def __init__(self) -> None:
+        """Starts with none."""
+        self.loss = float("inf")
+        self.metrics: dict[str, float] = {}
+        self.weights: dict[str, Tensor] = {}
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Copies the weights when they are the best so far."""
+        measured = {name: value for name, value in _measured(trainer).items() if name.startswith("valid_")}
+        if measured["valid_loss"] < self.loss:
+            self.loss, self.metrics = measured["valid_loss"], {**measured, "epoch": trainer.current_epoch + 1}
+            self.weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
+
+    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Puts the best weights back."""
+        if not self.weights:
+            raise ConfigError(
+                "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
+            )
+        module.load_state_dict(self.weights)
+        # The trainer's own metrics are what comes back from processes that it has started.
+        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in self.metrics.items()})
+
+    def state_dict(self) -> dict[str, Any]:
+        """Gives what `load_state_dict` takes."""
+        return {"loss": self.loss, "metrics": self.metrics, "weights": self.weights}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from an earlier state."""
+        self.loss, self.metrics, self.weights = state["loss"], state["metrics"], state["weights"]
+
+
+class History(Callback):
+    """Writes what was measured to a table, a row an epoch.
+
+    Args:
+        path: the table, CSV.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Starts with no rows."""
+        self.path, self.rows = path, list[dict[str, float]]()
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Adds a row."""
+        rate = float(trainer.optimizers[0].param_groups[0]["lr"])
+        row = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "learning_rate": rate}
+        self.rows.append({**row, **_measured(trainer)})
+        if trainer.is_global_zero:
+            write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Gives what `load_state_dict` takes."""
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from an earlier state."""
+        self.rows = list(state["rows"])
+
+
+class Progress(Callback):
+    """Shows how far training is: a bar in a terminal, a line an epoch elsewhere.
+
+    Args:
+        what: what is trained.
+    """
+
+    def __init__(self, what: str) -> None:
+        """Shows nothing yet."""
+        self.what = what
+        self.bar: Bar | None = None
+
+    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Shows the bar where there is a terminal."""
+        console = Console(stderr=True)
+        if console.is_terminal and trainer.is_global_zero:
+            columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+            self.bar = Bar(TextColumn("{task.description}"), *columns, console=console)
+            total = int(trainer.estimated_stepping_batches)
+            self.task = self.bar.add_task(self.what, total=total, completed=trainer.global_step)
+            self.bar.start()
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Moves the bar."""
+        if self.bar:
+            self.bar.update(self.task, completed=trainer.global_step)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Says what the epoch brought."""
+        epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
+        measured = {name: value for name, value in _measured(trainer).items() if name.startswith("valid_")}
+        shown = measured or _measured(trainer)
+        values = [f"{name.removeprefix('valid_')} {value:.4f}" for name, value in shown.items()]
+        if self.bar:
+            self.bar.update(self.task, description=f"{epoch}, {values[0]}")
+        elif trainer.is_global_zero:
+            print(", ".join([epoch, *values]), file=sys.stderr, flush=True)
+
+    def teardown(self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str) -> None:
+        """Ends the bar, also when training was interrupted."""
+        if self.bar:
+            self.bar.stop()
+
+
+class WholeFiles(TorchCheckpointIO):
+    """Writes a Lightning checkpoint whole or not at all, also where temporary files are on another disk."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Writes it beside its name, then renames it."""
+        with replacing(Path(path), durable=False) as partial:
+            torch.save(checkpoint, partial)
+
+
+def fit(
+    module: lightning.LightningModule,
+    part: str,
+    options: FitOptions,
+    settings: Mapping[str, Any],
+    callbacks: list[Callback],
+    data: Mapping[str, Any],
+    **trainer: Any,
+) -> dict[str, float]:
+    """Trains a module in place.
+
+    Args:
+        module: what to train.
+        part: name of the part of a model that it is.
+        options: how.
+        settings: plain data on which the outcome depends; an interrupted training of others is not
+            gone on with.
+        callbacks: what else is to happen.
+        data: loaders or data module, as arguments of the trainer's `fit`.
+        trainer: settings of Lightning's trainer, where the options say nothing.
+
+    Returns:
+        What was measured, by name.
+
+    Raises:
+        CheckpointError: the interrupted training is damaged or has other settings.
+        KeyboardInterrupt: the user has stopped it.
+    """
+    folder = options.folder / part if options.folder else None
+    chosen: dict[str, Any] = {"devices": 1, **trainer, **options.trainer}
+    chosen["accelerator"] = _accelerator(chosen.get("accelerator", "auto"))
+    callbacks = [*callbacks, Progress(part)]
+    with _quiet():
+        if folder is None:
+            lightning_trainer = _trainer(callbacks, logger=False, enable_checkpointing=False, **chosen)
+            _run(lightning_trainer, module, data, None)
+            return _measured(lightning_trainer)
+        with sole_writer(folder, f"{folder}") if is_first_process() else nullcontext():
+            folder.mkdir(parents=True, exist_ok=True)
+            state = _prepare(folder, options.resume, {**settings, "precision": chosen["precision"]})
+            keep = ModelCheckpoint(
+                folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
+            )
+            lightning_trainer = _trainer(
+                [*callbacks, History(folder / HISTORY), keep],
+                logger=TensorBoardLogger(folder, name="", version=""),
+                plugins=[WholeFiles()],
+                **chosen,
+            )
+            _run(lightning_trainer, module, data, state)
+            return _measured(lightning_trainer)
+
+
+def is_first_process() -> bool:
+    """Tells whether this process is alone, or the first of those that train together."""
+    return not getattr(rank_zero_only, "rank", 0)
+
+
+def interrupted(folder: Path, parts: list[str]) -> list[str]:
+    """Names the parts whose training was interrupted in `folder`."""
+    return [part for part in parts if (folder / part / STATE).exists()]
+
+
+def forget(folder: Path, part: str) -> None:
+    """Drops what was kept to go on with a part's training; its logs stay."""
+    for path in (folder / part / STATE, *_partial(folder / part)):
+        path.unlink(missing_ok=True)
+
+
+def default_precision() -> str:
+    """bf16-mixed where the CPU or GPU has bfloat16 arithmetic, 32-true elsewhere."""
+    if torch.cuda.is_available():
+        known = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        known = bool(torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    return "bf16-mixed" if known else "32-true"
+
+
+def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
+    """Makes the folder; gives the state to go on from, if any."""
+    state, described = folder / STATE, json.loads(json.dumps(settings, default=str))
+    if resume and state.exists():
+        there = json.loads((folder / SETTINGS).read_text()) if (folder / SETTINGS).exists() else {}
+        names = {name for name in {*there, *described} if there.get(name) != described.get(name)}
+        if names:
+            raise CheckpointError(
+                f"Expected the settings of the interrupted training in {folder} to resume it, got another "
+                f"{' and '.join(f'`{name}`' for name in sorted(names))}. Repeat its settings, or pass "
+                "--overwrite to begin anew."
+            )
+        return state
+    if is_first_process():
+        for old in (state, folder / HISTORY, *folder.glob("events.out.tfevents.*"), *_partial(folder)):
+            old.unlink(missing_ok=True)
+        write_text(folder / SETTINGS, json.dumps(described, indent=1) + "\n")
+    return None
+
+
+def _partial(folder: Path) -> Iterator[Path]:
+    """What a kill in the middle of writing has left."""
+    return folder.glob(f".{STATE}.*.partial")
+
+
+def _run(
+    trainer: lightning.Trainer,
+    module: lightning.LightningModule,
+    data: Mapping[str, Any],
+    state: Path | None,
+) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
+    except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
+        signal.signal(signal.SIGINT, handler)
+        raise KeyboardInterrupt from None
+    except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
+        if state is None or trainer.global_step:
+            raise
+        raise CheckpointError(
+            f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
+        ) from error
+
+
+def _accelerator(name: str) -> str:
+    # Where it is left open: CUDA or CPU, since the Gaussian processes need float64.
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+
+
+def _trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
+    try:
+        return lightning.Trainer(
+            callbacks=callbacks,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
+            **settings,
+        )
+    except (
+        ValueError,
+        TypeError,
+        RuntimeError,
+        MisconfigurationException,
+    ) as error:
+        raise ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {error}") from error
+
+
+def _measured(trainer: lightning.Trainer) -> dict[str, float]:
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Lightning's hints to its developers out of a user's terminal."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"lightning\..*")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

@@ -1,0 +1,176 @@
+"""The checkpoint that a training goes into: what may be written there, and what is there already.
+
+Every refusal comes before any work is done. Where processes train together, the first alone refuses
+and writes.
+"""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from rich.filesize import decimal
+
+from benchnav.errors import CheckpointError
+from benchnav.models.checkpoint import (
+    CLASSIFIER,
+    CONFIG,
+    Checkpoint,
+    Part,
+    is_member,
+    load_checkpoint,
+    save_checkpoint,
+)
+from benchnav.models.training.fit import FitOptions, forget, interrupted, is_first_process
+
+
+class Target:
+    """A checkpoint that parts are added to, one after the other, each saved as soon as it is trained.
+
+    Args:
+        folder: where it is saved.
+        checkpoint: what it holds so far.
+        digest: of the data that parts are trained on.
+        options: how they are trained.
+    """
+
+    def __init__(self, folder: Path, checkpoint: Checkpoint, digest: str, options: FitOptions) -> None:
+        """Starts with what is there."""
+        self.folder, self.checkpoint = folder, checkpoint
+        self.digest, self.options = digest, options
+
+    def holds(
+        self,
+        name: str,
+        config: Mapping[str, Any],
+        seed: int,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
+    ) -> bool:
+        """Tells whether an interrupted run has left a part, trained in the same way.
+
+        Args:
+            name: of the part.
+            config: settings of its training.
+            seed: its root seed.
+            defaults: what settings are that a part of an earlier version does not name.
+
+        Raises:
+            CheckpointError: it was trained in another way.
+        """
+        part = self.checkpoint.parts.get(name)
+        if part is None:
+            return False
+        wanted, there = (
+            json.loads(json.dumps(dict(settings))) for settings in (config, {**defaults, **part.config})
+        )
+        if wanted.items() <= there.items() and (part.seed, part.data_digest) == (seed, self.digest):
+            self._forget(name)  # a kill may have come between saving and forgetting
+            return True
+        remedy = "pass --overwrite instead of --resume"
+        if self.options.folder and interrupted(self.options.folder, [name]):
+            remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
+        raise CheckpointError(
+            f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
+            f"{part.seed} and {part.data_id}. Repeat its settings, or {remedy}."
+        )
+
+    def add(self, name: str, part: Part) -> None:
+        """Saves a trained part with the rest."""
+        self.checkpoint = self.checkpoint.with_part(name, part)
+        if is_first_process():
+            self._save()
+            self._forget(name)
+
+    def set_pool_temperature(self, temperature: float) -> None:
+        """Saves the temperature of the pool of classifiers with the rest."""
+        self.checkpoint = replace(self.checkpoint, pool_temperature=temperature)
+        if is_first_process():
+            self._save()
+
+    def _save(self) -> None:
+        save_checkpoint(self.folder, self.checkpoint)
+        size = sum(path.stat().st_size for path in self.folder.iterdir())
+        parts = " and ".join(sorted(self.checkpoint.parts))
+        print(f"wrote {self.folder} with {parts} ({decimal(size)})")
+
+    def _forget(self, name: str) -> None:
+        if self.options.folder and is_first_process():
+            forget(self.options.folder, name)
+
+
+def open_target(
+    folder: Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions, overwrite: bool
+) -> Target:
+    """Opens the checkpoint that training goes into.
+
+    Args:
+        folder: where it is, or will be.
+        fresh: without parts, of the family and classes that are to be trained.
+        parts: names of the parts to train.
+        digest: of the data that they are trained on.
+        options: how to train.
+        overwrite: whether what is there may be replaced.
+
+    Raises:
+        CheckpointError: the folder is something else, or what is there would be lost or does not fit.
+    """
+    folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
+    left = interrupted(options.folder, parts) if options.folder else []
+    if left and not (options.resume or overwrite) and is_first_process():
+        raise CheckpointError(
+            f"Expected no interrupted training in {options.folder}, got one of {' and '.join(left)}. "
+            "Pass --resume to go on with it, or --overwrite to begin anew."
+        )
+    checkpoint = _what_is_there(folder, fresh, overwrite)
+    trained = [name for name in checkpoint.parts if name in parts]
+    if overwrite:
+        # Members of an ensemble stand or fall together.
+        dropped = {
+            name for name in checkpoint.parts if name in parts or (is_member(name) and CLASSIFIER in parts)
+        }
+        kept = {name: part for name, part in checkpoint.parts.items() if name not in dropped}
+        checkpoint = replace(checkpoint, parts=kept)
+    elif trained and not options.resume and is_first_process():
+        raise CheckpointError(
+            f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace "
+            "it, or --resume to go on with what an interrupted training has left."
+        )
+    elif trained and not options.resume:
+        checkpoint = fresh
+    return Target(folder, checkpoint, digest, options)
+
+
+def _what_is_there(folder: Path, fresh: Checkpoint, overwrite: bool) -> Checkpoint:
+    if not folder.exists():
+        # Whether a checkpoint can be written there shows now rather than after the training.
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        os.rmdir(tempfile.mkdtemp(dir=folder.parent))
+        return fresh
+    if not (folder / CONFIG).is_file():
+        raise CheckpointError(
+            f"Expected `out` to be a new folder or a checkpoint, got {folder}, which is something else. "
+            "Choose another `out`."
+        )
+    try:
+        there = load_checkpoint(folder)
+    except CheckpointError:
+        if overwrite:
+            return fresh
+        raise
+    if (there.model, there.class_names) == (fresh.model, fresh.class_names):
+        return there
+    if overwrite:
+        return fresh
+    raise CheckpointError(
+        f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(there)}. "
+        "Choose another `out`, or pass --overwrite to replace it."
+    )
+
+
+def _describe(checkpoint: Checkpoint) -> str:
+    return f"a {checkpoint.model} model of the classes {', '.join(checkpoint.class_names)}"

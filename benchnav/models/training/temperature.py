@@ -1,0 +1,79 @@
+"""Temperature scaling: one number by which logits are divided, so that confidence fits accuracy.
+
+It is fitted to the validation maps by maximum likelihood and leaves every most likely class as it is.
+The average of several calibrated classifiers is not sure enough of itself, the less so the more they
+differ. So it is given a temperature of its own: first pool, then calibrate. Sources: Guo et al. (2017),
+"On calibration of modern neural networks"; Rahaman and Thiery (2021), "Uncertainty quantification and
+deep ensembles". Letters in shapes: B maps, H×W cells, C classes, N cells.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor, nn
+
+from benchnav import rng
+from benchnav.models.training.data import MapDataset
+
+_CHUNK_CELLS = 2**17
+_MOST_CELLS = 200_000
+_LARGEST = 20.0
+
+
+def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
+    """Finds the temperature of least negative log likelihood, in [0.05, 20].
+
+    Args:
+        logits: shape [N, C].
+        class_id: true classes, int64, shape [N].
+    """
+    logits = logits.double()
+
+    def loss(log_temperature: float) -> float:
+        scaled = logits / float(np.exp(log_temperature))
+        return float(nn.functional.cross_entropy(scaled, class_id))
+
+    reach = float(np.log(_LARGEST))
+    return float(np.exp(minimize_scalar(loss, bounds=(-reach, reach), method="bounded").x))
+
+
+def fit_pool_temperature(members: Sequence[nn.Module], maps: MapDataset, seed: int = 0) -> float:
+    """Finds the temperature of the average of several classifiers' probabilities, for `probabilities.sharpen`.
+
+    Args:
+        members: each calibrated by itself, from uint8 images [B, 3, H, W] to logits [B, C, H, W].
+        maps: with `rgb` and `class_id`.
+        seed: root seed of the cells to fit to.
+    """
+    average, class_id = torch.zeros(()), torch.zeros(0, dtype=torch.int64)
+    for member in members:
+        logits, class_id = sample_logits(member, maps, seed)
+        average = average + logits.double().softmax(1) / len(members)
+    return fit_temperature(average.log(), class_id)
+
+
+def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Classifies maps and keeps at most 200 000 cells, the same share of every map.
+
+    Args:
+        classifier: from uint8 images [B, 3, H, W] to logits [B, C, H, W].
+        maps: with `rgb` and `class_id`.
+        seed: root seed of the draw.
+
+    Returns:
+        Logits [N, C] and true classes [N], int64.
+    """
+    rgb, class_id = maps.fields["rgb"], maps.fields["class_id"].flatten(1).long()
+    cells = class_id.shape[1]
+    kept = min(cells, max(1, _MOST_CELLS // len(maps)))
+    key = rng.stream_key(seed, "models", "temperature")
+    step, found = max(1, _CHUNK_CELLS // cells), []
+    with torch.inference_mode():
+        for start in range(0, len(maps), step):
+            logits = classifier(rgb[start : start + step]).float().flatten(2)
+            for which, one in enumerate(logits, start):
+                place = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0][:kept])
+                found.append((one[:, place].T.clone(), class_id[which, place]))
+    return torch.cat([logits for logits, _ in found]), torch.cat([classes for _, classes in found])

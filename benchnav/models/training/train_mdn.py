@@ -1,0 +1,84 @@
+"""Training a mixture density network."""
+
+from dataclasses import asdict
+
+import torch
+from lightning.pytorch.callbacks import EarlyStopping
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.mixture import TraversabilityMixture
+from benchnav.models.checkpoint import as_stored
+from benchnav.models.config import MDNConfig
+from benchnav.models.nets.mdn import MDN, MixtureDensityNetwork, censored_nll
+from benchnav.models.training.data import MapData, MapDataset
+from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.train import training_digest
+
+_CHUNK_CELLS = 2**17
+
+_DEFAULT = FitOptions()
+
+
+def fit_mdn(
+    config: MDNConfig,
+    dataset: TerrainDataset,
+    seed: int = 0,
+    options: FitOptions = _DEFAULT,
+    half_precision: bool = False,
+) -> tuple[MixtureDensityNetwork, dict[str, float]]:
+    """Trains a network on the split `train` until the split `valid` no longer gains.
+
+    Args:
+        config: what to train.
+        dataset: the maps.
+        seed: root seed of weights, order and augmentation.
+        options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
+        half_precision: whether its kernels will be kept as float16, to which they are rounded before it is
+            measured.
+
+    Returns:
+        The network with its best weights, on the CPU, and what was measured on `valid`.
+    """
+    data = MapData(dataset, config.batch_size, seed, config.jitter, ("slope_deg", "traversability"))
+    # Flat ground alone would have no scale.
+    scale = data.train.fields["slope_deg"].double().square().mean().sqrt().clamp(min=1).float()
+    network = MixtureDensityNetwork(config, *data.colour_statistics(), scale, seed)
+    stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
+    metrics = fit(
+        network,
+        MDN,
+        options,
+        {"config": asdict(config), "data": training_digest(dataset), "seed": seed},
+        [KeepBest(), stopping],
+        {"datamodule": data},
+        max_epochs=config.max_epochs,
+        precision=default_precision(),
+    )
+    network.cpu().eval()
+    if half_precision:
+        network.load_state_dict(as_stored(network.state_dict(), half_precision))
+        metrics = {**metrics, **measure_network(network, data.valid)}
+    return network, metrics
+
+
+def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[str, float]:
+    """Measures a network as training does: `valid_loss` and `valid_rmse`.
+
+    Args:
+        network: in evaluation, on the CPU.
+        maps: with `rgb`, `slope_deg` and `traversability`.
+    """
+    fields, step = maps.fields, max(1, _CHUNK_CELLS // maps.fields["slope_deg"][0].numel())
+    loss, squares, cells = 0.0, 0.0, 0
+    with torch.inference_mode():
+        for start in range(0, len(maps), step):
+            batch = {name: values[start : start + step] for name, values in fields.items()}
+            log_weights, means, stds = network(batch["rgb"], batch["slope_deg"])
+            observed = batch["traversability"]
+            seen = observed.isfinite()
+            count = int(seen.sum())
+            loss += float(censored_nll(log_weights, means, stds, observed)) * count
+            gap = TraversabilityMixture(log_weights.exp(), means, stds).mean()[seen] - observed[seen]
+            squares += float(gap.double().square().sum())
+            cells += count
+    return {"valid_loss": loss / max(1, cells), "valid_rmse": (squares / max(1, cells)) ** 0.5}

@@ -1,0 +1,42 @@
+"""A* + DWA: a global path over the map's cells, followed by the dynamic window approach.
+
+Source: paper IV-A1.
+"""
+
+from dataclasses import dataclass, field
+
+from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState
+from benchnav.planning.planners.astar.guided import GuideConfig, Guided
+from benchnav.planning.problem import Task
+from benchnav.planning.robots import SPEED, TURN_RATE
+
+
+@dataclass(frozen=True, kw_only=True)
+class AStarDWAConfig(GuideConfig):
+    """Settings of A* + DWA: those of the global path, and these.
+
+    Args:
+        dwa: settings of DWA.
+    """
+
+    dwa: DWAConfig = field(default_factory=DWAConfig)
+
+
+class AStarDWA(Guided[DWAState]):
+    """A* gives way-points to the dynamic window approach.
+
+    Args:
+        config: settings.
+    """
+
+    steers = ((SPEED, TURN_RATE),)
+
+    def __init__(self, config: AStarDWAConfig | None = None) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.config = config or AStarDWAConfig()
+        self._dwa = DWA(self.config.dwa)
+        super().__init__(self.config, self._dwa)
+
+    def remarks(self, task: Task) -> tuple[str, ...]:
+        """Names the accelerations that are not the robot's, and paths that no setting moves; see `Planner`."""
+        return (*self._dwa.remarks(task.robot), *super().remarks(task))

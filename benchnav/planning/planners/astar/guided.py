@@ -1,0 +1,137 @@
+"""A global path that gives way-points to any local planner.
+
+A* gives the cheapest path from wherever the robot stands; the local planner heads for a way-point on it. A
+robot that its local planner holds in place is steered along the path. Source: paper IV-A1, after Fan et al.
+(2021), "STEP". Letters in shapes: B episodes, A action dimensions.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
+from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.straight import steer_toward
+from benchnav.planning.problem import Problem, Task
+
+Local = TypeVar("Local")
+
+
+class LocalPlanner(Protocol[Local]):
+    """The contract of a local planner: a planner that is told where to go at each step."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Local:
+        """Prepares to plan; see `Planner`."""
+        ...
+
+    def plan_toward(self, step: Step, plan_state: Local, target_m: Tensor) -> tuple[Tensor, Local, Plan]:
+        """Chooses actions toward a target (x, y), shape [B, 2]; else as `Planner.plan`."""
+        ...
+
+    def took(self, plan_state: Local, action: Tensor) -> Local:
+        """Notes the actions that are taken, which may be others than it chose, shape [B, A]."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuideConfig:
+    """Settings of the global path.
+
+    Args:
+        lookahead_m: how far along the path the way-point lies at most.
+        by_time: A* minimises time under λ̂ rather than 3D length.
+    """
+
+    lookahead_m: float = 4.0
+    by_time: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses a look-ahead that looks nowhere."""
+        if not 0 < self.lookahead_m < float("inf"):
+            raise ConfigError(f"Expected `lookahead_m` > 0 and finite for A*, got {self.lookahead_m}.")
+
+
+@dataclass(frozen=True)
+class GuidedState(Generic[Local]):
+    """What a guided planner carries from step to step.
+
+    Args:
+        problem: what is being solved.
+        field: cheapest paths to the goal.
+        ground: what a metre costs in each cell.
+        local: the local planner's plan state.
+        recovery: of robots that stand.
+    """
+
+    problem: Problem
+    field: astar.CostToGo
+    ground: GroundCosts
+    local: Local
+    recovery: Recovery
+
+
+class Guided(Generic[Local]):
+    """A local planner guided by A*, as a planner.
+
+    Args:
+        guide: settings of the global path.
+        local: drives to way-points.
+    """
+
+    def __init__(self, guide: GuideConfig, local: LocalPlanner[Local]) -> None:
+        """Keeps the settings; all else is in the plan state."""
+        self.guide, self.local = guide, local
+
+    @property
+    def follows(self) -> str:
+        """Whose objectives it follows."""
+        cost = "travel time" if self.guide.by_time else "path length"
+        return f"{cost} (A*), J ({self.local.name})"
+
+    def remarks(self, task: Task) -> tuple[str, ...]:
+        """Says where no risk setting moves the path; see `Planner`."""
+        if self.guide.by_time or task.rules.free_space.by != "mean":
+            return ()
+        return (
+            "A* takes the shortest way over free ground, and ground is free by the mean: its path is the same under "
+            f"every risk setting, which moves {self.local.name} alone (by_time: true lets it choose the path)",
+        )
+
+    def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
+        """Searches the maps; see `Planner`."""
+        by_time = self.guide.by_time
+        return GuidedState(
+            problem=problem,
+            field=astar.search(problem, by_time),
+            ground=ground_costs(problem, by_time),
+            local=self.local.init(problem, generator),
+            recovery=Recovery.none(problem.start),
+        )
+
+    def plan(self, step: Step, plan_state: GuidedState[Local]) -> tuple[Tensor, GuidedState[Local], Plan]:
+        """Follows the cheapest path; see `Planner`."""
+        problem, field, state = plan_state.problem, plan_state.field, step.state
+        count = 2 + int(self.guide.lookahead_m / problem.grid.resolution_m)
+        points = astar.path_points(problem, field, state, count)
+        target, straight = choose_waypoint(plan_state.ground, points, self.guide.lookahead_m)
+        action, local, plan = self.local.plan_toward(step, plan_state.local, target)
+        recovery = watch(plan_state.recovery, state, action, problem.robot)
+        recovery = aim(recovery, plan_state.recovery.active, problem, field, state, straight)
+        away = steer_toward(state, recovery.target_m, problem.robot)
+        action = torch.where(recovery.active[:, None], away, action)
+        if step.draw:
+            # Long enough for a path that crosses the map twice; longer ones are cut.
+            whole = 2 * (problem.grid.height + problem.grid.width)
+            plan = replace(plan, reference=astar.path_points(problem, field, state, whole))
+        local = self.local.took(local, action)
+        return action, replace(plan_state, local=local, recovery=recovery), plan

@@ -1,0 +1,132 @@
+"""Recovery: what becomes of a robot that its local planner holds in place.
+
+Where a local planner has held a robot in place for a second, the robot is steered along the path, cell by
+cell, until it has left the place; one that drives and is held by the ground is left to its planner. Not of
+the paper. Letters in shapes: B episodes, S state and A action dimensions.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from benchnav.planning.objective import distance
+from benchnav.planning.planners.astar.astar import CostToGo
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Robot
+
+# A robot that has moved less than this
+_STANDING_M = 0.05
+# for so long,
+_PATIENCE_S = 1.0
+# at less than this share of its top speed as commanded, is steered along the path,
+_IDLE = 0.2
+# from one of its points to within this share of a cell's width of the next,
+_REACHED = 0.1
+# until it is this far away
+_LEFT_M = 0.5
+# or so much time has passed.
+_RECOVERY_S = 20.0
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """How long each robot has stood, and whether it is being steered away.
+
+    Args:
+        place_m: (x, y) that it has not left, shape [B, 2].
+        steps: steps that it has been there, int64, shape [B].
+        driven_m: how far it was to drive in these, shape [B].
+        active: it is being steered away, bool, shape [B].
+        target_m: (x, y) that it is then steered to, shape [B, 2].
+        cell: flat index of the path's cell at or behind that, int64, shape [B].
+    """
+
+    place_m: Tensor
+    steps: Tensor
+    driven_m: Tensor
+    active: Tensor
+    target_m: Tensor
+    cell: Tensor
+
+    @classmethod
+    def none(cls, state: Tensor) -> "Recovery":
+        """That of robots, shape [B, S], which have not been anywhere yet."""
+        zero = torch.zeros_like(state[:, 0])
+        place = torch.full_like(state[:, :2], torch.inf)
+        return cls(place, zero.long(), zero, zero.bool(), place, zero.long())
+
+
+def watch(recovery: Recovery, state: Tensor, action: Tensor, robot: Robot) -> Recovery:
+    """Begins and ends recoveries.
+
+    Args:
+        recovery: up to the last step.
+        state: where the robots are now, shape [B, S].
+        action: what the local planner would do next, the speed first, shape [B, A].
+        robot: for its time step and top speed.
+    """
+    left = distance(state, recovery.place_m) >= torch.where(recovery.active, _LEFT_M, _STANDING_M)
+    time_s = (recovery.steps + 1) * robot.dt_s
+    given_up = recovery.active & (time_s >= _PATIENCE_S + _RECOVERY_S)
+    anew = left | given_up
+    held = (time_s >= _PATIENCE_S) & (recovery.driven_m < _IDLE * robot.top_speed_mps * time_s)
+    return replace(
+        recovery,
+        place_m=torch.where(anew[:, None], state[:, :2], recovery.place_m),
+        steps=torch.where(anew, 0, recovery.steps + 1),
+        driven_m=torch.where(anew, 0, recovery.driven_m) + action[:, 0].abs() * robot.dt_s,
+        active=~anew & (recovery.active | held),
+    )
+
+
+def aim(
+    recovery: Recovery,
+    begun: Tensor,
+    problem: Problem,
+    field: CostToGo,
+    state: Tensor,
+    straight: Tensor,
+) -> Recovery:
+    """Says where robots are steered: along the path, from the centre of one cell to that of the next.
+
+    Where dearer ground lies on the line to the next cell, it is reached by way of the corner that the two
+    cells share, which no other cell has a part in. A robot keeps to a target until it is there.
+
+    Args:
+        recovery: now, from `watch`, with the targets of the last step.
+        begun: those whose recovery began earlier, bool, shape [B].
+        problem: B problems.
+        field: cheapest paths to the goal.
+        state: where the robots are now, shape [B, S].
+        straight: no dearer ground lies on the line to the next cell, bool, shape [B].
+
+    Returns:
+        The recovery with the targets of this step.
+    """
+    grid = problem.grid
+
+    def after(cell: Tensor) -> Tensor:
+        return field.following.gather(1, cell[:, None])[:, 0]
+
+    def centre(cell: Tensor) -> Tensor:
+        return torch.stack(grid.centre_of(cell // grid.width, cell % grid.width), dim=-1).to(state)
+
+    def point(cell: Tensor) -> Tensor:
+        return torch.where((after(cell) == cell)[:, None], problem.goal_m, centre(cell))
+
+    arrived = distance(state, recovery.target_m) < _REACHED * grid.resolution_m
+    at_point = (recovery.target_m == point(recovery.cell)).all(dim=1)
+    cell = torch.where(arrived & at_point, after(recovery.cell), recovery.cell)
+    target = torch.where(arrived[:, None], point(cell), recovery.target_m)
+
+    row, column = grid.cell_of(state[:, 0], state[:, 1])
+    own = row * grid.width + column
+    first = after(own)
+    gate = 0.5 * (centre(own) + centre(first))
+    first_m = torch.where(straight[:, None], point(first), gate)
+    return replace(
+        recovery,
+        target_m=torch.where(begun[:, None], target, first_m),
+        cell=torch.where(begun, cell, first),
+    )

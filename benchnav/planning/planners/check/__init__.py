@@ -1,0 +1,1 @@
+"""What planners are held to: the contract, and the boundary between a planner and an episode."""

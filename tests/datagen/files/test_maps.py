@@ -1,0 +1,84 @@
+from pathlib import Path
+
+import h5py
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from benchnav.datagen.files.maps import TerrainMaps
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import DatasetError
+from tests.factories import tiny_dataset
+
+
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_maps_are_what_is_stored(dataset_path: Path, in_memory: bool) -> None:
+    maps = TerrainMaps(dataset_path, "train", ("slope_deg", "environment", "start_m"), in_memory=in_memory)
+    stored = TerrainDataset(dataset_path).read("train")
+    assert len(maps) == 8
+    for index in (0, 5, -1):
+        assert list(maps[index]) == ["slope_deg", "environment", "start_m"]
+        for name, value in maps[index].items():
+            assert torch.equal(value, torch.from_numpy(stored[name])[index])
+    with pytest.raises(IndexError, match="0–7"):
+        maps[8]
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_workers_read_what_this_process_reads(dataset_path: Path, context: str, in_memory: bool) -> None:
+    maps = TerrainMaps(dataset_path, "train", in_memory=in_memory)
+    here = torch.stack([maps[i]["rgb"] for i in range(len(maps))])  # and so the file is open already
+    workers = {"fork": 2, "spawn": 1}[context]
+    loader = DataLoader(maps, batch_size=2, num_workers=workers, multiprocessing_context=context)
+    assert torch.equal(torch.cat([batch["rgb"] for batch in loader]), here)
+    assert torch.equal(maps[3]["rgb"], here[3])
+
+
+def test_another_process_opens_the_file_for_itself(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    maps = TerrainMaps(dataset_path, "train")
+    here = [maps._arrays()["rgb"] for _ in range(2)]
+    monkeypatch.setattr("os.getpid", lambda: -1)
+    assert here[0] is here[1] is not maps._arrays()["rgb"]
+
+
+def test_only_the_fields_asked_for_are_read(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with h5py.File(path, "r+") as file:
+        del file["train/elevation_m"]
+    assert TerrainMaps(path, "train")[0].keys() == {"rgb", "class_id"}
+
+
+def test_bad_requests_and_damage_are_named(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with pytest.raises(DatasetError, match=r"fields.*'colour'"):
+        TerrainMaps(path, "train", ("rgb", "colour"))
+    with pytest.raises(DatasetError, match="'nope'"):
+        TerrainMaps(path, "nope")
+    with h5py.File(path, "r") as file:
+        place = file["train/rgb"].id.get_chunk_info(1)
+    raw = bytearray(path.read_bytes())
+    raw[place.byte_offset + 9] ^= 16
+    path.write_bytes(raw)
+    maps = TerrainMaps(path, "train")
+    assert maps[0]
+    with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
+        maps[1]
+
+
+def test_maps_from_memory_are_copies_and_relative_paths_hold(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.chdir(dataset_path.parent)
+    maps = [TerrainMaps(dataset_path.name, "train", in_memory=there) for there in (False, True)]
+    monkeypatch.chdir("/")
+    before = maps[0][2]["rgb"].clone()
+    for source in maps:
+        source[2]["rgb"].zero_()
+        assert torch.equal(source[2]["rgb"], before)
+
+
+def test_a_missing_array_is_damage(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with h5py.File(path, "r+") as file:
+        del file["train/rgb"]
+    with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
+        TerrainMaps(path, "train")[0]

@@ -1,0 +1,94 @@
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from benchnav.datagen import schema
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset, terrain_of
+from benchnav.datagen.recipe import classes
+from benchnav.datagen.synth.generate import generate
+from benchnav.errors import DatasetError
+from tests.datagen.small import small_stakes
+from tests.factories import tiny_dataset, tiny_recipe
+
+
+def test_what_is_read_is_what_was_generated(dataset_path: Path) -> None:
+    dataset = TerrainDataset(dataset_path)
+    recipe, manifest = tiny_recipe(), json.dumps(dataset.manifest)
+    assert dataset.recipe == recipe
+    assert json.dumps(dataset.manifest) == manifest
+    for split in dataset.splits:
+        made = generate(recipe, split, np.arange(2))
+        read = dataset.read(split, [0, 1])
+        for name in schema.FIELDS:
+            np.testing.assert_array_equal(made[name], read[name])
+    terrain = dataset.terrain("train", [3, 5])
+    assert terrain.class_id.dtype == torch.int64
+    assert terrain.truth.stds.dtype == torch.float32
+    np.testing.assert_array_equal(terrain.rgb, dataset.read("train", [3, 5], ["rgb"])["rgb"])
+
+
+def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="not there"):
+        TerrainDataset(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(DatasetError, match="no readable HDF5"):
+        TerrainDataset(tmp_path / "text.h5")
+    path = tiny_dataset(tmp_path / "d.h5")
+    rewrite(path, {"format_version": "1.2"})
+    with pytest.raises(DatasetError, match="newer benchnav"):
+        TerrainDataset(path)
+    rewrite(path, {"format": "other"})
+    with pytest.raises(DatasetError, match="got 'other'"):
+        TerrainDataset(path)
+
+
+def test_a_changed_manifest_is_found(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    raw = path.read_bytes()
+    at = raw.index(b'"scale": 2.0')
+    path.write_bytes(raw[:at] + raw[at:].replace(b'"scale": 2.0', b'"scale": 3.0', 1))
+    with pytest.raises(DatasetError, match="does not match its digest"):
+        TerrainDataset(path)
+
+
+def rewrite(path: Path, changes: dict[str, str]) -> None:
+    with h5py.File(path, "r+") as file:
+        manifest = json.loads(file["manifest"][()]) | changes
+        del file["manifest"]
+        file["manifest"] = json.dumps(manifest)
+
+
+def test_bad_requests_are_named(dataset_path: Path) -> None:
+    dataset = TerrainDataset(dataset_path)
+    with pytest.raises(DatasetError, match="test/std"):
+        dataset.read("nope")
+    with pytest.raises(DatasetError, match="0–7"):
+        dataset.read("train", [8])
+    for indices in ([-1], [0.5]):
+        with pytest.raises(DatasetError, match="0–7"):
+            dataset.read("train", indices)  # type: ignore[arg-type]
+    with pytest.raises(DatasetError, match=r"fields.*'colour'"):
+        dataset.read("train", fields=["colour"])
+    assert dataset.read("train", [], ["rgb"])["rgb"].shape == (0, 3, 32, 32)
+    assert dataset.read("train", fields=[]) == {}
+    with pytest.raises(DatasetError, match="neither a file"):
+        find_dataset("no-such-id")
+
+
+def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
+    """The truth by class, and what looks alike by each twin: single-class settings choose among these."""
+    recipe = small_stakes()
+    terrain = terrain_of(generate(recipe, "train", np.arange(4)), recipe)
+    assert terrain.truth.group == (0, 0)
+    assert terrain.look_alikes is not None
+    seen = terrain.look_alikes(terrain.class_id, terrain.slope_deg)
+    assert seen.group == (0, 0, 1, 1)
+    twins = torch.tensor([len(own) for own in classes.twins(recipe.classes)])[terrain.class_id]
+    assert set(twins.unique().tolist()) == {1, 2}
+    for place, share in enumerate((1 / twins, 1 - 1 / twins)):
+        own = [k for k, group in enumerate(seen.group) if group == place]
+        torch.testing.assert_close(seen.weights[:, own].sum(1), share)

@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.recipe.scenario import Scenario, blend
+from benchnav.errors import ConfigError
+
+TINY = yaml.safe_load((Path(load_recipe.__globals__["RECIPES"]) / "tiny-v1.yaml").read_text())
+
+
+def test_shipped_recipes_load_and_survive_their_manifest() -> None:
+    assert {"paper-v1", "tiny-v1"} <= set(shipped_recipes())
+    for name in shipped_recipes():
+        recipe = load_recipe(name)
+        assert recipe_from_dict(recipe.to_dict(), "manifest") == recipe
+
+
+def test_severity_moves_from_std_to_the_preset() -> None:
+    scenarios = {f"hs{s}": {"preset": "hs", "severity": s} for s in (0, 0.5, 1)} | {"std": {"preset": "std"}}
+    recipe = recipe_from_dict({**TINY, "scenarios": scenarios | TINY["scenarios"]}, "test")
+    std, half, full = (recipe.scenarios[name] for name in ("hs0", "hs0.5", "hs1"))
+    assert std == Scenario()
+    assert half.light_height[0] == pytest.approx((std.light_height[0] + full.light_height[0]) / 2)
+    assert half.light_height[1] == pytest.approx((std.light_height[1] + full.light_height[1]) / 2)
+    assert blend(std, full, 0.25).light_height[0] == pytest.approx(0.75 * 0.8 + 0.25 * full.light_height[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"occupancy": [0.5, 0.2]}, "summing to 1"),
+        ({"occupancy": [0.5, float("nan")]}, "occupancy"),
+        ({"colour": 3}, "colour"),
+        ({"splits": {"train": {"scenario": "std", "maps": 0}}}, "maps"),
+        ({"splits": {"train": {"scenario": "fog", "maps": 1}}}, "scenario"),
+        ({"splits": {}}, "split"),
+        ({"scenarios": {"std": {"preset": "fog"}}}, "preset"),
+        ({"scenarios": {"std": {"relief_m": [2, 1]}}}, "relief_m"),
+        ({"scenarios": {"std": {"ambient": float("nan")}}}, "ambient"),
+        ({"goal_m": [99, 3]}, "goal_m"),
+        ({"height": "tall"}, "height"),
+        ({"resolution_m": 0}, "resolution_m"),
+        ({"environments": 0}, "environments"),
+        ({"id": "../x"}, "id"),
+        ({"goal_m": [4, 4]}, "goal_m"),
+        ({"scenarios": {"std": {"preset": "hg", "crater_radius_m": [9, 9]}}}, "crater_radius_m"),
+        ({"splits": {"test+std": {"scenario": "std", "maps": 1}}}, "split name"),
+        ({"splits": {"manifest": {"scenario": "std", "maps": 1}}}, "split name"),
+        ({"scenarios": {"std": {"preset": ["std"]}}}, "preset"),
+    ],
+)
+def test_bad_recipes_give_one_line_that_names_the_key(change: dict, expected: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        recipe_from_dict({**TINY, **change}, "bad.yaml").grid  # noqa: B018 - built when asked for
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_recipe_that_is_not_there_lists_those_that_are() -> None:
+    with pytest.raises(ConfigError, match=r"paper-v1.*no-such"):
+        load_recipe("no-such")

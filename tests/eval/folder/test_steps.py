@@ -1,0 +1,156 @@
+"""Steps of a run, as partitioned Parquet."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from benchnav.errors import ConfigError
+from benchnav.eval.folder.steps import align_steps, read_steps
+from benchnav.eval.keep import Keep
+from benchnav.eval.run.rows import step_table
+from benchnav.eval.run.runner import run_suite
+from benchnav.eval.suite import Suite
+from benchnav.eval.trial import trials_of
+from benchnav.eval.unit import Extent, units
+from tests.eval.run.test_rows import made, unit
+
+PLANNERS: tuple[Any, ...] = ({"part": "tests.eval.parts:Faulty", "label": "slow"}, "straight")
+
+
+def run(dataset: Path, folder: Path, **changes: Any) -> Path:
+    given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "instances": 2, "seeds": (0, 5)} | changes
+    suite = Suite(
+        data=str(dataset), scenarios=("std",), model="oracle", noise="stored", time_budget_s=4.0, record="none",
+        **given,
+    )  # fmt: skip
+    for _ in run_suite(suite, folder):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run(dataset_path, tmp_path_factory.mktemp("steps") / "run")
+
+
+def test_steps_hold_the_driven_path_and_the_robots_own_actions() -> None:
+    problem, episodes = made()
+    rows = step_table(unit(), problem, episodes, [0, 1]).to_pandas()
+    first, second = (rows[rows["instance"] == i] for i in unit().instances)
+    assert first["x_m"].tolist() == [0, 3, 3]
+    assert first["y_m"].tolist() == [0, 0, 4]
+    assert first["speed_mps"].tolist()[:2] == [1, 1]
+    assert first["turn_rate_radps"].tolist()[:2] == [0, 0.5]
+    assert np.isnan(first["traversability"].iloc[-1])
+    assert np.isnan(first["speed_mps"].iloc[-1])
+    assert second["step"].tolist() == [0, 1, 2, 3, 4]
+    assert second["time_s"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    alone = step_table(unit(), problem, episodes, [1]).to_pandas()
+    pd.testing.assert_frame_equal(alone, second.reset_index(drop=True))
+
+
+def test_one_episode_is_read_with_filters_by_any_reader(folder: Path) -> None:
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    everything = read_steps(folder)
+    assert len(everything) == round((rows["end_time_s"] / 0.1 + 1).sum())
+    for trial in rows["trial"].unique():
+        filters = [("trial", "==", trial), ("instance", "==", 1), ("seed", "==", 5)]
+        steps = pd.read_parquet(folder / "steps", filters=filters)
+        (row,) = rows[(rows["trial"] == trial) & (rows["instance"] == 1) & (rows["seed"] == 5)].to_dict(
+            "records"
+        )
+        assert set(steps["trial"]) == {trial}
+        assert steps["time_s"].max() == pytest.approx(row["end_time_s"])
+        assert np.nanmean(steps["traversability"].to_numpy(np.float64)) == pytest.approx(
+            row["traversability"]
+        )
+        ours = read_steps(folder, trial=trial, instance=1, seed=5)
+        pd.testing.assert_frame_equal(ours[steps.columns.drop("trial")], steps.drop(columns="trial"))
+        assert ours["trial"].tolist() == [trial] * len(ours)
+
+
+def test_steps_are_found_by_what_tables_call_their_trials(folder: Path) -> None:
+    rows = pd.read_parquet(folder / "episodes.parquet")
+    named = rows.groupby(["planner", "risk"])["trial"].first()
+    assert set(read_steps(folder, planner="slow")["trial"]) == {named["slow", "mean"], named["slow", "cvar"]}
+    assert set(read_steps(folder, planner=["slow", "straight"], risk=["cvar", "–"])["trial"]) == {
+        named["slow", "cvar"], named["straight", "–"]
+    }  # fmt: skip
+    assert len(read_steps(folder, planner="slow", risk="–")) == 0
+    assert set(read_steps(folder, trial=named["slow", "mean"], risk="mean")["trial"]) == {
+        named["slow", "mean"]
+    }
+    assert len(read_steps(folder, trial=named["slow", "mean"], risk="cvar")) == 0
+    with pytest.raises(ConfigError, match=r"Expected filters among .*instance.* got 'instanse'"):
+        read_steps(folder, instanse=1)
+
+
+def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path: Path) -> None:
+    """Also where a run is extended by them; readers take the columns of the first file."""
+    place = run(dataset_path, tmp_path / "run", planners=PLANNERS[:1], risks=("mean",), seeds=(0,))
+    run(
+        dataset_path, place, risks=("mean",), seeds=(0,), robots=("bicycle",),
+        planners=({"part": "mppi", "options": {"samples": 4, "horizon": 3}},),
+    )  # fmt: skip
+    steps = pd.read_parquet(place / "steps")
+    assert {"speed_mps", "turn_rate_radps", "steering_rad"} <= set(steps.columns)
+    assert steps.columns[-2] == "traversability"
+    for planner, missing in (("slow", "steering_rad"), ("mppi", "turn_rate_radps")):
+        own = read_steps(place, planner=planner)
+        assert len(own)
+        assert own[missing].isna().all()
+        assert own["speed_mps"].notna().any()
+
+
+def test_steps_of_recorded_episodes_alone_or_none(dataset_path: Path, tmp_path: Path) -> None:
+    suite = Suite(
+        data=str(dataset_path), scenarios=("std",), model="oracle", planners=PLANNERS, risks=("mean", "cvar"),
+        instances=2, seeds=(0, 5), time_budget_s=4.0, steps="recorded",
+    )  # fmt: skip
+    for _ in run_suite(suite, tmp_path / "run"):
+        pass
+    steps = read_steps(tmp_path / "run")
+    kept = steps[["trial", "seed", "instance"]].drop_duplicates()
+    assert len(kept) == 3
+    assert set(kept["seed"]) == {0}
+    assert set(kept["instance"]) == {0}
+    none = run(dataset_path, tmp_path / "none", steps="none")
+    assert not (none / "steps").exists()
+    with pytest.raises(ConfigError, match="--steps all"):
+        read_steps(none)
+
+
+def test_the_table_of_format_version_2_is_read(folder: Path, tmp_path: Path) -> None:
+    everything = read_steps(folder)
+    about = json.loads((folder / "run.json").read_text()) | {"format_version": 2}
+    (tmp_path / "run.json").write_text(json.dumps(about))
+    everything.to_parquet(tmp_path / "steps.parquet")
+    pd.testing.assert_frame_equal(read_steps(tmp_path), everything)
+    trial = everything["trial"].iloc[0]
+    pd.testing.assert_frame_equal(
+        read_steps(tmp_path, trial=trial, instance=1), read_steps(folder, trial=trial, instance=1)
+    )
+
+
+def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("steps/*/*")}
+    assert len(before) == 6
+    suite = Suite(data=str(dataset_path), model="oracle", planners=PLANNERS, risks=("mean", "cvar"), noise="stored",
+                  time_budget_s=4.0)  # fmt: skip
+    trials = {t.id: (t, Extent.product((0, 5), 1, 2)) for t in trials_of(suite, lambda data: ("std",))}
+    align_steps(folder, units(trials, Keep()))
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_an_episode_that_ended_at_once_has_its_one_state() -> None:
+    problem, episodes = made()
+    at_once = replace(episodes, steps=torch.tensor([0, 1]))
+    rows = step_table(unit(), problem, at_once, [0]).to_pandas()
+    assert (len(rows), rows["time_s"].tolist()) == (1, [0.0])
+    assert np.isnan(rows["traversability"]).all()

@@ -1,0 +1,199 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.axes import Axes
+
+from benchnav.eval.report.charts.driven import (
+    GROUND,
+    MOST_PATHS,
+    DrivenGround,
+    driven_figure,
+    telling_map,
+    write_driven,
+)
+from benchnav.eval.report.recorded.ground import HOLDING
+from tests.eval.report import made
+from tests.eval.report.test_write import run_folder
+
+RISKS = ("mean", "cvar:0.5", "cvar:0.9")
+
+
+def ground(**changes: Any) -> DrivenGround:
+    field = np.linspace(0, 1, 40 * 60, dtype=np.float32).reshape(40, 60)
+    about = {
+        "data": "paper-v1",
+        "scenario": "std",
+        "world": "stakes",
+        "seed": 0,
+        "realisation": 0,
+        "instance": 1,
+    }
+    given = {
+        "about": about, "resolution_m": 0.5, "rgb": np.full((3, 40, 60), 100, np.uint8), "field": field,
+        "holding": field < 0.1, "goal_m": np.array([24.0, 15.0], np.float32),
+    }  # fmt: skip
+    return DrivenGround(**(given | changes))
+
+
+def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
+    """Rows of three risk settings: of each instance, which of them succeeded."""
+    return made.rows(
+        made.row(made.trial(risk=risk, world="stakes"), instance, 30.0 + place if success else None)
+        for instance, successes in ended.items()
+        for place, (risk, success) in enumerate(zip(RISKS, successes, strict=False))
+    )
+
+
+def track(place: int) -> np.ndarray:
+    x = np.linspace(2, 20, 30)
+    return np.stack((x, 3 + 0.3 * x + place), axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("ended", "instance"),
+    [
+        ({0: [True] * 3, 1: [True, False, True], 2: [False] * 3}, 1),
+        ({0: [True] * 3, 1: [False] * 3}, 0),
+        ({0: [True, False], 4: [False, False, True]}, 4),  # more trials
+    ],
+)
+def test_the_map_is_one_on_which_outcomes_differ(ended: dict[int, list[bool]], instance: int) -> None:
+    about = telling_map(episodes(ended))
+    assert about == {"data": "paper-v1", "scenario": "std", "world": "stakes", "seed": 0, "realisation": 0,
+                     "instance": instance}  # fmt: skip
+    assert type(about["seed"]) is int
+
+
+def test_luck_and_worlds_tell_maps_apart() -> None:
+    labels = [made.trial(risk=risk, world=world) for world in ("a", "b") for risk in RISKS]
+    rows = made.rows(
+        made.row(one, seed=seed, realisation=draw, time_s=None if (seed, draw, one["risk"], one["world"]) ==
+                 (7, 1, "mean", "b") else 9.0)
+        for one in labels for seed in (0, 7) for draw in (0, 1)
+    )  # fmt: skip
+    about = telling_map(rows)
+    assert (about["world"], about["seed"], about["realisation"]) == ("b", 7, 1)
+
+
+def drawn(figure: Any) -> tuple[Axes, dict[str, np.ndarray]]:
+    panel = figure.axes[0]
+    return panel, {
+        line.get_label(): np.array(line.get_data()).T for line in panel.lines if line.get_label()[0] != "_"
+    }
+
+
+def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
+    rows = episodes({1: [True, False, True]})
+    panel, lines = drawn(driven_figure(ground(), rows, [track(i) for i in range(3)]))
+    for place, label in enumerate(
+        ("mean: success, 30 s", "cvar:0.5: timeout, 100 s", "cvar:0.9: success, 32 s")
+    ):
+        np.testing.assert_array_equal(lines[label], track(place))
+    np.testing.assert_array_equal(lines["goal"], [[24, 15]])
+    np.testing.assert_array_equal(lines["start"], track(0)[:1])
+    crosses = [line for line in panel.lines if line.get_marker() == "X"]
+    assert len(crosses) == 1
+    np.testing.assert_array_equal(np.ravel(crosses[0].get_data()), track(1)[-1])
+    labelled = [line for line in panel.lines if line.get_label() in list(lines)[:3]]
+    assert len({line.get_color() for line in labelled}) == 3
+
+
+def test_what_holds_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> None:
+    rows = episodes({1: [True]})
+    panel, _ = drawn(driven_figure(ground(), rows, [track(0)]))
+    shown = np.asarray(panel.images[0].get_array())
+    red = np.isclose(shown, np.array(HOLDING) / 255).all(axis=-1)
+    np.testing.assert_array_equal(red, ground().holding)
+    greys = shown[~ground().holding]
+    assert (np.diff(greys[:, 0]) >= 0).all()
+    faded = ground(field=None, holding=np.zeros((40, 60), bool))
+    panel, _ = drawn(driven_figure(faded, rows, [track(0)]))
+    np.testing.assert_allclose(np.asarray(panel.images[0].get_array()), 0.6 + 0.4 * 100 / 255)
+
+
+def with_steps(folder: Path, rows: pd.DataFrame) -> None:
+    """Stores a path of each row, like no other's."""
+    for place, (trial, own) in enumerate(rows.groupby("trial", sort=False)):
+        for (seed, realisation), unit in own.groupby(["seed", "realisation"]):
+            steps = pd.concat(
+                pd.DataFrame({"seed": seed, "realisation": realisation, "instance": i, "step": np.arange(30)}
+                             | dict(zip(("x_m", "y_m"), (track(place) + i + 5 * seed + 9 * realisation).T,
+                                        strict=True)))
+                for i in unit["instance"]
+            )  # fmt: skip
+            path = folder / "steps" / f"trial={trial}" / f"{seed}-{realisation}-00000.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            steps.to_parquet(path, index=False)
+
+
+def test_the_figure_is_of_the_stored_steps_of_its_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = episodes({0: [True] * 3, 1: [True, False, True]})
+    folder = run_folder(tmp_path / "run", rows, format_version=3)
+    assert write_driven(folder) == {}
+    with_steps(folder, rows)
+    assert write_driven(folder) == {}
+    ground().save(folder / GROUND)
+    shown: list[Any] = []
+
+    def draw(*given: Any) -> Any:
+        shown.append(given)
+        return driven_figure(*given)
+
+    monkeypatch.setattr("benchnav.eval.report.charts.driven.driven_figure", draw)
+    caption = write_driven(folder)
+    assert "std 1, seed 0, realisation 0: of all maps" in caption["driven"]
+    assert (folder / "figures" / "driven.png").stat().st_size > 5000
+    ((_, own, tracks),) = shown
+    assert own["instance"].tolist() == [1, 1, 1]
+    for place, positions in enumerate(tracks):
+        np.testing.assert_allclose(positions, track(place) + 1)
+
+
+@pytest.mark.parametrize(("seed", "realisation"), [(0, 0), (0, 1), (7, 0), (7, 1)])
+def test_the_paths_are_those_of_the_maps_own_luck(
+    seed: int, realisation: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = made.rows(
+        made.row(made.trial(risk=risk, world="stakes"), instance, seed=one, realisation=draw)
+        for risk in RISKS for one in (0, 7) for draw in (0, 1) for instance in (0, 1)
+    )  # fmt: skip
+    folder = run_folder(tmp_path / "run", rows, format_version=3)
+    with_steps(folder, rows)
+    ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
+    shown: list[Any] = []
+    monkeypatch.setattr(
+        "benchnav.eval.report.charts.driven.driven_figure", lambda *given: shown.append(given)
+    )
+    monkeypatch.setattr("benchnav.eval.report.charts.driven.save", lambda *given: None)
+    caption = write_driven(folder)["driven"]
+    assert f"std 1, seed {seed}, realisation {realisation}:" in caption
+    ((_, own, tracks),) = shown
+    assert own["risk"].tolist() == list(RISKS)
+    assert set(zip(own["seed"], own["realisation"], own["instance"], strict=True)) == {(seed, realisation, 1)}
+    for place, positions in enumerate(tracks):
+        np.testing.assert_allclose(positions, track(place) + 1 + 5 * seed + 9 * realisation)
+
+
+def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: Path) -> None:
+    rows = made.rows(
+        made.row(made.trial(risk=f"cvar:0.{i:02}", world="stakes"), 1) for i in range(MOST_PATHS + 2)
+    )
+    folder = run_folder(tmp_path / "run", rows, format_version=3)
+    with_steps(folder, rows)
+    ground().save(folder / GROUND)
+    caption = write_driven(folder)["driven"]
+    assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} trials." in caption
+
+
+def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
+    for one in (ground(), ground(field=None)):
+        one.save(tmp_path / "a.npz")
+        again = DrivenGround.load(tmp_path / "a.npz")
+        assert (again.about, again.resolution_m) == (one.about, 0.5)
+        assert (again.field is None) == (one.field is None)
+        np.testing.assert_array_equal(again.holding, one.holding)

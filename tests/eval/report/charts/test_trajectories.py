@@ -1,0 +1,223 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from benchnav.eval.report.charts.trajectories import MOST_PANELS, choose, trajectory_figure
+from benchnav.eval.report.figures import save
+from benchnav.eval.report.recorded.ground import field_colours, hatching, outline
+from benchnav.eval.report.recorded.recording import take_snapshot
+from benchnav.eval.report.recorded.snapshot import Snapshot
+from tests.eval.report import made
+
+
+def snapshot(trial: str = "t", instance: int = 0, seed: int = 0, **labels: str) -> Snapshot:
+    about = made.trial(**labels) | {"trial": trial, "instance": str(instance), "seed": str(seed)}
+    return take_snapshot(made.recording(about=about | {"realisation": "0", "outcome": "out_of_bounds"}))
+
+
+def chosen(snapshots: list[Snapshot], trials: list[str]) -> list[tuple[str, str]]:
+    return [(s.about["trial"], s.about["instance"]) for s in choose(snapshots, trials)]
+
+
+def test_one_a_trial_on_one_map_in_the_tables_order() -> None:
+    every = [snapshot("b", 10), snapshot("b", 9), snapshot("a", 9), snapshot("a", 10), snapshot("c", 3)]
+    assert chosen(every, ["c", "b", "a"]) == [("c", "3"), ("b", "9"), ("a", "9")]
+    assert chosen(every, ["a", "b"]) == [("a", "9"), ("b", "9")]
+    mixed = [snapshot("a", 2), snapshot("b", 1), snapshot("b", 2)]
+    assert chosen(mixed, ["a", "b"]) == [("a", "2"), ("b", "2")]
+    assert chosen([], ["a"]) == []
+
+
+def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do_not() -> None:
+    def ended(trial: str, instance: int, outcome: str) -> Snapshot:
+        made = snapshot(trial, instance)
+        return replace(made, about={**made.about, "outcome": outcome})
+
+    outcomes = {("a", 1): "success", ("b", 1): "success", ("a", 2): "success", ("b", 2): "immobilised"}
+    every = [ended(*place, outcome) for place, outcome in outcomes.items()]
+    every += [
+        ended("a", 3, "success"),
+        ended("b", 3, "stuck"),
+        ended("b", 0, "stuck"),
+        ended("c", 0, "success"),
+    ]
+    assert chosen(every, ["a", "b", "c"]) == [("a", "2"), ("b", "2"), ("c", "0")]
+    alike = [ended(trial, 1, "success") for trial in "ab"] + [ended(trial, 2, "stuck") for trial in "ab"]
+    assert chosen(alike, ["a", "b"]) == [("a", "2"), ("b", "2")]
+    assert chosen(alike[:2], ["a", "b"]) == [("a", "1"), ("b", "1")]
+
+
+def test_no_more_than_can_be_seen() -> None:
+    trials = [f"t{k}" for k in range(12)]
+    assert len(chosen([snapshot(trial) for trial in trials], trials)) == MOST_PANELS
+
+
+def shown(figure: Figure) -> list:  # type: ignore[type-arg]
+    return [axes for axes in figure.axes if axes.get_visible() and axes.get_images()]
+
+
+SOFT_WORDS = "soft ground, which does not show"
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_every_snapshot_has_two_panels_of_its_map(count: int) -> None:
+    figure = trajectory_figure([snapshot()] * count)
+    assert len(shown(figure)) == 2 * count
+    for axes in shown(figure):
+        assert (axes.get_xlim(), axes.get_ylim()) == ((0, 30), (0, 20))
+    figure.draw_without_rendering()
+    boxes = [axes.get_window_extent() for axes in shown(figure)]
+    assert all(box.width > 200 and box.height > 130 for box in boxes)
+
+
+def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
+    taken = snapshot()
+    above, below = shown(trajectory_figure([taken]))
+    now = taken.now
+    assert above.get_title() == f"MPPI, cvar, std 0\nt = {now / 10:g} s; outcome: out of bounds"
+    for panel in (above, below):
+        lines = [path.vertices for layer in panel.collections for path in layer.get_paths()]
+        for layer in taken.plan.lines.values():
+            for line in layer:
+                assert any(np.array_equal(line, drawn) for drawn in lines)
+    (met,) = (layer for layer in above.collections if layer.get_array() is not None)
+    np.testing.assert_array_equal(met.get_array(), taken.traversability[:now])
+    np.testing.assert_array_equal(met.get_paths()[-1].vertices, taken.track[now - 1 : now + 1])
+    # On the map of λ̂ in black, since it has the colours of λ.
+    black = [line for line in below.lines if line.get_color() == "black" and len(line.get_xdata()) > 1]
+    np.testing.assert_array_equal(np.stack(black[0].get_data(), axis=1), taken.track[: now + 1])
+    np.testing.assert_array_equal(below.get_images()[0].get_array(), taken.predicted)
+    closed = below.get_images()[1].get_array()
+    np.testing.assert_array_equal(np.isfinite(np.ma.filled(closed, np.nan)), ~taken.free)
+
+
+def held(world: str = "stakes", **changes: Any) -> Snapshot:
+    recording = made.held_recording(170)
+    changes = {"about": recording.about | {"world": world}} | changes
+    return take_snapshot(replace(recording, **changes))
+
+
+def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended() -> None:
+    taken = held()
+    above, below, last = shown(trajectory_figure([taken]))
+    assert taken.field is not None
+    (drawn,) = (image.get_array() for image in last.get_images())
+    np.testing.assert_array_equal(drawn, field_colours(taken.field, taken.holding))
+    assert last.get_images()[0].origin == "lower"
+    paths = [line for line in last.lines if len(line.get_xdata()) > 1]
+    assert paths
+    for line in paths:
+        np.testing.assert_array_equal(np.stack(line.get_data(), axis=1), taken.track)
+    marks = {
+        (line.get_marker(), line.get_color()): tuple(np.ravel(line.get_data()))
+        for line in last.lines
+        if line.get_marker() != "None"
+    }
+    assert marks["X", "black"] == marks["o", "black"] == tuple(taken.track[-1])
+    assert marks["o", "red"] == tuple(taken.track[0])
+    assert marks["X", "magenta"] == tuple(taken.goal_m)
+    assert last.get_title() == "driven to the end (17 s), on λ as it was"
+    # Where it was by the moment of the plan is told by the panels above.
+    for panel in (above, below):
+        assert not [line for line in panel.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
+        assert max(len(line.get_xdata()) for line in panel.lines) == taken.now + 1 < 170
+
+
+def test_soft_ground_is_marked_on_the_terrain_alone() -> None:
+    taken = held()
+    above, below, last = shown(trajectory_figure([taken]))
+    drawn = [
+        {path.vertices.tobytes() for c in p.collections for path in c.get_paths()}
+        for p in (above, below, last)
+    ]
+    for lines in (outline, hatching):
+        wanted = {line.astype(float).tobytes() for line in lines(taken.soft, 0.5)}
+        assert wanted <= drawn[0]
+        assert not wanted & (drawn[1] | drawn[2])
+
+
+def test_a_robot_that_was_not_held_has_no_mark_of_it() -> None:
+    taken = held(about=made.recording().about)
+    *_, last = shown(figure := trajectory_figure([taken]))
+    assert not [line for line in last.lines if (line.get_marker(), line.get_color()) == ("X", "black")]
+    assert "immobilised" not in names_in_legend(figure)
+
+
+def test_only_panels_whose_λ_stayed_have_a_third() -> None:
+    figure = trajectory_figure([snapshot(), held(), snapshot(), snapshot(), held()])
+    titles = [axes.get_title() for axes in shown(figure)]
+    assert len(titles) == 5 * 2 + 2
+    assert sum("as it was" in title for title in titles) == 2
+    figure.draw_without_rendering()
+    columns = [
+        axes.get_subplotspec().colspan.start for axes in shown(figure) if "as it was" in axes.get_title()
+    ]
+    assert columns == [1, 0]
+
+
+def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
+    taken = held(field=None)
+    bare = replace(taken, soft=np.zeros_like(taken.soft), holding=np.zeros_like(taken.holding))
+    with_ground, without = (trajectory_figure([one]) for one in (taken, bare))
+    assert names_in_legend(with_ground) == names_in_legend(without)
+    for one, other in zip(shown(with_ground), shown(without), strict=True):
+        lines = [sum(len(drawn.get_paths()) for drawn in axes.collections) for axes in (one, other)]
+        assert lines[0] == lines[1] > 0
+
+
+def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
+    def titles(*labels: dict[str, str]) -> list[str]:
+        figure = trajectory_figure([snapshot(**one) for one in labels])
+        return [axes.get_title().split("\n")[0] for axes in shown(figure) if "outcome" in axes.get_title()]
+
+    blind = {"planner": "straight", "model": "–", "risk": "–"}
+    assert titles({}, blind) == ["MPPI, cvar, std 0", "straight, std 0"]
+    told = {"model": "clairvoyant", "risk": "–"}
+    assert titles(told) == ["MPPI, clairvoyant, std 0"]
+    assert titles({"model": "oracle"}, told) == ["MPPI, oracle, cvar, std 0", "MPPI, clairvoyant, std 0"]
+    assert titles({}, {"world": "stakes"}) == ["MPPI, paper, cvar, std 0", "MPPI, stakes, cvar, std 0"]
+
+
+def names_in_legend(figure: Figure) -> list[str]:
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, ["not free", SOFT_WORDS, "holds a robot", "immobilised"]),
+        ({"soft": np.zeros((40, 60), bool)}, ["not free", "holds a robot", "immobilised"]),
+        ({"holding": np.zeros((40, 60), bool)}, ["not free", SOFT_WORDS, "immobilised"]),
+    ],
+)
+def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: list[str]) -> None:
+    assert names_in_legend(trajectory_figure([held(**changes)]))[4 : 4 + len(names) + 1] == [
+        *names,
+        "samples",
+    ]
+
+
+def test_the_legend_names_layers_that_are_there() -> None:
+    names = names_in_legend(trajectory_figure([snapshot()]))
+    marks = ["start", "goal", "robot", "driven; above in the colour of the λ met"]
+    assert names == [*marks, "not free", "samples", "reference path", "planned"]
+    taken = snapshot()
+    everywhere = replace(taken, free=np.ones_like(taken.free))
+    assert "not free" not in names_in_legend(trajectory_figure([everywhere]))
+
+
+def test_whose_map_of_λ_it_is_stands_above_it() -> None:
+    blind = {"planner": "straight", "model": "–", "risk": "–"}
+    *_, given, none = shown(trajectory_figure([snapshot(), snapshot(**blind)]))
+    assert given.get_title() == "λ̂ given to the planner"
+    assert none.get_title() == "E[λ] in truth; the planner is given nothing"
+
+
+def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:
+    save(trajectory_figure([take_snapshot(made.recording(0, plans=()))]), tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 1000

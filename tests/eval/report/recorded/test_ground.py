@@ -1,0 +1,104 @@
+"""What the ground looks like, against counts by hand and a model of colour blindness."""
+
+import matplotlib
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from benchnav.eval.report.recorded.ground import HOLDING, field_colours, hatching, immobilised_at, outline
+
+REGIONS = arrays(bool, st.tuples(st.integers(1, 7), st.integers(1, 9)))
+
+# Machado, Oliveira and Fernandes (2009), full severity, on linear RGB.
+SEEN = {
+    "all": np.eye(3),
+    "without red": np.array(
+        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+    ),
+    "without green": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "without blue": np.array(
+        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+    ),
+}
+
+
+def lab(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """CIE L*a*b* of sRGB colours in [0, 1], as somebody sees them."""
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    xyz = (linear @ seen.T).clip(0, 1) @ to_xyz.T / to_xyz.sum(axis=1)
+    x, y, z = np.moveaxis(np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116), -1, 0)
+    return np.stack((116 * y - 16, 500 * (x - y), 200 * (y - z)), axis=-1)
+
+
+@pytest.mark.parametrize("seen", SEEN)
+def test_what_holds_a_robot_has_a_colour_that_no_traversability_has(seen: str) -> None:
+    shades = field_colours(np.linspace(0, 1, 256)[None], np.zeros((1, 256), bool))[0] / 255
+    away = lab(shades, SEEN[seen]) - lab(np.array(HOLDING) / 255, SEEN[seen])
+    # A difference of 2.3 can just be seen.
+    assert np.linalg.norm(away, axis=1).min() > 30
+
+
+def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds() -> None:
+    field = np.random.default_rng(0).random((5, 7))
+    holding = field < 0.3
+    colours = field_colours(field, holding)
+    assert (colours.dtype, colours.shape) == (np.uint8, (5, 7, 3))
+    usual = np.round(255 * matplotlib.colormaps["viridis"](field)[..., :3])
+    np.testing.assert_array_equal(colours[~holding], usual[~holding])
+    assert (colours[holding] == HOLDING).all()
+
+
+def cells_beside(region: np.ndarray, edge: np.ndarray, resolution_m: float) -> list[bool]:
+    """Whether the cells on the two sides of an edge are of a region; off the map none is."""
+    middle, along = edge.mean(axis=0) / resolution_m, (edge[1] - edge[0]) / resolution_m
+    across = 0.5 * along[::-1]
+    found = []
+    for column, row in (middle - across, middle + across):
+        inside = 0 <= row < region.shape[0] and 0 <= column < region.shape[1]
+        found.append(bool(inside and region[int(row), int(column)]))
+    return found
+
+
+@given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
+def test_an_outline_is_every_edge_between_what_is_in_a_region_and_what_is_not(
+    region: np.ndarray, resolution_m: float
+) -> None:
+    edges = outline(region, resolution_m)
+    np.testing.assert_allclose(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), resolution_m)
+    for edge in edges:
+        assert sorted(cells_beside(region, edge, resolution_m)) == [False, True]
+    # Each cell has four sides, and two cells of the region share what is between them.
+    shared = (region[1:] & region[:-1]).sum() + (region[:, 1:] & region[:, :-1]).sum()
+    assert len(np.unique(edges, axis=0)) == len(edges) == 4 * region.sum() - 2 * shared
+
+
+@given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
+def test_hatching_lies_in_its_region_alone(region: np.ndarray, resolution_m: float) -> None:
+    lines = hatching(region, resolution_m)
+    column, row = np.floor(lines.mean(axis=1) / resolution_m).astype(int).T
+    assert region[row, column].all()
+    np.testing.assert_allclose(lines[:, 1] - lines[:, 0], resolution_m)
+
+
+def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
+    lines = hatching(np.ones((9, 12), bool), 1.0)
+    column, row = lines[:, 0].astype(int).T
+    for line in range(9):
+        np.testing.assert_array_equal(np.diff(np.sort(column[row == line])), 4)
+        assert (row == line).sum() == 3
+    starts = {tuple(point) for point in lines[:, 0]}
+    assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)
+
+
+@pytest.mark.parametrize("outcome", ["immobilised", "stuck", "success"])
+def test_an_immobilised_robot_is_where_its_episode_ended(outcome: str) -> None:
+    place = immobilised_at({"outcome": outcome}, np.array([[1.0, 2.0], [3.0, 4.0]]))
+    if outcome == "immobilised":
+        np.testing.assert_array_equal(place, [3.0, 4.0])
+    else:
+        assert place is None

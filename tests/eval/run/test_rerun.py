@@ -1,0 +1,239 @@
+"""A run that is repeated says truly whether its rows came out the same, and what differs around it."""
+
+import inspect
+import json
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchnav.errors import ConfigError
+from benchnav.eval import cli
+from benchnav.eval.folder import provenance
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.shard import Shard
+from benchnav.eval.run.rerun import Comparison, compare, rerun
+from benchnav.eval.run.runner import Workers, run_suite
+from benchnav.eval.suite import Suite
+from tests import factories
+
+HERE = Workers()
+MINE = "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
+
+
+@pytest.fixture
+def suite(dataset_path: Path, tmp_path: Path) -> Suite:
+    """Two planners that need no time, one of them in a file."""
+    (tmp_path / "mine.py").write_text(MINE)
+    shutil.copy(dataset_path, tmp_path / "tiny.h5")
+    return Suite(
+        data=str(tmp_path / "tiny.h5"), model="oracle", risks=("mean",), scenarios=("std",), instances=2,
+        planners=("tests.eval.parts:Faulty", f"{tmp_path / 'mine.py'}:Mine"), time_budget_s=30.0, noise="stored",
+        record="none",
+    )  # fmt: skip
+
+
+def finish(suite: Suite, folder: Path, **options: object) -> Path:
+    list(run_suite(suite, folder, **options))  # type: ignore[arg-type]
+    return folder
+
+
+def repeat(run: Path, folder: Path, **options: object) -> Comparison:
+    list(rerun(run, folder, HERE, **options))  # type: ignore[arg-type]
+    return compare(run, folder)
+
+
+def change_rows(run: Path, changes: Mapping[str, object], where: str) -> None:
+    rows = pd.read_parquet(run / "episodes.parquet")
+    chosen = rows.eval(where)
+    for name, value in changes.items():
+        rows.loc[chosen, name] = value
+    rows.to_parquet(run / "episodes.parquet")
+
+
+def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    finish(replace(suite, seeds=(3,), instances=1), run)
+    finish(replace(suite, scenarios=("hs",), realisations=2), run)
+    comparison = repeat(run, tmp_path / "again")
+    assert comparison.same
+    assert comparison.episodes == 2 * 2 + 2 * 1 + 2 * 2 * 2
+    assert comparison.lines == (
+        "all 14 rows came out the same",
+        "nothing that is known of the environment differs",
+    )
+    first, second = open_run(run), open_run(tmp_path / "again")
+    assert second.trials == first.trials
+    assert second.about["run_id"] != first.about["run_id"]
+
+
+def test_the_time_limit_of_planners_is_repeated(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    about = json.loads((run / "run.json").read_text())
+    assert "planner_limit_s" in about
+    (run / "run.json").write_text(json.dumps({**about, "planner_limit_s": 77.0}))
+    next(steps := rerun(run, tmp_path / "again", HERE))
+    steps.close()
+    assert open_run(tmp_path / "again").about["planner_limit_s"] == 77.0
+
+
+def test_rows_that_differ_are_counted_and_the_first_named(suite: Suite, tmp_path: Path) -> None:
+    run = finish(replace(suite, seeds=(0, 1, 2, 3)), tmp_path / "run")
+    change_rows(run, {"outcome": "timeout", "total_time_s": 12.5}, "planner == 'Mine' and seed > 0")
+    comparison = repeat(run, tmp_path / "again")
+    assert not comparison.same
+    assert len(comparison.different) == 6
+    lines = comparison.lines
+    assert lines[0] == "6 of 16 rows came out differently, in 1 of 2 trials:"
+    assert "planner Mine" in lines[1]
+    assert lines[1].endswith("6 rows")
+    named = [line for line in lines if "outcome timeout → success" in line]
+    assert len(named) == 5
+    assert "seed 1, realisation 0, instance 0: " in named[0]
+    assert "total_time_s 12.5 → " in named[0]
+    time_s = pd.read_parquet(tmp_path / "again" / "episodes.parquet").query("planner == 'Mine' and seed > 0")
+    greatest = (time_s["total_time_s"] - 12.5).abs().max()
+    assert f"greatest differences: total_time_s {greatest:.3g}" in lines
+
+
+def test_wall_time_is_no_difference(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    change_rows(run, {"planning_ms": 1e6}, "seed == 0")
+    assert repeat(run, tmp_path / "again").same
+
+
+def test_code_that_changed_is_named_beside_the_rows(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    slower = MINE.replace(
+        "pass", "def __init__(self, fault='none', after_s=1.0):\n        super().__init__('give up', 2.0)"
+    )
+    (tmp_path / "mine.py").write_text(slower)
+    comparison = repeat(run, tmp_path / "again")
+    assert {comparison.different[0].columns["outcome"]} == {("success", "planner_failure")}
+    assert len(comparison.different) == 2
+    assert comparison.lines[-1].startswith("what differs in the environment: ")
+    assert "mine.py" in comparison.lines[-1]
+
+
+def test_maps_that_changed_are_named(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    (tmp_path / "other.h5").replace(tmp_path / "tiny.h5")
+    comparison = repeat(run, tmp_path / "again")
+    assert not comparison.same
+    assert "maps of" in comparison.lines[-1]
+
+
+def test_versions_processor_and_machine_are_named_though_rows_are_the_same(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = finish(suite, tmp_path / "run")
+    code = provenance.describe_code()
+    other = {**code, "versions": {**code["versions"], "torch": "9.9"}, "processor": "ABACUS"}
+    monkeypatch.setattr(provenance, "describe_code", lambda: other)
+    monkeypatch.setattr(provenance, "describe_machine", lambda: {"processor": "bead", "cores": 7})
+    comparison = repeat(run, tmp_path / "again")
+    assert comparison.same
+    assert f"torch ({code['versions']['torch']} to 9.9)" in comparison.lines[-1]
+    assert "to ABACUS)" in comparison.lines[-1]
+    assert "to bead, 7 cores)" in comparison.lines[-1]
+
+
+def test_all_that_is_no_longer_there_is_told_before_anything_is_run(suite: Suite, tmp_path: Path) -> None:
+    run = finish(replace(suite, risks=("mean", "tests.eval.parts:least")), tmp_path / "run")
+    (tmp_path / "mine.py").unlink()
+    (tmp_path / "tiny.h5").unlink()
+    with pytest.raises(ConfigError, match=r"cannot be repeated.*maps of .*tiny\.h5.*planner .*mine\.py"):
+        repeat(run, tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+def test_a_dataset_with_fewer_maps_is_told(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    (tmp_path / "tiny.h5").unlink()
+    factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=1))
+    with pytest.raises(ConfigError, match="Expected 2 maps, got 1"):
+        repeat(run, tmp_path / "again")
+
+
+def test_a_folder_of_other_trials_is_left_as_it_is(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    other = finish(replace(suite, risks=("cvar",)), tmp_path / "other")
+    before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
+    with pytest.raises(ConfigError, match="has other trials"):
+        repeat(run, other)
+    assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
+
+
+def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> None:
+    run = finish(suite, tmp_path / "run")
+    with pytest.raises(ConfigError, match="another folder"):
+        repeat(run, tmp_path / "x" / ".." / "run", overwrite=True)
+    assert (run / "episodes.parquet").exists()
+    part = finish(suite, tmp_path / "part", shard=Shard(index=1, of=1))
+    with pytest.raises(ConfigError, match="shard 1/1"):
+        repeat(part, tmp_path / "again")
+    (run / "episodes.parquet").unlink()
+    with pytest.raises(ConfigError, match="Expected a finished run"):
+        repeat(run, tmp_path / "again")
+    with pytest.raises(ConfigError, match="version 1"):
+        repeat(Path(__file__).parents[2] / "data" / "run-1", tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ((), {"workers": Workers(), "overwrite": False}),
+        (("--jobs", "3", "--overwrite"), {"workers": Workers(jobs=3), "overwrite": True}),
+        (("--backend", "dask", "--scheduler", "tcp://a:1"), {"workers": Workers(scheduler="tcp://a:1")}),
+    ],
+)
+def test_the_command_repeats_with_the_workers_that_are_asked_for(
+    words: tuple[str, ...], expected: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[dict[str, object]] = []
+
+    def begin(*args: object, **options: object) -> None:
+        given.append(inspect.signature(rerun).bind(*args, **options).arguments)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr("benchnav.eval.run.rerun.rerun", begin)
+    monkeypatch.setattr(sys, "argv", ["benchnav-eval", "rerun", str(tmp_path / "run"), *words])
+    with pytest.raises(SystemExit):
+        cli.main()
+    (told,) = given
+    assert {name: told[name] for name in expected} == expected
+    assert (told["run_folder"], told["folder"]) == (tmp_path / "run", tmp_path / "run-rerun")
+
+
+def test_the_command_ends_with_0_1_or_2(  # type: ignore[no-untyped-def]
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def call(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["benchnav-eval", "rerun", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        return int(ended.value.code or 0), captured.out, captured.err
+
+    run = finish(suite, tmp_path / "run")
+    status, printed, _ = call(str(run))
+    assert status == 0
+    assert "all 4 rows came out the same" in printed
+    assert (tmp_path / "run-rerun" / "episodes.parquet").exists()
+    change_rows(run, {"score": 0.25}, "instance == 1")
+    status, printed, error = call(str(run))
+    assert status == 1
+    assert "2 of 2 units were there already" in error
+    assert "2 of 4 rows came out differently" in printed
+    status, _, error = call(str(run), "--overwrite", "--out", str(tmp_path / "other"))
+    assert status == 1
+    assert "already" not in error
+    (tmp_path / "mine.py").unlink()
+    status, printed, error = call(str(run), "--out", str(tmp_path / "third"))
+    assert (status, printed, len(error.splitlines())) == (2, "", 1)

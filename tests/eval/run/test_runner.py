@@ -1,0 +1,494 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from benchnav import registry
+from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.find_episodes import find_episodes
+from benchnav.eval.folder import provenance
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.steps import read_steps
+from benchnav.eval.report.playback.files import playback_path
+from benchnav.eval.report.write import write_report
+from benchnav.eval.run.recorder import find_recording
+from benchnav.eval.run.runner import run_suite
+from benchnav.eval.suite import Suite
+from tests import factories
+from tests.eval.report.playback.rrd import read_path
+
+BUDGETS = {"mppi": {"samples": 64, "horizon": 20}, "cl_rrt": {"expansions": 50}}
+PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")
+KEYS = ["scenario", "planner", "risk", "seed", "realisation", "instance"]
+# What a wall clock says is no result.
+TIMING = ["planning_ms", "planning_ms_p95", "planning_start_ms"]
+
+
+def suite_on(dataset: Path, **changes: object) -> Suite:
+    made = Suite(
+        data=str(dataset), model="oracle", instances=2, time_budget_s=40.0, planner_options=BUDGETS,
+        risks=("cvar", "mean"), scenarios=("std", "hs"),
+    )  # fmt: skip
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def quick(dataset: Path, **changes: object) -> Suite:
+    """A suite of a planner that needs no time."""
+    given = {"planners": ("tests.eval.parts:Faulty",), "planner_options": {}, "record": "none"} | changes
+    return suite_on(dataset, **given)
+
+
+def finish(suite: Suite, folder: Path, jobs: int = 1, **options: object) -> pd.DataFrame:
+    for _ in run_suite(suite, folder, jobs, **options):  # type: ignore[arg-type]
+        pass
+    return pd.read_parquet(folder / "episodes.parquet")
+
+
+def same(first: pd.DataFrame, second: pd.DataFrame) -> None:
+    first, second = (
+        rows.sort_values(KEYS).drop(columns=TIMING).reset_index(drop=True) for rows in (first, second)
+    )
+    pd.testing.assert_frame_equal(first, second)
+
+
+@pytest.fixture(scope="module")
+def finished(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Suite, Path]:
+    """A run of every planner under two risk settings on two scenarios."""
+    suite = suite_on(dataset_path)
+    folder = tmp_path_factory.mktemp("run") / "run"
+    finish(suite, folder)
+    write_report(folder)
+    return suite, folder
+
+
+def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> None:
+    _, folder = finished
+    episodes = pd.read_parquet(folder / "episodes.parquet")
+    assert len(episodes) == (1 + 3 * 2) * 2 * 2
+    assert not episodes.duplicated(KEYS).any()
+    assert set(episodes["planner"]) == set(PLANNERS)
+    assert set(episodes[episodes["planner"] == "straight"]["risk"]) == {"–"}
+    about = json.loads((folder / "run.json").read_text())
+    assert (about["format"], about["format_version"]) == ("benchnav-run", 3)
+    assert about["code"]["versions"]["torch"] == torch.__version__.split("+")[0]
+    (data,) = about["datasets"].values()
+    assert [len(digests) for digests in data["maps"].values()] == [2, 2]
+    assert len({digest for digests in data["maps"].values() for digest in digests}) == 4
+    figures = ("figures/trajectories.png", "figures/success.png")
+    for name in ("summary.md", "summary.csv", "summary.tex", *figures):
+        assert (folder / name).stat().st_size > 100
+    assert len(pd.read_csv(folder / "summary.csv")) == 14
+    assert not list(folder.rglob("*partial*"))
+    assert not list(folder.parent.glob(".*"))
+    # A unit is one file, in the folder of its trial.
+    assert sorted(p.parent.name for p in folder.glob("units/*/*")) == sorted(about["trials"])
+
+
+def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]) -> None:
+    _, folder = finished
+    recordings = sorted((folder / "playback").glob("*.rrd"))
+    trials = open_run(folder).trials
+    assert len(recordings) == len(trials) == (1 + 3 * 2) * 2
+    paths = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    subprocess.run(
+        ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=paths
+    )
+    for planner in PLANNERS:
+        ((unit, member),) = find_episodes(folder, {"planner": [planner]}, None, 0, 0)
+        path = playback_path(folder, unit.stem(member))
+        assert path in recordings
+        episode = read_steps(folder, trial=unit.trial.id, instance=0)
+        times, positions = read_path(path)
+        np.testing.assert_allclose(times, episode["time_s"], atol=1e-6)
+        np.testing.assert_array_equal(positions[:, :2], episode[["x_m", "y_m"]].to_numpy())
+
+
+def test_rows_do_not_depend_on_workers(finished: tuple[Suite, Path], tmp_path: Path) -> None:
+    suite, folder = finished
+    same(finish(suite, tmp_path / "two", jobs=2), pd.read_parquet(folder / "episodes.parquet"))
+    steps = [read_steps(place) for place in (folder, tmp_path / "two")]
+    pd.testing.assert_frame_equal(*steps)
+
+
+def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp_path: Path) -> None:
+    suite, whole = finished
+    folder = tmp_path / "run"
+    code = (
+        "import sys; from pathlib import Path; from benchnav.eval.suite import Suite\n"
+        "from benchnav.eval.run.runner import run_suite\n"
+        f"for _ in run_suite({suite!r}, Path({str(folder)!r})): pass"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while len(list(folder.glob("units/*/*.parquet"))) < 2:
+        time.sleep(0.02)
+        assert process.poll() is None
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (folder / "episodes.parquet").exists()
+    kept = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/[!.]*.parquet")}
+    said: list[str] = []
+    same(finish(suite, folder, say=said.append), pd.read_parquet(whole / "episodes.parquet"))
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert said == [f"{len(kept)} of 14 units were there already"]
+
+
+def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_path: Path) -> None:
+    suite, said = quick(dataset_path), []
+    first = finish(suite, tmp_path / "run")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "run").glob("units/*/*")}
+    again = finish(suite, tmp_path / "run", say=said.append)
+    pd.testing.assert_frame_equal(first, again)
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert said == ["4 of 4 units were there already"]
+
+
+@pytest.mark.parametrize(
+    ("change", "trials", "rows", "kept"),
+    [
+        ({"risks": ("cvar", "mean", "var")}, 6, 12, 4),
+        ({"risks": ("var",)}, 6, 12, 4),
+        ({"planners": ("tests.eval.parts:Faulty", "straight")}, 6, 12, 4),
+        ({"models": ("oracle", "tests.eval.parts:Gaussian")}, 8, 16, 4),
+        ({"seeds": (0, 5)}, 4, 16, 4),
+        ({"seed": 5}, 4, 16, 4),
+        ({"seed": 5, "instances": 1}, 4, 12, 4),
+        ({"realisations": 3}, 4, 24, 4),
+        ({"scenarios": ("hg",)}, 6, 12, 4),
+        ({"noise": "stored"}, 8, 16, 4),
+    ],
+)
+def test_a_run_is_extended_by_what_is_missing(
+    change: dict[str, object], trials: int, rows: int, kept: int, dataset_path: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    finish(quick(dataset_path), folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
+    run_id = open_run(folder).about["run_id"]
+    extended = finish(quick(dataset_path, **change), folder)
+    assert (extended["trial"].nunique(), len(extended)) == (trials, rows)
+    assert sum(path.stat().st_mtime_ns == when for path, when in before.items()) == kept == len(before)
+    assert open_run(folder).about["run_id"] == run_id
+    # What was there and what came make the rows of a run that had all at once.
+    fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
+    fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
+    if not {"scenarios", "noise", "instances"} & set(change):
+        same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
+
+
+def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
+    dataset = factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=53))
+    folder, suite = tmp_path / "run", quick(dataset, scenarios=("std",), risks=("mean",))
+    sizes = []
+    for instances in (50, 52, 0, 4):
+        rows = finish(replace(suite, instances=instances), folder)
+        sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
+    assert sizes == [(50, 1), (52, 2), (53, 2), (53, 2)]
+    same(rows, finish(replace(suite, instances=0), tmp_path / "fresh"))
+
+
+def test_a_run_is_extended_by_another_dataset(dataset_path: Path, tmp_path: Path) -> None:
+    finish(quick(dataset_path, scenarios=("std",), risks=("mean",)), tmp_path / "run")
+    other = factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    rows = finish(quick(other, scenarios=("std",), risks=("mean",)), tmp_path / "run")
+    assert rows.groupby("data").size().to_dict() == {str(dataset_path): 2, str(other): 2}
+    assert len(open_run(tmp_path / "run").about["datasets"]) == 2
+
+
+def test_an_extension_under_a_label_that_is_taken_is_refused(dataset_path: Path, tmp_path: Path) -> None:
+    finish(quick(dataset_path, scenarios=("std",)), tmp_path / "run")
+    late = {"part": "tests.eval.parts:Faulty", "options": {"after_s": 2.0}}
+    with pytest.raises(ConfigError, match="both called 'Faulty'"):
+        finish(quick(dataset_path, scenarios=("std",), planners=(late,)), tmp_path / "run")
+
+
+def test_code_that_changes_while_a_run_goes_on_makes_no_table(dataset_path: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.py"
+    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    suite = quick(dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",))
+    steps = run_suite(suite, tmp_path / "run")
+    next(steps)
+    mine.write_text(mine.read_text() + "# edited\n")
+    with pytest.raises(ConfigError, match=r"While .* running these changed: .*mine\.py"):
+        list(steps)
+    assert not (tmp_path / "run" / "episodes.parquet").exists()
+
+
+def test_a_unit_of_another_run_does_not_count(dataset_path: Path, tmp_path: Path) -> None:
+    suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
+    for name in ("one", "two"):
+        finish(suite, tmp_path / name)
+    (unit,) = (path.relative_to(tmp_path / "one") for path in (tmp_path / "one").glob("units/*/*"))
+    shutil.copy(tmp_path / "one" / unit, tmp_path / "two" / unit)
+    said: list[str] = []
+    finish(suite, tmp_path / "two", say=said.append)
+    assert said == []  # nothing was there: the unit was run anew
+
+
+@pytest.mark.parametrize("risk", ["cvar:1.5", "var:-0.1", "expected-time:-1", "chance:2", "single-class:1"])
+def test_options_that_a_risk_measure_cannot_take_are_refused_before_the_run(
+    dataset_path: Path, tmp_path: Path, risk: str
+) -> None:
+    with pytest.raises(ConfigError, match=r"Expected .* in [\[(]0, 1[\])], got"):
+        finish(quick(dataset_path, scenarios=("std",), risks=("mean", risk)), tmp_path / "run")
+    assert not (tmp_path / "run" / "units").exists()
+
+
+def test_a_run_with_another_time_limit_or_compiler_is_refused(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
+    finish(suite, tmp_path / "run")
+    with pytest.raises(ConfigError, match="planner_limit_s"):
+        finish(suite, tmp_path / "run", planner_limit_s=9.0)
+    monkeypatch.setattr(provenance, "can_compile", lambda: None)
+    with pytest.raises(ConfigError, match="compiles"):
+        finish(suite, tmp_path / "run")
+
+
+def test_a_run_of_other_code_or_data_is_refused_and_what_changed_is_named(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, mine, folder = tmp_path / "tiny.h5", tmp_path / "mine.py", tmp_path / "run"
+    shutil.copy(dataset_path, data)
+    mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
+    suite = quick(data, planners=(f"{mine}:Mine",), scenarios=("std",))
+    rows = finish(suite, folder)
+    code = provenance.describe_code()
+    changes = {
+        "benchnav's own sources": {**code, "sources": "0" * 64},
+        "torch": {**code, "versions": {**code["versions"], "torch": "9.9"}},
+        "processor": {**code, "processor": "ABACUS"},
+    }
+    for name, changed in changes.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(provenance, "describe_code", lambda changed=changed: changed)
+            with pytest.raises(ConfigError, match=name):
+                finish(suite, folder)
+    mine.write_text(mine.read_text() + "# another\n")
+    with pytest.raises(ConfigError, match=r"mine\.py"):
+        finish(suite, folder)
+    mine.write_text(mine.read_text().removesuffix("# another\n"))
+    factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    os.replace(tmp_path / "other.h5", data)
+    with pytest.raises(ConfigError, match=r"maps of .* test/std"):
+        finish(suite, folder)
+    pd.testing.assert_frame_equal(pd.read_parquet(folder / "episodes.parquet"), rows)
+    assert len(finish(suite, folder, overwrite=True)) == len(rows)
+
+
+def test_a_changed_checkpoint_is_named(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = quick(dataset_path, scenarios=("std",))
+    finish(suite, tmp_path / "run")
+    monkeypatch.setattr(provenance, "model_identity", lambda source: {"name": source, "files": {"a": "b"}})
+    with pytest.raises(ConfigError, match="model oracle"):
+        finish(suite, tmp_path / "run")
+
+
+def test_two_runs_in_one_folder_refuse_each_other_also_with_overwrite(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    suite = quick(dataset_path)
+    first = run_suite(suite, tmp_path / "run")
+    next(first)
+    for options in ({}, {"overwrite": True}):
+        with pytest.raises(BenchnavError, match="Another run"):
+            finish(suite, tmp_path / "run", **options)
+    for _ in first:
+        pass
+    assert len(pd.read_parquet(tmp_path / "run" / "episodes.parquet")) == 8
+
+
+def test_overwrite_drops_run_folders_alone(dataset_path: Path, tmp_path: Path) -> None:
+    precious = tmp_path / "run" / "thesis.tex"
+    precious.parent.mkdir()
+    precious.write_text("years")
+    with pytest.raises(ConfigError):
+        finish(quick(dataset_path), tmp_path / "run", overwrite=True)
+    with pytest.raises(ConfigError, match="something else"):
+        finish(quick(dataset_path), tmp_path / "run")
+    assert precious.read_text() == "years"
+
+
+def test_a_run_of_the_first_format_is_not_gone_on_with(dataset_path: Path, tmp_path: Path) -> None:
+    shutil.copytree(Path(__file__).parents[2] / "data" / "run-1", tmp_path / "run")
+    with pytest.raises(ConfigError, match="version 1"):
+        finish(quick(dataset_path), tmp_path / "run")
+
+
+def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:
+    _, folder = finished
+    asked = {"planner": ["astar_dwa"], "risk": ["mean"], "scenario": ["hs"]}
+    ((unit, member),) = find_episodes(folder, asked, None, 0, 1)
+    recording = find_recording(folder, unit, member)
+    steps = read_steps(folder, planner="astar_dwa", risk="mean", scenario="hs", instance=1)
+    np.testing.assert_array_equal(recording.states[:, :2], steps[["x_m", "y_m"]].to_numpy())
+    _, positions = read_path(playback_path(folder, unit.stem(member)))
+    np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
+
+
+def test_what_the_caller_set_is_left_alone(dataset_path: Path, tmp_path: Path) -> None:
+    threads, filters = torch.get_num_threads(), list(warnings.filters)
+    torch.set_num_threads(2)
+    try:
+        steps = run_suite(quick(dataset_path), tmp_path / "run")
+        for _ in steps:
+            assert torch.get_num_threads() == 2
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert list(warnings.filters) == filters
+
+
+def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path, tmp_path: Path) -> None:
+    finish(quick(dataset_path, scenarios=("std",), risks=("mean",)), tmp_path / "run")
+    kept = sorted((tmp_path / "run").rglob("*"))
+    for change, expected in (
+        ({"scenarios": ("fog",)}, "fog"),
+        ({"risks": ("cvr",)}, "cvr"),
+        ({"planners": ("mpi",), "planner_options": {}}, "mpi"),
+        ({"planner_options": {"mppi": {"sample": 1}}, "planners": ("mppi",)}, "samples"),
+        ({"model": "no-such-model"}, "no-such-model"),
+        ({"data": "no-such-data"}, "no-such-data"),
+        ({"noise": "loud"}, "loud"),
+        ({"noise": "frozen"}, "stored"),
+        ({"instances": 9}, "0 takes all"),
+        ({"time_budget_s": 0.01}, "time budget of at least one time step"),
+        ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
+        ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
+        ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
+        ({"robots": ("tests.eval.parts:Faulty",)}, "without dt_s"),
+        ({"planners": ("benchnav.planning.robots:Unicycle",)}, "without init"),
+        ({"objectives": ("benchnav.planning.robots:Unicycle",)}, "without stage"),
+        ({"trials": ({"task": 3},)}, "mapping"),
+        ({"trials": ({"planners": []},)}, "at least one trial"),
+        ({"trials": ({"planners": "mppi"},), "planner_options": {"mpi": {"samples": 8}}}, "planner_options"),
+        ({"model": {"part": "paper-v1", "lable": "mine"}}, "lable"),
+    ):
+        for place in (tmp_path / "run", tmp_path / "new"):
+            with pytest.raises(BenchnavError, match=expected):
+                finish(quick(dataset_path, **change), place, overwrite=True)
+        assert not (tmp_path / "new").exists()
+    assert sorted((tmp_path / "run").rglob("*")) == kept
+
+
+def test_parts_of_this_process_alone_are_refused_for_workers(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tests.eval.parts import Faulty
+
+    registry.register("planner", "mine", Faulty)
+    suite = quick(dataset_path, planners=("mine",))
+    assert len(finish(suite, tmp_path / "run")) == 8
+    for options in ({"jobs": 2}, {"planner_limit_s": 9.0}):
+        with pytest.raises(ConfigError, match="jobs"):
+            finish(suite, tmp_path / "two", **options)
+
+
+def test_what_a_user_should_know_is_said(dataset_path: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    suite = quick(dataset_path, task={"free_space": {"above": 0.1}}, model="paper-v1", scenarios=("std",))
+    other = replace(factories.tiny_recipe(), classes=factories.tiny_recipe().classes[:4], environments=1)
+    data = factories.tiny_dataset(tmp_path / "four.h5", other)
+    finish(replace(suite, data=str(data)), tmp_path / "run", say=said.append)
+    assert any("ground above 0.3" in line and "free above 0.1" in line for line in said)
+    assert any("class" in line and "paper-v1" in line for line in said)
+
+
+def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: Path, tmp_path: Path) -> None:
+    hopeless = {
+        "part": "tests.eval.parts:Faulty", "label": "hopeless", "options": {"fault": "give up", "after_s": 0.0},
+    }  # fmt: skip
+    suite = quick(dataset_path, planners=(hopeless,), scenarios=("std",), risks=("mean",), record="first")
+    episodes = finish(suite, tmp_path / "run")
+    assert episodes["outcome"].tolist() == ["planner_failure"] * 2
+    assert episodes["end_time_s"].tolist() == [0, 0]
+    assert episodes["total_time_s"].tolist() == [40, 40]
+    write_report(tmp_path / "run")
+    (recording,) = (tmp_path / "run" / "playback").glob("*.rrd")
+    _, positions = read_path(recording)
+    assert len(positions) <= 2
+
+
+def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
+    """Of a file with some maps of a shipped recipe; of others there is nothing to be told."""
+    recipe = load_recipe("tiny-v1")
+    few = {name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hg")}
+    path = factories.tiny_dataset(tmp_path / "few.h5", replace(recipe, splits=few))
+    made = "All maps of tiny-v1 are made with `benchnav-datagen create tiny-v1`"
+    for changes, told in (
+        ({"instances": 3}, True),
+        ({"instances": 5}, False),
+        ({"scenarios": ("hs",)}, True),
+        ({"scenarios": ("night",)}, False),
+    ):
+        suite = Suite(data=str(path), model="oracle", planners=("straight",), **changes)
+        with pytest.raises(ConfigError) as refused:
+            finish(suite, tmp_path / "run")
+        assert (made in str(refused.value)) == told, changes
+
+
+def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path: Path) -> None:
+    def told(budget: float, robot: str | dict[str, Any] = "unicycle") -> list[str]:
+        lines: list[str] = []
+        suite = Suite(
+            data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), instances=2,
+            time_budget_s=budget, robots=(robot,), record="none",
+        )  # fmt: skip
+        for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
+            pass
+        return [line for line in lines if "within T" in line]
+
+    # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
+    assert told(10.2) == ["in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"]
+    assert told(10.4) == []
+    assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []
+
+
+def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    suite = Suite(
+        data=str(dataset_path),
+        model="oracle",
+        planners=("straight",),
+        scenarios=("std",),
+        instances=2,
+        record="none",
+    )
+    before = finish(suite, tmp_path / "run")
+    for world, expected in (
+        ({"noise": "frozen", "correlation_m": 4.1}, r"`world.correlation_m` of at most 4 m.* got 4.1 m"),
+        ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for instance"),
+    ):
+        for place in ("run", "new"):
+            with pytest.raises(ConfigError, match=expected):
+                finish(replace(suite, world=world), tmp_path / place, overwrite=True)
+    same(before, pd.read_parquet(tmp_path / "run" / "episodes.parquet"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
+    dataset_path: Path, tmp_path: Path
+) -> None:
+    suite = Suite(
+        data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
+        scenarios=("std",), instances=1, record="none", time_budget_s=1.0,
+    )  # fmt: skip
+    with pytest.raises(ConfigError, match="without `group`"):
+        finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
+    assert set(finish(suite, tmp_path / "run")["risk"]) == {"–", *Suite().risks}

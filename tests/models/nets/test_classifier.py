@@ -1,0 +1,218 @@
+from types import SimpleNamespace
+
+import pytest
+import segmentation_models_pytorch as smp
+import torch
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import ConfigError
+from benchnav.models.config import ClassifierConfig
+from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.train import fit_classifier
+
+CPU = FitOptions(trainer={"precision": "32-true", "accelerator": "cpu"})
+MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
+
+
+def build(seed: int = 0, **settings: object) -> TerrainClassifier:
+    return TerrainClassifier(ClassifierConfig(**settings), 4, MEAN, STD, seed).eval()  # type: ignore[arg-type]
+
+
+def image(height: int, width: int, batch: int = 1) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(5)
+    return torch.randint(0, 256, (batch, 3, height, width), generator=generator, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (33, 20), (32, 64)])
+def test_maps_of_any_size_are_classified(shape: tuple[int, int]) -> None:
+    with torch.no_grad():
+        logits = build()(image(*shape))
+    assert logits.shape == (1, 4, *shape)
+    assert bool(logits.isfinite().all())
+
+
+def test_colours_are_normalised_by_the_training_maps() -> None:
+    model = build()
+    seen: list[torch.Tensor] = []
+    model.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    rgb = image(32, 32)
+    with torch.no_grad():
+        model(rgb)
+    expected = (rgb.float() - MEAN.view(3, 1, 1)) / STD.view(3, 1, 1)
+    torch.testing.assert_close(seen[0], expected)
+
+
+def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
+    before = torch.random.get_rng_state()
+    first, second, other = (next(build(seed).network.parameters()) for seed in (0, 0, 1))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_another_architecture_and_encoder_fit() -> None:
+    with torch.no_grad():
+        assert build(architecture="fpn", encoder="resnet34")(image(32, 32)).shape == (1, 4, 32, 32)
+
+
+@pytest.mark.parametrize(("name", "value"), [("architecture", "unett"), ("encoder", "resnet19")])
+def test_an_unknown_network_is_refused(name: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=value):
+        build(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("learning_rate", 0.0),
+        ("batch_size", 1),
+        ("max_epochs", 0),
+        ("max_epochs", "many"),
+        ("dice", -1.0),
+        ("weight_decay", -1.0),
+        ("label_smoothing", 1.0),
+        ("jitter", 1.0),
+        ("encoder_depth", 0),
+        ("encoder_depth", 6),
+        ("decoder_channels", (32, 0, 16)),
+    ],
+)
+def test_settings_that_cannot_train_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=name):
+        ClassifierConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_the_default_size_is_that_of_segmentation_models_itself() -> None:
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(3)
+        plain = smp.create_model("unet", "resnet18", encoder_weights=None, in_channels=3, classes=32)
+    built = build(3).network.network.state_dict()
+    assert built.keys() == plain.state_dict().keys()
+    assert all(torch.equal(built[name], value) for name, value in plain.state_dict().items())
+
+
+@pytest.mark.parametrize(("depth", "stride"), [(3, 8), (4, 16), (5, 32)])
+def test_maps_are_padded_to_the_stride_of_the_encoder(depth: int, stride: int) -> None:
+    model = build(encoder_depth=depth)
+    seen: list[torch.Tensor] = []
+    model.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    with torch.no_grad():
+        assert model(image(33, 40)).shape == (1, 4, 33, 40)
+    assert seen[0].shape[-2:] == (-(-33 // stride) * stride, -(-40 // stride) * stride)
+
+
+def test_depth_and_channels_reach_encoder_and_decoder() -> None:
+    model = build(encoder_depth=3, decoder_channels=(48, 24, 12))
+    network = model.network.network
+    assert [block.conv1[0].out_channels for block in network.decoder.blocks] == [48, 24, 12]
+    own = build(encoder_depth=3).network.network
+    assert [block.conv1[0].out_channels for block in own.decoder.blocks] == [64, 32, 16]
+    # The fourth and fifth stage are not there to be stored.
+    assert not list(network.encoder.layer3.parameters()) + list(network.encoder.layer4.parameters())
+    assert list(network.encoder.layer2.parameters())
+
+
+@pytest.mark.parametrize("depth", [3, 4])
+def test_every_weight_of_a_smaller_network_is_trained(depth: int) -> None:
+    model = build(encoder_depth=depth).train()
+    assert all(weight.grad is None for weight in model.parameters())
+    model(image(32, 32, batch=2)).sum().backward()
+    assert all(weight.grad is not None for weight in model.parameters())
+
+
+@pytest.mark.parametrize("architecture", ["unet", "linknet", "unetplusplus", "manet"])
+def test_smaller_networks_of_other_architectures(architecture: str) -> None:
+    small = build(architecture=architecture, encoder="mobilenet_v2", encoder_depth=4)
+    with torch.no_grad():
+        assert small(image(32, 32)).shape == (1, 4, 32, 32)
+    assert _weights(small) < _weights(build(architecture=architecture, encoder="mobilenet_v2"))
+
+
+def _weights(model: torch.nn.Module) -> int:
+    return sum(weight.numel() for weight in model.parameters())
+
+
+def test_a_smaller_network_is_read_back_from_plain_settings() -> None:
+    settings = {"encoder_depth": 3, "decoder_channels": [32, 16, 8]}
+    model = build(encoder_depth=3, decoder_channels=(32, 16, 8))
+    again = TerrainClassifier.from_tensors(settings, 4, model.state_dict())
+    with torch.no_grad():
+        assert torch.equal(model(image(32, 32)), again(image(32, 32)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"decoder_channels": (32, 16)}, r"`encoder_depth` 5 and `decoder_channels` \[32, 16\]"),
+        ({"architecture": "fpn", "decoder_channels": (9,)}, "no such setting"),
+        ({"architecture": "fpn", "encoder_depth": 4}, "answers 64 cells with 128"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(settings: dict[str, object], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        build(**settings)
+
+
+def test_training_is_reproducible_and_learns(
+    dataset: TerrainDataset, capfd: pytest.CaptureFixture[str], tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = ClassifierConfig(max_epochs=4, batch_size=5)
+    first, metrics = fit_classifier(config, dataset, 3, CPU)
+    lines = capfd.readouterr().err.strip().splitlines()
+    second, _ = fit_classifier(config, dataset, 3, CPU)
+    for name, value in first.state_dict().items():
+        assert torch.equal(value, second.state_dict()[name]), name
+    assert metrics["valid_accuracy"] > 0.15
+    assert [line.split(",")[0] for line in lines] == [f"classifier: epoch {n}/4" for n in (1, 2, 3, 4)]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_best_epoch_is_kept() -> None:
+    model, best = torch.nn.Linear(1, 1), KeepBest()
+    for epoch, loss in enumerate((2.0, 1.0, 3.0, float("nan"))):
+        torch.nn.init.constant_(model.weight, epoch)
+        trainer = SimpleNamespace(callback_metrics={"valid_loss": torch.tensor(loss)}, current_epoch=epoch)
+        best.on_validation_epoch_end(trainer, model)  # type: ignore[arg-type]
+    best.on_fit_end(trainer, model)  # type: ignore[arg-type]
+    assert model.weight.item() == 1
+    assert best.metrics == {"valid_loss": 1.0, "epoch": 2}
+    assert trainer.callback_metrics == {"valid_loss": 1.0, "epoch": 2}
+
+
+def test_training_stops_when_validation_no_longer_gains(
+    dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
+) -> None:
+    config = ClassifierConfig(max_epochs=30, batch_size=5, patience=1, learning_rate=0.3)
+    fit_classifier(config, dataset, 0, CPU)
+    assert len(capfd.readouterr().err.strip().splitlines()) < 20
+
+
+def test_a_loss_that_is_no_number_is_one_error() -> None:
+    with pytest.raises(ConfigError, match="learning_rate"):
+        KeepBest().on_fit_end(SimpleNamespace(), torch.nn.Linear(1, 1))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("full_resolution", "learns"), [(True, True), (False, False)])
+def test_classes_of_single_cells_are_learned_at_full_resolution_alone(
+    full_resolution: bool, learns: bool
+) -> None:
+    # Each cell has a class of its own, told by its own colour; neighbours tell nothing.
+    class_id = torch.randint(0, 4, (8, 32, 32), generator=torch.Generator().manual_seed(0))
+    rgb = (60 + 40 * class_id)[:, None].expand(-1, 3, -1, -1).to(torch.uint8)
+    model = build(full_resolution=full_resolution).train()
+    optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
+    for _ in range(30):
+        optimizer.zero_grad()
+        model.loss(model(rgb), class_id).backward()
+        optimizer.step()
+    accuracy = (model(rgb).argmax(1) == class_id).float().mean()
+    assert (accuracy > 0.95) == learns
+
+
+def test_weights_without_full_resolution_are_read_back() -> None:
+    model = build(full_resolution=False)
+    again = TerrainClassifier.from_tensors({"full_resolution": False}, 4, model.state_dict())
+    with torch.no_grad():
+        assert torch.equal(model(image(32, 32)), again(image(32, 32)))

@@ -1,0 +1,181 @@
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchnav import registry
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.cli import main
+from benchnav.models.predictor import Oracle
+from benchnav.models.quality import map_sheet
+from benchnav.models.quality.baseline import nearest_colour_accuracy
+from benchnav.models.quality.measure import evaluate
+from tests.models.stub import ColourModel
+
+
+@pytest.fixture(autouse=True)
+def _colour_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("model", "colours", ColourModel)
+
+
+def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["benchnav-train", "evaluate", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_table_is_printed_and_nothing_written(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "colours", "--data", dataset.path) == 0
+    out, err = capfd.readouterr()
+    quality = dict(evaluate(ColourModel(), dataset))["test/hs"]
+    (row,) = [line for line in out.splitlines() if line.startswith("test/hs")]
+    for value in (quality.classes[0].ece, quality.traversability.nll, quality.traversability.coverage):
+        assert f"{value:.4f}" in row
+    assert f"test/hs {nearest_colour_accuracy(dataset, 'test/hs'):.4f}" in out
+    assert out.splitlines()[-1] == "what the columns mean: with --out FOLDER, quality.md there says so"
+    assert max(map(len, out.splitlines())) <= 124
+    assert err.splitlines() == ["splits: 1/2", "splits: 2/2"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_json_alone_is_written_for_other_programs(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = tmp_path / "report.json"
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--json", report, "--seed", 5) == 0
+    found = json.loads(report.read_text())
+    assert list(found["splits"]) == ["test/std", "test/hs"]
+    assert found["dataset"] == {"id": dataset.id, "digest": dataset.digest}
+    assert (found["model"], found["seed"]) == ("colours", 5)
+    quality = dict(evaluate(ColourModel(), dataset, seed=5))["test/hs"]
+    assert tuple(found["splits"]["test/hs"]["pit"]) == quality.traversability.pit
+    assert found["splits"]["test/hs"]["accuracy"] == quality.classes[0].accuracy
+    assert found["nearest_colour_accuracy"]["test/hs"] == nearest_colour_accuracy(dataset, "test/hs")
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
+
+
+def test_a_folder_holds_report_page_and_figures(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
+    out = tmp_path / "new" / "quality"
+    asked = ["colours", "--data", dataset.path, "--out", out, "--maps", 1]
+    draw, titles = map_sheet.map_sheet_figure, []
+    monkeypatch.setattr(
+        map_sheet, "map_sheet_figure", lambda *given: titles.append(given[-1]) or draw(*given)
+    )
+    assert call(monkeypatch, *asked) == 0
+    assert titles == ["model colours on dataset tiny-v1"] * 2
+    assert {path.name for path in out.iterdir()} == {"quality.json", "quality.csv", "quality.md", "figures"}
+    figures = {path.name for path in (out / "figures").iterdir()}
+    assert figures == {
+        "confusion.png", "reliability.png", "pit.png", "latent.png",
+        "maps-test-std.png", "maps-test-hs.png",
+    }  # fmt: skip
+    printed = capfd.readouterr().out
+    assert "no ladder" in printed
+    assert printed.splitlines()[-1] == f"what the columns and figures mean: {out}/quality.md"
+    page = (out / "quality.md").read_text()
+    assert all(f"(figures/{name})" in page for name in figures)
+    assert "nearest colour" in page
+    assert len(list(csv.DictReader((out / "quality.csv").open()))) == 2
+
+    # Another evaluation takes its place only when asked to, and leaves no figure of the first.
+    assert call(monkeypatch, "oracle", "--data", dataset.path, "--out", out) == 2
+    assert "--overwrite" in capfd.readouterr().err
+    assert json.loads((out / "quality.json").read_text())["model"] == "colours"
+    assert call(monkeypatch, "oracle", "--data", dataset.path, "--out", out, "--maps", 0, "--overwrite") == 0
+    assert {path.name for path in (out / "figures").iterdir()} == {"pit.png"}
+    said = capfd.readouterr().out
+    assert "predicts no classes" in said
+    assert "no Gaussian processes" in said
+    assert "nearest colour" not in said
+    assert "accuracy" not in json.loads((out / "quality.json").read_text())["splits"]["test/hs"]
+
+
+def test_a_ladder_is_drawn_where_there_is_one(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
+    held = dict(dataset.manifest["splits"])
+    monkeypatch.setattr(
+        TerrainDataset, "splits", property(lambda self: {**held, "test/hs-100": held["test/hs"]})
+    )
+    read = TerrainDataset.read
+    monkeypatch.setattr(
+        TerrainDataset, "read", lambda self, split, *rest: read(self, split.removesuffix("-100"), *rest)
+    )
+    asked = ["oracle", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--maps", 0]
+    assert call(monkeypatch, *asked, "--out", tmp_path / "q") == 0
+    assert (tmp_path / "q" / "figures" / "ladder.png").is_file()
+    assert list(json.loads((tmp_path / "q" / "quality.json").read_text())["ladders"]) == ["test/hs"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["colour", "--data", "DATA"], "Did you mean 'colours'"),
+        (["oracle", "--data", "nothing.h5"], "nothing.h5"),
+        (["oracle", "--data", "DATA", "--splits", "[test/hg]"], "test/hg"),
+        (["oracle", "--data", "DATA", "--json", "no/such/folder.json"], "no/such"),
+        (["oracle", "--data", "DATA", "--json", "folder"], "folder"),
+        (["oracle", "--data", "DATA", "--out", "folder"], "something else"),
+        (["oracle", "--data", "DATA", "--out", "folder/file"], "something else"),
+        (["oracle", "--data", "DATA", "--out", "folder/file/deeper/out"], "folder/file"),
+        (["oracle", "--data", "DATA", "--out", "x", "--maps", "-1"], "maps"),
+        (["other", "--data", "DATA", "--out", "x"], "class table"),
+        (["other", "--data", "DATA", "--out", "new/x", "--json", "y.json"], "class table"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line_before_any_work(
+    arguments: list[str],
+    expected: str,
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    class Other(ColourModel):
+        def __init__(self) -> None:
+            super().__init__()
+            self.class_names = ("a", "b")
+
+    def never(*arguments: object) -> None:
+        raise AssertionError("measured what was to be refused")
+
+    registry.register("model", "other", Other)
+    monkeypatch.setattr(Oracle, "predict_terrain", never)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").write_text("mine")
+    assert call(monkeypatch, *(str(dataset.path) if item == "DATA" else item for item in arguments)) == 2
+    out, err = capfd.readouterr()
+    assert len(err.strip().splitlines()) == 1, err
+    assert err.startswith("benchnav-train: error: ")
+    assert expected in err
+    assert out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+    assert (tmp_path / "folder" / "file").read_text() == "mine"
+
+
+def test_the_command_is_light_to_import() -> None:
+    code = (
+        "import sys, benchnav.models.quality.command; "
+        "print(sorted({'torch', 'torchmetrics', 'matplotlib', 'pandas'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"

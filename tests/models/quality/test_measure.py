@@ -1,0 +1,248 @@
+import math
+from dataclasses import astuple, replace
+
+import pytest
+import torch
+from scipy.stats import mannwhitneyu
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import CheckpointError, DatasetError
+from benchnav.mixture import TraversabilityMixture
+from benchnav.models.fused import FusedModel
+from benchnav.models.predictor import Oracle
+from benchnav.models.quality.measure import choose_splits, evaluate, measure, measure_latent
+from benchnav.models.quality.scores import crps
+from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
+from benchnav.models.slope_gp.table import SoftModes
+from benchnav.terrain import Grid, Observation
+from tests.factories import normal
+from tests.models.stub import ColourModel
+from tests.models.support import linear_table, make_terrain
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_oracle_is_calibrated_and_has_no_class_metrics() -> None:
+    terrain = make_terrain(batch=20, size=32)
+    quality = measure(Oracle(), [terrain], generator(1))
+    figures = quality.traversability
+    assert quality.maps == 20
+    assert quality.classes == ()
+    assert figures.rmse_expected == 0
+    assert figures.coverage == pytest.approx(0.9, abs=0.01)
+    assert figures.tail_rate == pytest.approx(0.1, abs=0.01)
+    truth = Oracle().predict_terrain(terrain)
+    by_hand = -truth.log_prob(terrain.traversability).mean()
+    assert figures.nll == pytest.approx(float(by_hand), rel=1e-5)
+    error = (truth.mean() - terrain.traversability).square().mean().sqrt()
+    assert figures.rmse_observed == pytest.approx(float(error), rel=1e-5)
+    assert figures.crps == pytest.approx(float(crps(truth, terrain.traversability).mean()), rel=1e-5)
+    cells = terrain.traversability.numel()
+    assert sum(figures.pit) == cells
+    assert sum(figures.pit[1:-1]) / cells == pytest.approx(figures.coverage, abs=1e-4)
+    assert sum(figures.pit[:2]) / cells == pytest.approx(figures.tail_rate, abs=1e-4)
+
+
+def test_a_model_off_by_a_constant_is_off_by_it_in_truth() -> None:
+    class Shifted:
+        """Says N(0.4, 0.01) of ground that is N(0.5, 0.01)."""
+
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            ones = torch.ones(len(observation.rgb), 1, *observation.grid.shape)
+            return TraversabilityMixture(ones, 0.4 * ones, 0.01 * ones)
+
+    drawn = make_terrain(batch=3)
+    level = torch.full_like(drawn.traversability, 0.5)
+    terrain = replace(drawn, truth=normal(level, 0.02 * level), traversability=level)
+    figures = measure(Shifted(), [terrain], generator()).traversability
+    assert figures.rmse_expected == pytest.approx(0.1, abs=1e-5)
+    assert figures.rmse_observed == pytest.approx(0.1, abs=1e-5)
+    assert figures.coverage == figures.tail_rate == 0
+    assert figures.pit[-1] == level.numel()
+
+
+def test_class_metrics_are_those_counted_by_hand() -> None:
+    class Half:
+        """Says class 0 with certainty 0.8 everywhere; classes are 0 in the left half, else 1."""
+
+        class_names = ("a", "b", "c")
+
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            share = torch.tensor([0.8, 0.15, 0.05]).view(1, 3, 1, 1)
+            weights = share.expand(len(observation.rgb), 3, *observation.grid.shape).clone()
+            return TraversabilityMixture(weights, weights, torch.full_like(weights, 0.1))
+
+    terrain = make_terrain()
+    terrain.class_id[:] = 0
+    terrain.class_id[:, :, 8:] = 1
+    chunks = [make_terrain(), make_terrain()]
+    for chunk in chunks:
+        chunk.class_id[:] = terrain.class_id
+    (classes,) = measure(Half(), chunks, generator()).classes
+    assert classes.accuracy == pytest.approx(0.5)
+    assert classes.miou == pytest.approx((0.5 + 0) / 2)
+    assert classes.ece == pytest.approx(0.3, abs=1e-4)
+    left, right = 0.2**2 + 0.15**2 + 0.05**2, 0.8**2 + 0.85**2 + 0.05**2
+    assert classes.brier == pytest.approx((left + right) / 2)
+    half = terrain.class_id.numel() // 2 * len(chunks)
+    assert classes.confusion == ((half, 0, 0), (half, 0, 0), (0, 0, 0))
+    assert classes.reliability.cells[12] == 2 * half
+    assert classes.reliability.accuracy[12] == 0.5
+    assert classes.reliability.confidence[12] == pytest.approx(0.8)
+    nats = -sum(p * math.log(p) for p in (0.8, 0.15, 0.05))
+    assert classes.entropy == pytest.approx(nats, rel=1e-5)
+    assert classes.entropy_auroc == 0.5
+    assert math.isnan(classes.mutual_information)
+    assert math.isnan(classes.mutual_information_auroc)
+
+
+def test_uncertainty_is_ranked_over_all_maps(dataset: TerrainDataset) -> None:
+    model, terrain = ColourModel(), dataset.terrain("test/hs")
+    chunks = [terrain.select(torch.tensor([index])) for index in range(len(terrain))]
+    (classes,) = measure(model, chunks, generator()).classes
+    members = model.member_probabilities(terrain.observe())
+    wrong = members.mean(0).argmax(1) != terrain.class_id
+    for values, mean, auroc in (
+        (predictive_entropy(members.mean(0)), classes.entropy, classes.entropy_auroc),
+        (mutual_information(members), classes.mutual_information, classes.mutual_information_auroc),
+    ):
+        exact = mannwhitneyu(values[wrong].numpy(), values[~wrong].numpy()).statistic
+        exact /= int(wrong.sum()) * int((~wrong).sum())
+        assert mean == pytest.approx(float(values.mean()), rel=1e-5)
+        assert auroc == pytest.approx(exact, abs=1e-3)
+
+
+def test_one_member_has_no_mutual_information(dataset: TerrainDataset) -> None:
+    quality = measure(ColourModel((40.0,)), [dataset.terrain("valid")], generator())
+    assert math.isnan(quality.classes[0].mutual_information)
+    assert quality.classes[0].entropy > 0
+
+
+def test_slopes_are_counted_by_true_class() -> None:
+    terrain = make_terrain(batch=1, classes=10)
+    terrain.slope_deg[:] = 12.5
+    terrain.slope_deg[0, 0, :2] = torch.tensor([0.0, 90.0])
+    terrain.class_id[0, 0, :2] = torch.tensor([4, 6])
+    cells = torch.tensor(measure(ColourModel(), [terrain], generator()).classes[0].slope_cells)
+    assert cells.shape == (10, 90)
+    assert cells.sum(1).tolist() == terrain.class_id.flatten().bincount(minlength=10).tolist()
+    assert cells[4, 0] == cells[6, 89] == 1
+    assert int(cells[:, 12].sum()) == terrain.class_id.numel() - 2
+
+
+def test_measures_do_not_depend_on_how_maps_are_read(dataset: TerrainDataset) -> None:
+    terrain = dataset.terrain("valid")
+    whole = measure(ColourModel(), [terrain], generator())
+    parts = [terrain.select(torch.arange(4)[part]) for part in (slice(0, 1), slice(1, 4))]
+    pieces = measure(ColourModel(), parts, generator())
+    assert pieces.maps == whole.maps == 4
+    one, other = pieces.classes[0], whole.classes[0]
+    assert one.confusion == other.confusion
+    assert astuple(one)[:8] == pytest.approx(astuple(other)[:8], rel=1e-6)
+    named = ("rmse_observed", "rmse_expected", "nll", "crps")
+    assert [getattr(pieces.traversability, name) for name in named] == pytest.approx(
+        [getattr(whole.traversability, name) for name in named], rel=1e-6
+    )
+
+
+def test_latent_metrics_read_each_cell_with_its_own_class() -> None:
+    terrain, table = make_terrain(batch=4), linear_table()
+    mean, std = table.lookup(terrain.slope_deg)
+    own = terrain.class_id[:, None]
+    mean, std = mean.gather(1, own)[:, 0], std.gather(1, own)[:, 0]
+    perfect = replace(terrain, truth=normal(mean, std))
+    exact = measure_latent(table, [perfect])
+    assert exact["latent_rmse"] == pytest.approx(0, abs=1e-6)
+    assert exact["noise_error"] == pytest.approx(0, abs=1e-6)
+    shifted = replace(terrain, truth=normal(mean + 0.1, std))
+    assert measure_latent(table, [shifted])["latent_rmse"] == pytest.approx(0.1, rel=1e-4)
+    # In pieces as in one.
+    pieces = [shifted.select(torch.tensor(which)) for which in ([0], [1, 2, 3])]
+    assert measure_latent(table, pieces) == pytest.approx(measure_latent(table, [shifted]))
+    louder = replace(terrain, truth=normal(mean, std / 1.25))
+    pieces = [perfect.select(torch.tensor([0])), louder.select(torch.tensor([1]))]
+    assert measure_latent(table, pieces)["noise_error"] == pytest.approx(0.25, rel=1e-5)
+
+
+def test_a_second_mode_counts_in_the_nll_of_the_processes_and_not_in_their_error() -> None:
+    terrain, table = make_terrain(batch=2), linear_table()
+    soft = SoftModes(weight=torch.full((3,), 0.4), mean=torch.full((3,), 0.1), std=torch.full((3,), 0.3))
+    plain, both = (measure_latent(one, [terrain]) for one in (table, replace(table, soft=soft)))
+    assert both["latent_rmse"] == plain["latent_rmse"]
+    own = replace(table, soft=soft).own(terrain.class_id, terrain.slope_deg)
+    wanted = -float(own.log_prob(terrain.traversability).mean())
+    assert both["nll"] == pytest.approx(wanted, rel=1e-5)
+    assert both["nll"] != pytest.approx(plain["nll"], rel=1e-2)
+
+
+def test_the_classes_are_measured_whole_where_they_have_two_modes() -> None:
+    terrain = make_terrain(batch=2)
+    soft = SoftModes(
+        weight=torch.tensor([0.6, 0.0, 0.0]), mean=torch.full((3,), 0.1), std=torch.full((3,), 0.3)
+    )
+    names = ("a", "b", "c")
+    plain, both = (
+        measure(FusedModel([torch.nn.Identity()], table, names), [terrain], generator(1))
+        for table in (linear_table(), replace(linear_table(), soft=soft))
+    )
+    assert both.classes[0].confusion == plain.classes[0].confusion
+    assert both.classes[0].brier == pytest.approx(plain.classes[0].brier)
+    assert both.classes[0].entropy == pytest.approx(plain.classes[0].entropy)
+    assert both.traversability.nll != plain.traversability.nll
+
+
+def test_splits_are_measured_one_at_a_time(dataset: TerrainDataset) -> None:
+    found = dict(evaluate(Oracle(), dataset))
+    assert list(found) == ["test/std", "test/hs"]
+    assert found["test/std"].maps == 2
+    assert list(dict(evaluate(Oracle(), dataset, ["valid"]))) == ["valid"]
+    assert dict(evaluate(Oracle(), dataset)) == found
+
+
+def test_a_split_that_is_not_there_is_refused(dataset: TerrainDataset) -> None:
+    with pytest.raises(DatasetError, match="test/hg"):
+        dict(evaluate(Oracle(), dataset, ["test/hg"]))
+
+
+def test_a_model_of_other_classes_is_refused(dataset: TerrainDataset) -> None:
+    model = ColourModel()
+    model.class_names = ("a", "b", "c")
+    with pytest.raises(CheckpointError, match="class table"):
+        choose_splits(model, dataset)
+
+
+def test_a_split_named_twice_is_measured_once(dataset: TerrainDataset) -> None:
+    assert choose_splits(Oracle(), dataset, ["valid", "test/std", "valid"]) == ["valid", "test/std"]
+
+
+def test_cells_that_were_not_observed_are_left_out() -> None:
+    terrain = make_terrain(batch=2)
+    gone = torch.zeros(2, 16, 16, dtype=torch.bool)
+    gone[:, :, :5] = True
+    holed = replace(terrain, traversability=terrain.traversability.masked_fill(gone, torch.nan))
+    rest = replace(
+        terrain,
+        **{  # the same cells, cut to a map of their own
+            name: getattr(terrain, name)[..., 5:]
+            for name in (
+                "rgb", "class_id", "elevation_m", "slope_deg", "traversability",
+            )
+        },
+        truth=normal(terrain.truth.means[:, 0, :, 5:], terrain.truth.stds[:, 0, :, 5:]),
+        grid=Grid(16, 11, 0.5),
+    )  # fmt: skip
+    model = FusedModel([torch.nn.Identity()], linear_table(), ("a", "b", "c"))
+    found, wanted = (measure(model, [one], generator(1)).traversability for one in (holed, rest))
+    for name in ("rmse_observed", "rmse_expected", "nll", "crps"):
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-6), name
+    assert sum(found.pit) == 2 * 16 * 11
+    latent = [measure_latent(linear_table(), [one])["nll"] for one in (holed, rest)]
+    assert latent[0] == pytest.approx(latent[1], rel=1e-6)
+    with pytest.raises(DatasetError, match="observed"):
+        measure(
+            model,
+            [replace(holed, traversability=torch.full_like(holed.traversability, torch.nan))],
+            generator(1),
+        )

@@ -1,0 +1,174 @@
+import csv
+import io
+import json
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.predictor import Oracle
+from benchnav.models.quality.command import _figures
+from benchnav.models.quality.measure import Quality, evaluate
+from benchnav.models.quality.report import (
+    HEADINGS,
+    TWINS,
+    find_ladders,
+    numbers,
+    quality_csv,
+    quality_json,
+    quality_markdown,
+    quality_table,
+)
+from benchnav.models.quality.words import COLUMNS, caption
+from tests.models.stub import ColourModel
+
+Qualities = dict[str, Quality]
+
+
+@pytest.fixture(scope="module")
+def qualities(dataset: TerrainDataset) -> Qualities:
+    measured = dict(evaluate(ColourModel(), dataset))
+    return {
+        "test/std": measured["test/std"],
+        "test/hs-050": measured["test/hs"],
+        "valid": measured["test/hs"],
+    }
+
+
+@pytest.mark.parametrize(
+    ("splits", "expected"),
+    [
+        (["test/std", "test/hg", "test/hs"], {}),
+        (["test/hs-100"], {}),
+        (["test/hs-100", "test/std"], {"test/hs": [(0.0, "test/std"), (1.0, "test/hs-100")]}),
+        (["valid/std", "test/hs-100", "test/hs-025"],
+         {"test/hs": [(0.25, "test/hs-025"), (1.0, "test/hs-100")]}),
+        (["std", "dusk@0.5", "dusk@1.5", "hg-1000", "hg-10", "-050"],
+         {"dusk": [(0.0, "std"), (0.5, "dusk@0.5"), (1.5, "dusk@1.5")]}),
+        (["test/std", "test/hs-000", "test/hs-150"],
+         {"test/hs": [(0.0, "test/hs-000"), (1.5, "test/hs-150")]}),
+        (["test/std", "test/hg-050", "test/hs-050"],
+         {"test/hg": [(0.0, "test/std"), (0.5, "test/hg-050")],
+          "test/hs": [(0.0, "test/std"), (0.5, "test/hs-050")]}),
+    ],
+)  # fmt: skip
+def test_ladders_are_read_from_the_names_of_splits(
+    splits: list[str], expected: dict[str, list[tuple[float, str]]]
+) -> None:
+    assert find_ladders(splits) == expected
+
+
+def test_the_table_has_a_row_a_split_and_fits(qualities: Qualities) -> None:
+    wide = {"test/a-long-name@0.25": qualities["valid"], **qualities}
+    console = Console(width=124, file=io.StringIO())
+    console.print(quality_table("title", wide))
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert len(lines) == 3 + len(wide)
+    for split, line in zip(wide, lines[3:], strict=True):
+        assert line.split()[0] == split
+        assert f"{wide[split].classes[0].mutual_information_auroc:.4f}" in line
+        assert f"{wide[split].traversability.tail_rate:.4f}" in line
+    assert not any("…" in line for line in lines)
+
+
+def test_a_name_too_long_is_folded_rather_than_a_number(qualities: Qualities) -> None:
+    console = Console(width=124, file=io.StringIO())
+    console.print(quality_table("title", {"test/" + "long" * 20: qualities["valid"]}))
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, printed.splitlines())) <= 124
+    for value in numbers(qualities["valid"]).values():
+        assert f"{value:.4f}" in printed or value in (
+            qualities["valid"].classes[0].entropy,
+            qualities["valid"].classes[0].mutual_information,
+        )
+
+
+def test_what_there_is_not_is_left_out_or_dashed(qualities: Qualities, dataset: TerrainDataset) -> None:
+    oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
+    page = quality_markdown("title", oracle, [], [])
+    assert "mIoU" not in page
+    assert f"{oracle['valid'].traversability.crps:.4f}" in page
+    nameless = replace(qualities["valid"].classes[0], entropy_auroc=float("nan"))
+    mixed = {**qualities, "valid": replace(qualities["valid"], classes=(nameless,))}
+    (row,) = [line for line in quality_markdown("title", mixed, [], []).splitlines() if "| valid |" in line]
+    assert "–" in row
+
+
+def test_json_holds_everything_and_nothing_that_is_no_json(qualities: Qualities) -> None:
+    single = replace(qualities["valid"].classes[0], mutual_information=float("nan"))
+    whole = {**qualities, "valid": replace(qualities["valid"], classes=(single,))}
+
+    def refuse(text: str) -> None:
+        raise AssertionError(text)
+
+    found = json.loads(quality_json({"model": "m"}, whole), parse_constant=refuse)
+    assert found["model"] == "m"
+    assert found["splits"]["valid"]["mutual_information"] is None
+    assert found["ladders"] == {
+        "test/hs": [{"severity": 0.0, "split": "test/std"}, {"severity": 0.5, "split": "test/hs-050"}]
+    }
+    split, quality = found["splits"]["test/std"], qualities["test/std"]
+    assert split["maps"] == quality.maps
+    assert split["accuracy"] == quality.classes[0].accuracy
+    assert tuple(split["pit"]) == quality.traversability.pit
+    assert sum(map(sum, split["confusion"])) == sum(split["reliability"]["cells"]) == sum(split["pit"])
+    assert set(HEADINGS) - set(TWINS) <= set(split)
+
+
+def test_csv_has_scenario_severity_and_every_number(qualities: Qualities) -> None:
+    rows = list(csv.DictReader(io.StringIO(quality_csv(qualities))))
+    assert [(row["split"], row["scenario"], row["severity"]) for row in rows] == [
+        ("test/std", "", "0"), ("test/hs-050", "test/hs", "0.5"), ("valid", "", "")
+    ]  # fmt: skip
+    for row in rows:
+        quality = qualities[row["split"]]
+        assert row["maps"] == str(quality.maps)
+        found = {name: float(row[name]) for name in HEADINGS if name not in TWINS}
+        assert found == pytest.approx(numbers(quality), rel=1e-5)
+
+
+def test_csv_leaves_a_number_that_there_is_not_empty(qualities: Qualities) -> None:
+    single = replace(qualities["valid"].classes[0], mutual_information=float("nan"))
+    text = quality_csv({"valid": replace(qualities["valid"], classes=(single,))})
+    (row,) = csv.DictReader(io.StringIO(text))
+    assert row["mutual_information"] == ""
+
+
+def test_the_page_shows_table_notes_and_figures(qualities: Qualities) -> None:
+    figures = ["figures/pit.png", "figures/maps-test-hs-050.png"]
+    lines = quality_markdown("title", qualities, ["a note"], figures).splitlines()
+    assert lines[0] == "# title"
+    header, rule, *rows = [line for line in lines if line.startswith("|")]
+    assert len({line.count("|") for line in (header, rule, *rows)}) == 1
+    assert len(rows) == len(qualities)
+    images = ["![Whether the predicted distribution of λ can be trusted](figures/pit.png)"]
+    images.append("![Maps of test/hs-050](figures/maps-test-hs-050.png)")
+    assert {"a note", *images} <= set(lines)
+    for image in images:
+        under = lines[lines.index(image) + 2]
+        assert under.startswith(f"**{image[2 : image.index(']')]}.** ")
+        assert under.endswith(".")
+
+
+def test_every_column_of_the_page_is_explained_and_no_other(
+    qualities: Qualities, dataset: TerrainDataset
+) -> None:
+    assert set(COLUMNS) == set(HEADINGS)
+    oracle = dict(evaluate(Oracle(), dataset, ["valid"]))
+    for measured in (qualities, oracle):
+        lines = quality_markdown("title", measured, [], []).splitlines()
+        headings = [cell.strip() for cell in lines[2].strip("|").split("|")]
+        explained = [line[4:].partition("**: ") for line in lines if line.startswith("- **")]
+        assert [heading for heading, _, _ in explained] == [h for h in headings if h != "maps"]
+        assert all(sentence.endswith(".") for _, _, sentence in explained)
+
+
+def test_every_figure_has_a_caption(dataset: TerrainDataset, qualities: Qualities) -> None:
+    named = [
+        name
+        for name, _ in _figures("m on d", ColourModel(), dataset, dict(evaluate(ColourModel(), dataset)), 1)
+    ]
+    assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(named)
+    captions = [caption(name, dataset.splits) for name in (*named, "ladder")]
+    assert len({title for title, _ in captions}) == len(captions)

@@ -1,0 +1,128 @@
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from benchnav.errors import DatasetError
+from benchnav.models.config import LatentGPConfig
+from benchnav.models.slope_gp.cells import cell_nll, hold_out
+from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.sums import SlopeSums
+from benchnav.models.training.train import fit_gps
+from tests.models.support import make_cells
+
+GOOD = "class,slope_deg,traversability,note\nsand,3.5,0.9,x\nrock,10,1,y\nsand,,0.5,\nsand,4,NaN,\nNA,0,0,\n"
+
+
+def write(folder: Path, text: str | bytes, name: str = "log.csv") -> Path:
+    path = folder / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def test_a_csv_gives_its_observed_rows(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD)
+    logs = read_slip_logs(path)
+    assert logs.class_names == ("NA", "rock", "sand")
+    assert not logs.by_id
+    assert logs.class_id.tolist() == [2, 1, 0]
+    assert logs.slope_deg.tolist() == [3.5, 10, 0]
+    np.testing.assert_allclose(logs.traversability, [0.9, 1, 0])
+    assert logs.digest == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("classes", [["b", "a", "b"], pd.Categorical(["b", "a", "b"]), [1, 0, 1]])
+def test_parquet_and_csv_give_the_same(tmp_path: Path, classes: list[str]) -> None:
+    rows = pd.DataFrame({"class": classes, "slope_deg": [1.0, 2.0, None], "traversability": [0, 1, 1]})
+    rows.to_csv(tmp_path / "log.csv", index=False)
+    rows.to_parquet(tmp_path / "log.parquet")
+    text, binary = (read_slip_logs(tmp_path / name) for name in ("log.csv", "log.parquet"))
+    assert text.class_names == binary.class_names
+    assert text.by_id == binary.by_id == isinstance(rows["class"][0], np.integer)
+    for name in ("class_id", "slope_deg", "traversability"):
+        assert torch.equal(getattr(text, name), getattr(binary, name))
+    assert text.class_id.tolist() == [1, 0]
+
+
+def test_rows_are_put_under_the_ids_of_a_class_table(tmp_path: Path) -> None:
+    logs = read_slip_logs(write(tmp_path, GOOD))
+    cells = logs.cells(("rock", "mud", "sand", "NA"))
+    assert cells.class_id.tolist() == [2, 0, 3]
+    assert cells.slope_deg.tolist() == [3.5, 10, 0]
+    with pytest.raises(DatasetError, match=r"among rock, sands, NA .* got 'sand'\. Did you mean 'sands'\?"):
+        logs.cells(("rock", "sands", "NA"))
+
+
+def test_integer_classes_are_indices_into_the_class_table(tmp_path: Path) -> None:
+    logs = read_slip_logs(
+        write(tmp_path, "class,slope_deg,traversability\n3,1,0.25\n0,2,0.5\n3,5,\n10,3,0.75\n")
+    )
+    assert logs.by_id
+    assert logs.class_names == tuple(str(i) for i in range(11))
+    cells = logs.cells(tuple("abcdefghijkl"))
+    assert cells.class_id.tolist() == [3, 0, 10]
+    assert cells.slope_deg.tolist() == [1, 2, 3]
+    assert logs.cells(logs.class_names).class_id.tolist() == [3, 0, 10]
+    with pytest.raises(DatasetError, match=r"in 0–9 .* got 10"):
+        logs.cells(tuple("abcdefghij"))
+
+
+HEADER = "class,slope_deg,traversability\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "cannot be read: No columns"),
+        (HEADER, "got none among 0"),
+        (HEADER + "a,1,\nb,,1\n", "got none among 2"),
+        ("class,slope,traversability\na,1,1\n", "got no slope_deg.*It has class, slope, traversability"),
+        ("a;b\n1;2\n", "got no class and no slope_deg and no traversability"),
+        (HEADER + "a,1,0.5\na,,0.5\na,steep,0.5\n", "`slope_deg`.*got steep in row 3"),
+        (HEADER + "a,1,0.5\na,1,high\n", "`traversability`.*got high in row 2"),
+        (HEADER + "a,1,0.5\na,91,0.5\n", r"within \[0, 90\].*got 91 in row 2"),
+        (HEADER + "a,1,-0.1\n", r"within \[0, 1\].*got -0.1 in row 1"),
+        (HEADER + "a,inf,0.1\n", "got inf in row 1"),
+        (HEADER + "a,1,0.1\n,1,0.1\n", "`class` in every row.*row 2"),
+        (HEADER + "256,1,0.1\n", "at most 256 classes.*got 257"),
+        (HEADER + "a,1,0.1\na,1,0.1,0.2,0.3\n", "cannot be read: .*line 3"),
+        (b"\x89\xff\x00\x01" * 50, "cannot be read"),
+    ],
+)
+def test_a_bad_csv_is_refused_in_one_line(tmp_path: Path, text: str | bytes, why: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(DatasetError, match=why) as caught:
+        read_slip_logs(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="not there"):
+        read_slip_logs(tmp_path / "none.csv")
+    with pytest.raises(DatasetError, match=r"ends in \.csv or \.parquet"):
+        read_slip_logs(write(tmp_path, GOOD, "log.txt"))
+    with pytest.raises(DatasetError, match="PARQUET table"):
+        read_slip_logs(write(tmp_path, GOOD, "log.parquet"))
+
+
+def test_gps_learn_from_logs_and_report_a_held_out_nll(tmp_path: Path) -> None:
+    made = make_cells(400)
+    rows = pd.DataFrame(
+        {
+            "class": np.repeat(["a", "b", "c"], 400),
+            "slope_deg": made.slope_deg,
+            "traversability": made.traversability,
+        }
+    )
+    rows.sample(frac=1, random_state=0).to_parquet(tmp_path / "log.parquet")
+    logs = read_slip_logs(tmp_path / "log.parquet")
+    kept, held = hold_out(logs.cells(logs.class_names), 0.25)
+    sums, fresh = SlopeSums.of(kept, 3), make_cells(40_000, 5)
+    table = fit_gps(LatentGPConfig(), sums).tabulate()
+    nll = cell_nll(fresh, table)
+    assert cell_nll(held, table) == pytest.approx(nll, abs=0.1)
+    assert nll < cell_nll(fresh, fit_gps(LatentGPConfig(epochs=1, epoch_steps=1), sums).tabulate())

@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import DatasetError
+from benchnav.models.training.data import MapData, MapSampler, apply_jitter, apply_symmetry
+from tests.models.support import make_dataset
+
+
+def test_the_eight_symmetries_of_the_square_are_distinct() -> None:
+    square = torch.arange(9).view(3, 3)
+    turned = {tuple(apply_symmetry(square, which).flatten().tolist()) for which in range(8)}
+    assert len(turned) == 8
+
+
+@pytest.mark.parametrize("which", [0, 1, 4, 5])
+def test_symmetries_of_a_rectangle_keep_its_shape(which: int) -> None:
+    assert apply_symmetry(torch.zeros(2, 3, 5), which).shape == (2, 3, 5)
+
+
+def test_image_and_classes_are_turned_together(dataset: TerrainDataset) -> None:
+    data = MapData(dataset, 4, seed=0)
+    maps = data.train
+    key = (torch.arange(8), torch.arange(8), torch.ones(8, 3))
+    batch = maps[key]
+    for place in range(8):
+        assert torch.equal(batch["rgb"][place], apply_symmetry(maps.fields["rgb"][place], place))
+        assert torch.equal(batch["class_id"][place], apply_symmetry(maps.fields["class_id"][place], place))
+
+
+def test_order_is_keyed_by_seed_and_epoch() -> None:
+    def draw(seed: int, epoch: int) -> tuple[list[float], ...]:
+        sampler = MapSampler(50, 50, seed, symmetries=tuple(range(8)), jitter=0.3, shuffle=True)
+        sampler.set_epoch(epoch)
+        ((index, which, factors),) = sampler
+        return index.tolist(), which.tolist(), factors.tolist()
+
+    assert draw(0, 3) == draw(0, 3)
+    for other in (draw(0, 4), draw(1, 3)):
+        assert all(a != b for a, b in zip(draw(0, 3), other, strict=True))
+    assert set(draw(0, 3)[1]) == set(range(8))
+
+
+def test_an_epoch_has_every_map_once_in_batches_of_nearly_one_size() -> None:
+    batches = [index for index, *_ in MapSampler(10, 4, shuffle=True)]
+    assert sorted(torch.cat(batches).tolist()) == list(range(10))
+    assert [len(batch) for batch in batches] == [4, 3, 3]
+
+
+def test_loaders_give_fixed_keys_and_leave_the_global_generator_alone(dataset: TerrainDataset) -> None:
+    data = MapData(dataset, 4, seed=0)
+    before = torch.random.get_rng_state()
+    batch = next(iter(data.train_dataloader()))
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert set(batch) == {"rgb", "class_id"}
+    assert batch["rgb"].dtype == torch.uint8
+    assert batch["class_id"].dtype == torch.uint8
+    valid = torch.cat([batch["class_id"] for batch in data.val_dataloader()])
+    assert torch.equal(valid, data.valid.fields["class_id"])
+
+
+def test_colour_statistics_are_those_of_the_training_maps(dataset: TerrainDataset) -> None:
+    mean, std = MapData(dataset, 4, seed=0).colour_statistics()
+    rgb = dataset.read("train", fields=["rgb"])["rgb"].astype(float)
+    np.testing.assert_allclose(mean, rgb.mean((0, 2, 3)), rtol=1e-5)
+    np.testing.assert_allclose(std, rgb.std((0, 2, 3)), rtol=1e-5)
+
+
+def test_a_split_that_is_not_there_is_named(tmp_path) -> None:
+    small = make_dataset(tmp_path / "d.h5", train=2)
+    with pytest.raises(DatasetError, match="'valid'"):
+        MapData(small, 4, seed=0)
+
+
+def test_jitter_is_torchvisions_a_map_at_a_time() -> None:
+    rgb = torch.randint(0, 256, (2, 3, 8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    assert torch.equal(apply_jitter(rgb, torch.ones(2, 3)), rgb)
+    changed = apply_jitter(rgb, torch.tensor([[0.5, 1, 1], [1, 1, 0]]))
+    torch.testing.assert_close(changed[0].float(), rgb[0].float() / 2, rtol=0, atol=1)
+    assert torch.equal(changed[1, 0], changed[1, 1])  # without saturation all channels are one grey
+
+
+def test_jitter_is_within_its_range_and_valid_maps_are_never_changed(dataset: TerrainDataset) -> None:
+    (drawn,) = (factors for *_, factors in MapSampler(100, 100, jitter=0.2))
+    assert drawn.min() >= 0.8
+    assert drawn.max() <= 1.2
+    assert drawn.std() > 0.1
+    plain, jittered = (MapData(dataset, 4, seed=0, jitter=jitter) for jitter in (0.0, 0.5))
+    assert torch.equal(*(next(iter(data.val_dataloader()))["rgb"] for data in (plain, jittered)))
+    first, second = (next(iter(data.train_dataloader())) for data in (plain, jittered))
+    assert torch.equal(first["class_id"], second["class_id"])
+    assert not torch.equal(first["rgb"], second["rgb"])
+
+
+@settings(max_examples=30, deadline=None)
+@given(maps=st.integers(1, 40), batch_size=st.integers(1, 16), processes=st.integers(1, 4))
+def test_processes_share_every_batch(maps: int, batch_size: int, processes: int) -> None:
+    whole = [index for index, *_ in MapSampler(maps, batch_size, 3, shuffle=True)]
+    parts = [
+        [index for index, *_ in MapSampler(maps, batch_size, 3, shuffle=True, share=(place, processes))]
+        for place in range(processes)
+    ]
+    for place, batch in enumerate(whole):
+        shared = [part[place] for part in parts]
+        assert all(len(one) for one in shared)
+        assert set(torch.cat(shared).tolist()) == set(batch.tolist())
+        if len(batch) >= processes:
+            assert len(torch.cat(shared)) == len(batch)

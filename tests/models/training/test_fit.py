@@ -1,0 +1,213 @@
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from lightning.pytorch.callbacks import Callback
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.files import sole_writer
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.config import ClassifierConfig
+from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.training import train as training
+from benchnav.models.training.data import MapData
+from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.train import fit_classifier
+
+CPU = {"precision": "32-true", "accelerator": "cpu"}
+SMALL = ClassifierConfig(encoder="mobilenet_v2", max_epochs=4, batch_size=4, jitter=0.2)
+
+
+class Killed(Exception):
+    pass
+
+
+class KillIn(KeepBest):
+    """Ends training in the middle of an epoch, as a kill would."""
+
+    epoch = 2
+
+    def on_train_batch_end(self, trainer, *_: object) -> None:  # type: ignore[no-untyped-def, override]
+        if (trainer.current_epoch, trainer.global_step % 3) == (self.epoch, 1):
+            raise Killed
+
+
+def train(
+    dataset: TerrainDataset, folder: Path, resume: bool = False, **trainer: object
+) -> TerrainClassifier:
+    options = FitOptions(folder=folder, resume=resume, trainer={**CPU, **trainer})
+    return fit_classifier(SMALL, dataset, 1, options)[0]
+
+
+@pytest.fixture(scope="module")
+def whole(
+    dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, TerrainClassifier]:
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, train(dataset, folder)
+
+
+@pytest.fixture
+def cut(dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a training that was killed in its third epoch."""
+    monkeypatch.setattr(training, "KeepBest", KillIn)
+    with pytest.raises(Killed):
+        train(dataset, tmp_path)
+    monkeypatch.undo()
+    return tmp_path
+
+
+def test_a_resumed_training_ends_with_the_weights_and_the_history_of_an_unbroken_one(
+    dataset: TerrainDataset, whole: tuple[Path, TerrainClassifier], cut: Path
+) -> None:
+    assert list(pd.read_csv(cut / "classifier/metrics.csv")["epoch"]) == [1, 2]
+    again = train(dataset, cut, resume=True)
+    for name, value in whole[1].state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name
+    assert again.temperature == whole[1].temperature
+    first, second = (folder / "classifier/metrics.csv" for folder in (whole[0], cut))
+    assert first.read_text() == second.read_text()
+
+
+def test_logs_have_a_row_an_epoch_and_events_for_tensorboard(whole: tuple[Path, TerrainClassifier]) -> None:
+    folder = whole[0] / "classifier"
+    table = pd.read_csv(folder / "metrics.csv")
+    assert list(table["epoch"]) == [1, 2, 3, 4]
+    assert {"train_loss", "valid_loss", "valid_accuracy", "valid_miou", "learning_rate"} <= set(table)
+    assert table.notna().all(axis=None)
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    logged = [event.value for event in events.Scalars("valid_loss")]
+    torch.testing.assert_close(torch.tensor(logged), torch.tensor(table["valid_loss"].to_numpy()).float())
+
+
+@pytest.mark.parametrize("other", [{"max_epochs": 5}, {"jitter": 0.0}, "seed", "precision"])
+def test_a_training_of_other_settings_is_not_gone_on_with(
+    dataset: TerrainDataset, cut: Path, other: object
+) -> None:
+    config = replace(SMALL, **other) if isinstance(other, dict) else SMALL
+    trainer = {**CPU, "precision": "bf16-mixed"} if other == "precision" else CPU
+    options = FitOptions(folder=cut, resume=True, trainer=trainer)
+    with pytest.raises(CheckpointError, match="to resume it"):
+        fit_classifier(config, dataset, 2 if other == "seed" else 1, options)
+
+
+def test_a_damaged_state_is_refused(dataset: TerrainDataset, cut: Path) -> None:
+    state = cut / "classifier/last.ckpt"
+    content = state.read_bytes()
+    for damaged in (content[:100_000], b"garbage", b""):
+        state.write_bytes(damaged)
+        with pytest.raises(CheckpointError, match="is damaged"):
+            train(dataset, cut, resume=True)
+
+
+def test_one_process_at_a_time_trains_in_a_folder(dataset: TerrainDataset, tmp_path: Path) -> None:
+    (tmp_path / "classifier").mkdir()
+    with sole_writer(tmp_path / "classifier", "it"), pytest.raises(BenchnavError, match="Another run"):
+        train(dataset, tmp_path)
+
+
+def test_a_new_training_drops_what_an_old_one_left(dataset: TerrainDataset, cut: Path) -> None:
+    (cut / "classifier/.last.ckpt.1.partial").write_text("half")
+    before = {path.name for path in (cut / "classifier").glob("events*")}
+    fit_classifier(replace(SMALL, max_epochs=1), dataset, 1, FitOptions(folder=cut, trainer=CPU))
+    assert list(pd.read_csv(cut / "classifier/metrics.csv")["epoch"]) == [1]
+    assert not before & {path.name for path in (cut / "classifier").glob("events*")}
+    assert not list((cut / "classifier").glob(".*partial"))
+
+
+def test_nothing_to_resume_begins_anew(dataset: TerrainDataset, tmp_path: Path) -> None:
+    options = FitOptions(folder=tmp_path, resume=True, trainer=CPU)
+    fit_classifier(replace(SMALL, max_epochs=1), dataset, 1, options)
+    assert list(pd.read_csv(tmp_path / "classifier/metrics.csv")["epoch"]) == [1]
+
+
+@pytest.mark.parametrize("name", ["callbacks", "logger", "device"])
+def test_settings_that_the_trainer_does_not_take_are_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=f"got '{name}'"):
+        FitOptions(trainer={name: 1})
+
+
+def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
+    seen: list[tuple[int, int]] = []
+
+    class Watch(Callback):
+        def on_train_end(self, trainer, module) -> None:  # type: ignore[no-untyped-def]
+            seen.append((trainer.num_training_batches, trainer.accumulate_grad_batches))
+
+    options = FitOptions(trainer={**CPU, "limit_train_batches": 1, "accumulate_grad_batches": 2})
+    data = MapData(dataset, 4, 0)
+    model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+    fit(model, "x", options, {}, [KeepBest(), Watch()], {"datamodule": data}, max_epochs=1)
+    assert seen == [(1, 2)]
+    with pytest.raises(ConfigError, match="Lightning takes"):
+        fit(model, "x", FitOptions(trainer={"precision": "8-tiny"}), {}, [], {})
+
+
+def test_bfloat16_is_chosen_where_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for known, precision in ((True, "bf16-mixed"), (False, "32-true")):
+        monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation, k=known: k)
+        assert default_precision() == precision
+
+
+def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
+    dataset: TerrainDataset, whole: tuple[Path, TerrainClassifier], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
+    command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--seed", "1"]
+    command += ["--trainer.precision", "32-true", "--trainer.accelerator", "cpu", "--half-precision", "false"]
+    settings = json.loads(json.dumps(vars(SMALL)))
+    command += [f"--classifier.{name}={value}" for name, value in settings.items()]
+    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    assert process.stderr
+    while "epoch 3/4" not in (line := process.stderr.readline()):
+        assert line, "it ended before it could be killed"
+    process.kill()
+    process.wait()
+    assert not (tmp_path / "m").exists()
+    refused = subprocess.run(command, capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert "--resume" in refused.stderr
+    subprocess.run([*command, "--resume"], capture_output=True, env=environment, check=True)
+    there = load_checkpoint(tmp_path / "m").part("classifier")
+    for name, value in whole[1].state_dict().items():
+        assert torch.equal(value, there.tensors[name]), name
+    assert there.config["temperature"] == whole[1].temperature
+    assert not (tmp_path / "m.training/classifier/last.ckpt").exists()
+
+
+def test_two_processes_train_one_classifier(dataset: TerrainDataset, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
+    command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--trainer.strategy", "ddp_fork"]
+    command += ["--trainer.accelerator", "cpu", "--trainer.devices", "2", "--trainer.max_epochs", "2"]
+    command += ["--trainer.precision", "32-true", "--classifier.encoder", "mobilenet_v2"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert [line for line in done.stderr.splitlines() if line.startswith("classifier: epoch 2/2")]
+    assert done.stdout.count("wrote") == 1
+    (row,) = (
+        row
+        for row in pd.read_csv(tmp_path / "m.training/classifier/metrics.csv").itertuples()
+        if row.epoch == 2
+    )
+    metrics = load_checkpoint(tmp_path / "m").part("classifier").metrics
+    assert metrics["epoch"] in (1, 2)
+    assert row.valid_accuracy > 0.05
+
+
+def test_no_more_processes_than_processors_are_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    FitOptions(trainer={"devices": os.cpu_count()})
+    for devices in (0, (os.cpu_count() or 1) + 1):
+        with pytest.raises(ConfigError, match=r"trainer\.devices"):
+            FitOptions(trainer={"devices": devices})

@@ -1,0 +1,120 @@
+import pytest
+import torch
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.probabilities import sharpen
+from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
+from benchnav.models.training.data import MapData, MapDataset
+from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
+
+
+def draw(cells: int, temperature: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Logits whose classes were drawn after dividing them by a temperature."""
+    generator = torch.Generator().manual_seed(0)
+    logits = 4 * torch.randn(cells, 5, generator=generator)
+    drawn = (logits / temperature).softmax(1).multinomial(1, generator=generator)
+    return logits, drawn.squeeze(1)
+
+
+@pytest.mark.parametrize("temperature", [0.4, 1.0, 2.5])
+def test_the_temperature_that_the_classes_were_drawn_with_is_found(temperature: float) -> None:
+    found = fit_temperature(*draw(50_000, temperature))
+    assert found == pytest.approx(temperature, rel=0.02)
+
+
+def test_no_other_temperature_is_more_likely() -> None:
+    logits, class_id = draw(2_000, 1.7)
+    found = fit_temperature(logits, class_id)
+
+    def loss(temperature: float) -> float:
+        return float(torch.nn.functional.cross_entropy(logits.double() / temperature, class_id))
+
+    assert loss(found) < min(loss(found * factor) for factor in (0.9, 0.99, 1.01, 1.1))
+
+
+def test_classes_all_right_or_all_wrong_give_a_finite_temperature() -> None:
+    logits, _ = draw(100, 1.0)
+    assert 0.05 <= fit_temperature(logits, logits.argmax(1)) < 0.1
+    assert 15 < fit_temperature(logits, logits.argmin(1)) <= 20.1
+
+
+def test_sampled_logits_stay_beside_their_class(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = MapData(dataset, 4, 0).valid
+
+    class Colour(torch.nn.Module):
+        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+            return rgb.float()
+
+    monkeypatch.setattr("benchnav.models.training.temperature._MOST_CELLS", 200)
+    logits, class_id = sample_logits(Colour(), maps)
+    assert logits.shape == (200, 3)
+    pairs = torch.cat([maps.fields["rgb"], maps.fields["class_id"][:, None]], dim=1).flatten(2)
+    for which in range(4):
+        there = {tuple(cell) for cell in pairs[which].T.tolist()}
+        part = slice(50 * which, 50 * (which + 1))
+        drawn = torch.cat([logits[part].long(), class_id[part, None]], dim=1)
+        assert {tuple(cell) for cell in drawn.tolist()} <= there
+    again, _ = sample_logits(Colour(), maps)
+    other, _ = sample_logits(Colour(), maps, seed=1)
+    assert torch.equal(logits, again)
+    assert not torch.equal(logits, other)
+
+
+CLASSES, STRENGTH = 3, 2.5
+
+
+class Witness(torch.nn.Module):
+    """A classifier whose evidence is one channel of the image in three, its own errors in it."""
+
+    def __init__(self, channel: int, boldness: float, temperature: float = 1.0) -> None:
+        super().__init__()
+        self.channel, self.boldness, self.temperature = channel, boldness, temperature
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        # A channel holds the evidence for each of three classes in a third of the byte's levels each.
+        level = rgb[:, self.channel].long()
+        evidence = torch.stack([level % 6, level // 6 % 6, level // 36 % 6], 1).float() - 2.5
+        return self.boldness * evidence / self.temperature
+
+
+def witnessed(maps: int, seed: int) -> MapDataset:
+    """Maps of single cells' classes; each channel has noisy evidence of its own, in six steps a class."""
+    generator = torch.Generator().manual_seed(seed)
+    class_id = torch.randint(0, CLASSES, (maps, 16, 16), generator=generator)
+    shown = torch.nn.functional.one_hot(class_id, CLASSES).movedim(-1, 1).unsqueeze(1).float()
+    noise = torch.randn(maps, 3, CLASSES, 16, 16, generator=generator)
+    steps = (2 + STRENGTH * (shown - 0.2) + noise).round().clamp(0, 5).long()
+    rgb = steps[:, :, 0] + 6 * steps[:, :, 1] + 36 * steps[:, :, 2]
+    return MapDataset({"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)})
+
+
+def ece(probabilities: torch.Tensor, class_id: torch.Tensor) -> float:
+    curve = ReliabilityCurve()
+    curve.update(probabilities, class_id.long())
+    return calibration_error(curve.compute())
+
+
+def test_a_pool_that_is_calibrated_as_a_whole_is_right_as_often_as_it_says() -> None:
+    maps, fresh = witnessed(100, 0), witnessed(100, 1)
+    members = []
+    for channel, boldness in enumerate((0.5, 2.0, 6.0)):  # each miscalibrated in its own way
+        own = Witness(channel, boldness)
+        members.append(Witness(channel, boldness, fit_temperature(*sample_logits(own, maps))))
+    rgb, class_id = fresh.fields["rgb"], fresh.fields["class_id"]
+    alone = [member(rgb).softmax(1) for member in members]
+    assert max(ece(one, class_id) for one in alone) < 0.03
+    average = torch.stack(alone).mean(0)
+    temperature = fit_pool_temperature(members, maps)
+    assert temperature < 0.7
+    before, after = ece(average, class_id), ece(sharpen(average, temperature), class_id)
+    assert before > 0.1
+    assert after < 0.15 * before
+
+
+def test_of_one_classifier_the_pool_temperature_is_what_its_own_leaves_over() -> None:
+    maps = witnessed(50, 2)
+    own = fit_temperature(*sample_logits(Witness(0, 3.0), maps))
+    assert fit_pool_temperature([Witness(0, 3.0)], maps) == pytest.approx(own, rel=1e-3)
+    assert fit_pool_temperature([Witness(0, 3.0, own)], maps) == pytest.approx(1, rel=1e-3)

@@ -1,0 +1,134 @@
+from dataclasses import replace
+
+import networkx
+import numpy as np
+import pytest
+import torch
+
+from benchnav import gridgraph
+from benchnav.planning.free_space import PRICE
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.robots import Unicycle
+from benchnav.terrain import Grid
+from tests import factories
+
+
+def random_problem(seed: int, robot: Unicycle | None = None) -> Problem:
+    generator = torch.Generator().manual_seed(seed)
+    maps = 0.15 + torch.rand(3, 16, 12, generator=generator)
+    elevation = 2 * torch.rand(3, 16, 12, generator=generator)
+    return factories.problem(maps.clamp(max=1), goal=(4.25, 6.75), elevation_m=elevation, robot=robot)
+
+
+def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Graph:
+    """Halves of an edge at their own cell's cost; prices on the flat length."""
+    free, height = problem.free[member].numpy(), problem.elevation_m[member].double().numpy()
+    pace = 1 / problem.risk_map[member].double().clamp(min=0.3).numpy() / problem.robot.top_speed_mps
+    graph = networkx.Graph()
+    rows, columns = problem.grid.shape
+    for i in range(rows):
+        for j in range(columns):
+            for k, m in ((i, j + 1), (i + 1, j), (i + 1, j + 1), (i + 1, j - 1)):
+                if 0 <= k < rows and 0 <= m < columns:
+                    half = 0.25 * np.hypot(i - k, j - m)
+                    cost = np.hypot(2 * half, height[i, j] - height[k, m])
+                    if by_time:
+                        cost = half * (pace[i, j] + pace[k, m])
+                    price = half * PRICE * (int(not free[i, j]) + int(not free[k, m]))
+                    graph.add_edge((i, j), (k, m), weight=cost + price)
+    return graph
+
+
+@pytest.mark.parametrize("by_time", [False, True])
+@pytest.mark.parametrize("seed", range(2))
+def test_costs_to_go_equal_networkx_on_every_cell(seed: int, by_time: bool) -> None:
+    problem = random_problem(seed, Unicycle(speed_mps=(0, 2)))
+    assert not problem.free.all()
+    field = astar.search(problem, by_time)
+    centres = [(i, j) for i in range(16) for j in range(12)]
+    goals = {(i, j) for i, j in centres if np.hypot(j / 2 + 0.25 - 4.25, i / 2 + 0.25 - 6.75) < 1}
+    for b in range(3):
+        graph = networkx_graph(problem, b, by_time)
+        expected = networkx.multi_source_dijkstra_path_length(graph, goals)
+        for cell in centres:
+            assert field.cost[b][cell].item() == pytest.approx(expected[cell], rel=1e-5)
+        # The path that is followed costs what is said.
+        cells = astar.path_cells(field, torch.full((3,), 3), 200)[b].tolist()
+        assert len(cells) > cells.index(cells[-1]) + 1
+        path = [divmod(cell, 12) for cell in cells[: cells.index(cells[-1]) + 1]]
+        assert path[-1] in goals
+        assert networkx.path_weight(graph, path, "weight") == pytest.approx(expected[0, 3], rel=1e-5)
+
+
+def test_time_cost_prefers_the_quick_way_round() -> None:
+    slow = torch.full((1, 16, 20), 1.0)
+    slow[0, 6:14, 5:11] = 0.31
+    problem = factories.problem(slow, start=(1.25, 4.0), goal=(6.75, 4.0))
+    crossing = {}
+    for by_time in (False, True):
+        field = astar.search(problem, by_time)
+        cells = astar.path_cells(field, torch.tensor([8 * 20 + 2]), 40)[0]
+        crossing[by_time] = bool((problem.traversability[0].flatten()[cells] < 0.5).any())
+    assert crossing == {False: True, True: False}
+
+
+def test_a_path_leaves_ground_that_is_not_free_by_the_shortest_way_and_enters_none() -> None:
+    open_map = torch.full((1, 16, 16), 0.9)
+    open_map[0, 6:10, 6:10] = 0.0
+    problem = factories.problem(open_map)
+    field = astar.search(problem)
+    cells = astar.path_cells(field, torch.tensor([8 * 16 + 8]), 40)[0]
+    free = problem.free[0].flatten()[cells]
+    first = int(free.int().argmax())
+    assert 1 <= first <= 2
+    assert free[first:].all()
+    outside = [c for i in range(16) for c in astar.path_cells(field, torch.tensor([i * 16]), 40)[0].tolist()]
+    assert problem.free[0].flatten()[outside].all()
+
+
+def test_a_wall_without_a_gap_is_crossed_where_it_is_thinnest() -> None:
+    walled = torch.full((2, 16, 16), 0.9)
+    walled[0, :, 7:10] = 0.1
+    walled[0, 13, 7:9] = 0.9
+    problem = factories.problem(walled)
+    field = astar.search(problem)
+    assert field.cost.isfinite().all()
+    assert gridgraph.NO_CELL not in field.following
+    cells = astar.path_cells(field, torch.tensor([2 * 16 + 2] * 2), 60)
+    blocked = [~problem.free[b].flatten()[cells[b]] for b in range(2)]
+    assert blocked[0].sum() == 1
+    # Half an edge before its centre and half an edge behind, straight or across a corner.
+    assert 0.5 * PRICE <= field.cost[0, 2, 2] <= 0.75 * PRICE
+    assert blocked[1].sum() == 0
+    assert field.cost[1, 2, 2] < 100
+
+
+def test_a_goal_in_a_ring_that_is_not_free_is_reached_through_its_disc() -> None:
+    closed = torch.full((1, 16, 16), 0.9)
+    closed[0, 10:, 10:] = 0.0
+    problem = factories.problem(closed)
+    assert problem.free[0, 13, 13]
+    cells = astar.path_cells(astar.search(problem), torch.tensor([2 * 16 + 2]), 60)[0]
+    assert (~problem.free[0].flatten()[cells]).sum() == 1
+
+
+def test_a_goal_at_a_corner_of_coarse_cells_is_reached() -> None:
+    made = factories.problem(torch.full((1, 8, 8), 0.9))
+    observation = replace(made.observation, grid=Grid(8, 8, 2.0))
+    start, goal = torch.tensor([[3.0, 3.0]]), torch.tensor([[12.0, 12.0]])
+    problem = pose_problem(made.task, observation, made.mixture, made.risk_map, start, goal, 100.0)
+    field = astar.search(problem)
+    assert field.following[0, 6 * 8 + 6] == 6 * 8 + 6
+    # Five diagonal steps of 2√2 m.
+    assert field.cost[0, 1, 1].item() == pytest.approx(10 * 2**0.5)
+
+
+def test_points_begin_at_the_robot_and_end_at_the_goal() -> None:
+    problem = factories.problem(torch.full((2, 16, 20), 0.9), start=(3.1, 3.4), goal=(8.1, 3.3))
+    points = astar.path_points(problem, astar.search(problem), problem.start, 20)
+    assert points.shape == (2, 20, 2)
+    expected = [(3.1, 3.4), (3.75, 3.25), (4.25, 3.25)]
+    torch.testing.assert_close(points[1, :3], torch.tensor(expected))
+    torch.testing.assert_close(points[1, -1], torch.tensor([8.1, 3.3]))
+    assert (points[0].diff(dim=0)[:, 0] >= 0).all()

@@ -1,0 +1,156 @@
+"""A* + DWA in closed loops, from places in which it once stood for ever."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
+from benchnav.planning.planners.astar.dwa import DWAConfig
+from benchnav.planning.planners.planner import check_steers
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
+from benchnav.planning.world.outcome import Outcome
+from tests import factories
+from tests.planning.planners.driving import Drive, drive, first, generator
+
+SUCCESS = Outcome.SUCCESS
+
+
+def longest_stand_s(driven: Drive) -> float:
+    """The longest time in which a robot moved under 5 cm, over the batch."""
+    longest = 0
+    for states, steps in zip(driven.states, driven.steps.tolist(), strict=True):
+        since = 0
+        for step in range(steps):
+            if (states[step, :2] - states[since, :2]).norm() > 0.05:
+                since = step
+            longest = max(longest, step - since)
+    return longest / 10
+
+
+@pytest.mark.parametrize(("robot", "by_time"), [(Unicycle(), False), (DifferentialDrive(), True)])
+def test_it_finds_the_gap_in_a_wall(robot: Unicycle, by_time: bool) -> None:
+    ground = torch.full((2, 24, 30), 0.85)
+    ground[:, 11:13, :] = 0.1
+    ground[:, 11:13, 20:24] = 0.85
+    problem = factories.problem(ground, start=(3.0, 2.5), goal=(6.0, 10.0), robot=robot)
+    driven = drive(AStarDWA(AStarDWAConfig(by_time=by_time)), problem)
+    assert driven.outcome.tolist() == [SUCCESS] * 2
+    assert problem.free_at(driven.states).float().mean() > 0.98
+
+
+def cornered() -> Problem:
+    """Four corners of ground that is not free, to be passed closely on either side and both axes."""
+    ground = torch.full((4, 20, 26), 0.8)
+    ground[0, 6:, 8:12] = 0.0
+    ground[1, :12, 8:12] = 0.0
+    ground[2, 4:14, 6:20] = 0.0
+    # A way that leads through corners alone.
+    ground[3, :, 12] = 0.0
+    ground[3, 8, 12], ground[3, 7:10, 11], ground[3, 8, 11] = 0.8, 0.0, 0.8
+    return factories.problem(ground, start=(2.0, 4.0), goal=(11.5, 4.2))
+
+
+@pytest.mark.parametrize("by_time", [False, True])
+def test_it_does_not_stand_beside_a_corner(by_time: bool) -> None:
+    driven = drive(AStarDWA(AStarDWAConfig(by_time=by_time)), cornered())
+    assert driven.outcome.tolist() == [SUCCESS] * 4
+    assert longest_stand_s(driven) < 5
+
+
+def test_it_sets_off_however_near_to_a_corner_it_stands() -> None:
+    # Beside it, at its tip, and in the cell before it; looking along each axis.
+    places = ((3.98, 3.6), (3.99, 2.99), (3.7, 2.6))
+    starts = torch.tensor([[*place, heading] for place in places for heading in (0.0, 1.5, 3.1, -2.0)])
+    ground = torch.full((len(starts), 16, 20), 0.8)
+    ground[:, 6:, 8:12] = 0.0
+    problem = replace(factories.problem(ground, goal=(8.5, 6.5)), start=starts)
+    driven = drive(AStarDWA(), problem)
+    assert driven.outcome.tolist() == [SUCCESS] * len(starts)
+    assert longest_stand_s(driven) < 8
+
+
+def test_it_leaves_ground_that_is_predicted_to_hold_it() -> None:
+    predicted = torch.full((2, 16, 20), 0.8)
+    predicted[:, 1:6, 1:6] = 0.0
+    truth = predicted.clone()
+    truth[:, 1:6, 1:6] = 0.4
+    problem = factories.problem(predicted, goal=(8.5, 6.5))
+    problem = replace(problem, start=torch.tensor([[1.7, 1.6, 0.8], [1.7, 1.6, -2.4]]))
+    driven = drive(AStarDWA(), problem, truth)
+    assert driven.outcome.tolist() == [SUCCESS] * 2
+    assert driven.steps.max() < 350
+
+
+def test_it_drives_across_where_no_way_is_free() -> None:
+    ground = torch.full((2, 16, 20), 0.85)
+    ground[0, 7:9] = 0.2
+    ground[1, 9:, 12:] = 0.2
+    problem = factories.problem(ground, goal=(8.5, 6.5))
+    driven = drive(AStarDWA(), problem)
+    assert driven.outcome.tolist() == [SUCCESS] * 2
+
+
+def test_a_robot_turned_away_turns_round() -> None:
+    problem = factories.problem(torch.full((3, 16, 20), 0.6), start=(4.0, 4.0), goal=(8.0, 4.0))
+    starts = torch.tensor([[4.0, 4.0, math.pi], [4.0, 4.0, 2.0], [4.0, 4.0, -2.0]])
+    driven = drive(AStarDWA(), replace(problem, start=starts))
+    assert driven.outcome.tolist() == [SUCCESS] * 3
+    assert driven.steps.max() < 200
+
+
+@pytest.mark.parametrize("rate", [-1.0, 1.0])
+def test_a_robot_that_spins_stops_it(rate: float) -> None:
+    problem = factories.problem(torch.full((1, 16, 20), 0.6), start=(4.0, 4.0), goal=(8.0, 4.0))
+    planner = AStarDWA()
+    state = planner.init(problem, generator())
+    spinning = torch.tensor([[0.0, rate]])
+    state = replace(state, local=planner.local.took(state.local, spinning))
+    robot_state, rates = problem.start, []
+    for _ in range(150):
+        step = replace(first(problem), state=robot_state)
+        action, state, _ = planner.plan(step, state)
+        robot_state = problem.robot(robot_state, action, problem.traversability_at(robot_state))
+        rates.append(action[0, 1].item())
+        if (robot_state[0, :2] - problem.goal_m[0]).norm() < 1:
+            break
+    else:
+        pytest.fail("it did not arrive")
+    assert abs(rates[-1]) < 0.3
+
+
+def test_its_settings_are_its_own_and_those_of_dwa() -> None:
+    part = {"part": "astar_dwa", "options": {"by_time": True, "lookahead_m": 3, "dwa": {"horizon": 40}}}
+    made = registry.make("planner", part)
+    assert made.config == AStarDWAConfig(by_time=True, lookahead_m=3.0, dwa=DWAConfig(horizon=40))
+    assert made.local.config == DWAConfig(horizon=40)
+    assert made.follows == "travel time (A*), J (DWA)"
+    with pytest.raises(ConfigError, match="dwa"):
+        registry.make("planner", {"part": "astar_dwa", "options": {"dwa": {"horizons": 40}}})
+    with pytest.raises(ConfigError, match="horizon"):
+        registry.make("planner", {"part": "astar_dwa", "options": {"dwa": {"horizon": 0}}})
+
+
+def test_it_tells_of_accelerations_that_the_robot_does_not_have() -> None:
+    assert AStarDWA().remarks(factories.task(DifferentialDrive())) == ()
+    assert "0.5 m/s²" in AStarDWA().remarks(factories.task(Unicycle()))[0]
+
+
+def test_it_tells_where_no_risk_setting_moves_its_path() -> None:
+    by_mean, by_risk = (Rules(free_space=FreeSpace(by=by)) for by in ("mean", "risk"))
+    (remark,) = AStarDWA().remarks(factories.task(DifferentialDrive(), rules=by_mean))
+    assert "by_time" in remark
+    assert AStarDWA().remarks(factories.task(DifferentialDrive(), rules=by_risk)) == ()
+    quick = AStarDWA(AStarDWAConfig(by_time=True))
+    assert quick.remarks(factories.task(DifferentialDrive(), rules=by_mean)) == ()
+
+
+def test_it_refuses_a_robot_that_steers() -> None:
+    check_steers(AStarDWA(), DifferentialDrive(), "astar_dwa")
+    with pytest.raises(ConfigError, match="steering_rad"):
+        check_steers(AStarDWA(), Bicycle(), "astar_dwa")

@@ -1,0 +1,175 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from benchnav.errors import ConfigError
+from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, judge, velocity_window
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import DifferentialDrive, Unicycle
+from tests import factories
+from tests.planning.planners.driving import fake_cuda, first, generator, on_cuda, step_at
+
+CONFIG = DWAConfig()
+
+
+def chosen(
+    problem: Problem, state: torch.Tensor, velocity: torch.Tensor, target: torch.Tensor
+) -> torch.Tensor:
+    return DWA().plan_toward(step_at(state), DWAState(problem, velocity), target)[0]
+
+
+def test_the_window_is_what_the_accelerations_reach_within_the_bounds() -> None:
+    problem = factories.problem(torch.full((2, 16, 16), 0.8))
+    velocity = torch.tensor([[0.5, 0.0], [0.98, -1.0]])
+    window = velocity_window(problem, velocity, CONFIG)
+    assert window.shape == (2, 100, 2)
+    torch.testing.assert_close(window.amin(1), torch.tensor([[0.45, -0.05], [0.93, -1.0]]))
+    torch.testing.assert_close(window.amax(1), torch.tensor([[0.55, 0.05], [1.0, -0.95]]))
+    assert len(window[0].unique(dim=0)) == 100
+    other = DWAConfig(speeds=3, turn_rates=4, acceleration=2.0, turn_acceleration=1.0)
+    window = velocity_window(problem, velocity, other)
+    assert window.shape == (2, 12, 2)
+    torch.testing.assert_close(window.amin(1)[0], torch.tensor([0.3, -0.1]))
+
+
+def test_a_robot_with_limits_has_its_own_window_and_needs_no_remark() -> None:
+    robot = DifferentialDrive(acceleration_mps2=0.8, turn_acceleration_radps2=0.3)
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=robot)
+    window = velocity_window(problem, torch.tensor([[0.5, 0.0]]), CONFIG)
+    torch.testing.assert_close(window.amin(1), torch.tensor([[0.42, -0.03]]))
+    torch.testing.assert_close(window.amax(1), torch.tensor([[0.58, 0.03]]))
+    assert DWA().remarks(robot) == ()
+    (remark,) = DWA(DWAConfig(acceleration=0.7)).remarks(Unicycle())
+    assert "0.7 m/s²" in remark
+    assert "0.5 rad/s²" in remark
+
+
+def test_it_knows_the_velocity_that_a_robot_took() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8))
+    taken = torch.tensor([[1.0, -1.0]])
+    dwa = DWA()
+    state = dwa.init(problem, generator())
+    assert state.velocity.tolist() == [[0.0, 0.0]]
+    assert torch.equal(dwa.took(state, taken).velocity, taken)
+    # A robot with limits gets no farther than these.
+    limited = replace(problem, task=replace(problem.task, robot=DifferentialDrive()))
+    state = dwa.took(dwa.init(limited, generator()), taken)
+    torch.testing.assert_close(state.velocity, torch.tensor([[0.05, -0.1]]))
+
+
+def test_costs_equal_a_loop_over_pairs_and_steps() -> None:
+    maps = torch.rand(2, 16, 20, generator=generator())
+    maps[0] = maps[0].clamp(min=0.31)
+    problem = factories.problem(maps, start=(3.3, 2.2))
+    assert not problem.free[1, 4, 6:9].all()
+    target = torch.tensor([[3.6, 2.6], [7.0, 6.0]])
+    window = torch.tensor([[[0.9, 0.2], [0.1, -0.7]], [[0.0, 0.0], [1.0, 1.0]]])
+    config = DWAConfig(horizon=23, heading_weight=3.0, arrival_m=0.3)
+    cost, positions = judge(problem, problem.start, window, target, config)
+    assert len(positions) == 24
+    arrivals = 0
+    for b in range(2):
+        for m in range(2):
+            x, y, heading = problem.start[b].tolist()
+            gx, gy = target[b].tolist()
+            v, w = window[b, m].tolist()
+            expected, arrived = 0.0, False
+            for t in range(24):
+                row, column = int(y // 0.5), int(x // 0.5)
+                price = 0 if problem.free[b, row, column] else 1e4
+                if not arrived:
+                    expected += math.hypot(x - gx, y - gy) + price
+                if t == 23:
+                    break
+                lam = max(maps[b, row, column].item(), 0.3)
+                x, y = x + 0.1 * lam * v * math.cos(heading), y + 0.1 * lam * v * math.sin(heading)
+                heading += 0.1 * lam * w
+                arrived = arrived or math.hypot(x - gx, y - gy) <= 0.3
+                assert positions[t + 1][b, m].tolist() == pytest.approx([x, y], abs=1e-4)
+            if not arrived:
+                bearing = math.atan2(gy - 2.2, gx - 3.3)
+                expected += 3.0 * abs(bearing - heading)
+            arrivals += arrived
+            assert cost[b, m].item() == pytest.approx(expected, rel=1e-4)
+    assert arrivals == 1
+
+
+def test_it_speeds_up_toward_a_far_waypoint_and_turns_to_one_aside() -> None:
+    problem = factories.problem(torch.full((2, 16, 16), 0.8), start=(2.0, 2.0), goal=(6.0, 6.0))
+    waypoint = torch.tensor([[6.0, 6.0], [2.0, 6.0]])
+    velocity = chosen(problem, problem.start, torch.tensor([[0.5, 0.0]] * 2), waypoint)
+    assert velocity[0, 0] > 0.54
+    assert abs(velocity[0, 1]) < 0.01
+    assert velocity[1, 1] > 0.04
+
+
+def test_it_brakes_before_a_wall() -> None:
+    walled = torch.full((1, 16, 16), 0.9)
+    walled[:, :, 8:] = 0.1
+    problem = factories.problem(walled, start=(3.4, 4.0), goal=(7.0, 4.0))
+    velocity = chosen(problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m)
+    assert velocity[0, 0] < 0.26
+
+
+def test_it_drives_out_of_ground_predicted_to_hold_it() -> None:
+    problem = factories.problem(torch.zeros(1, 16, 16), start=(4.0, 4.0), goal=(7.0, 4.0))
+    velocity = chosen(problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m)
+    assert velocity[0, 0] > 0.34
+
+
+def test_a_robot_that_spins_stops_spinning() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(4.0, 7.0))
+    state, velocity = problem.start.clone(), torch.tensor([[0.0, -1.0]])
+    for _ in range(80):
+        velocity = chosen(problem, state, velocity, problem.goal_m)
+        state = problem.robot(state, velocity, problem.traversability_at(state))
+    assert abs(velocity[0, 1]) < 0.6
+    assert torch.linalg.vector_norm(state[0, :2] - problem.goal_m[0]) < 3.0
+
+
+def test_it_turns_on_the_spot_toward_a_waypoint_behind_on_either_side() -> None:
+    problem = factories.problem(torch.full((2, 16, 16), 0.8), start=(4.0, 4.0), goal=(4.0, 7.0))
+    state = torch.tensor([[4.0, 4.0, -0.3], [4.0, 4.0, 3.4]])
+    behind = torch.tensor([[1.0, 4.0], [7.0, 4.0]])
+    velocity = chosen(problem, state, torch.zeros(2, 2), behind)
+    # The shorter way round: from −0.3 to −π rightward, from 3.4 to 2π leftward.
+    assert velocity[0, 1] < -0.04
+    assert velocity[1, 1] > 0.04
+
+
+def test_a_near_waypoint_does_not_slow_the_robot() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.9), start=(2.0, 4.0), goal=(7.0, 4.0))
+    near = torch.tensor([[3.0, 4.0]])
+    velocity = chosen(problem, problem.start, torch.tensor([[0.6, 0.0]]), near)
+    assert velocity[0, 0] > 0.64
+
+
+def test_trajectories_are_stacked_only_to_be_drawn() -> None:
+    problem = factories.problem(torch.full((2, 16, 16), 0.9))
+    dwa = DWA()
+    state = dwa.init(problem, generator())
+    quiet, _, nothing = dwa.plan_toward(first(problem), state, problem.goal_m)
+    action, _, plan = dwa.plan_toward(first(problem, draw=True), state, problem.goal_m)
+    assert torch.equal(action, quiet)
+    assert nothing.samples.numel() == nothing.path.numel() == 0
+    assert plan.samples.shape == (2, 100, 11, 2)
+    assert plan.path.shape == (2, 51, 2)
+    expected = problem.robot(problem.start, action, problem.traversability_at(problem.start))
+    torch.testing.assert_close(plan.path[:, 1], expected[:, :2])
+
+
+def test_no_tensor_is_made_on_another_device() -> None:
+    with fake_cuda(factories.problem(torch.full((2, 16, 20), 0.9), robot=DifferentialDrive())) as problem:
+        dwa = DWA()
+        action, state, plan = dwa.plan_toward(
+            first(problem, draw=True), dwa.init(problem, generator()), problem.goal_m
+        )
+        assert on_cuda(action, dwa.took(state, action).velocity, plan.path, plan.samples, plan.status)
+
+
+@pytest.mark.parametrize("name", ["speeds", "turn_rates", "horizon", "acceleration", "turn_acceleration"])
+def test_an_empty_window_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=name):
+        DWAConfig(**{name: 0})

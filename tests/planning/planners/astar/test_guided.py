@@ -1,0 +1,154 @@
+"""The guide and the recovery, with local planners that do as little as can be."""
+
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.errors import ConfigError
+from benchnav.planning.planners.astar import astar
+from benchnav.planning.planners.astar.guided import GuideConfig, Guided
+from benchnav.planning.planners.astar.waypoint import choose_waypoint, ground_costs
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Bicycle
+from benchnav.planning.world.outcome import Outcome
+from tests import factories
+from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, step_at, with_start
+
+
+@dataclass
+class Constant:
+    """Commands the same whatever it is told; keeps what it was told."""
+
+    action: tuple[float, float]
+    targets: list[Tensor] = field(default_factory=list)
+    name: str = "constant"
+
+    def init(self, problem: Problem, generator: torch.Generator) -> tuple[Tensor, ...]:
+        return ()
+
+    def plan_toward(
+        self, step: Step, plan_state: tuple[Tensor, ...], target_m: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, ...], Plan]:
+        self.targets.append(target_m)
+        action = step.state.new_tensor(self.action).expand(len(step.state), 2)
+        return action, plan_state, Plan.empty(len(action), action.device)
+
+    def took(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
+        return (*plan_state, action)
+
+
+# --- With the recovery.
+
+
+def test_a_local_planner_that_does_nothing_arrives_by_recovery_alone() -> None:
+    walled = torch.full((2, 16, 24), 0.85)
+    walled[1, 7:9, :12] = 0.1
+    problem = factories.problem(walled, start=(2.0, 2.0), goal=(4.0, 6.5))
+    driven = drive(Guided(GuideConfig(), Constant((0.0, 0.0))), problem, time_budget_s=100)
+    assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
+    assert problem.free_at(driven.states).float().mean() > 0.98
+
+
+def recovered(problem: Problem, steps: int) -> list[list[float]]:
+    """The points to which a robot that is held is steered, one after another."""
+    planner = Guided(GuideConfig(), Constant((0.0, 0.0)))
+    plan_state, state, targets = planner.init(problem, generator()), problem.start, []
+    for _ in range(steps):
+        action, plan_state, _ = planner.plan(step_at(state), plan_state)
+        state = problem.robot(state, action, problem.traversability_at(state))
+        target = plan_state.recovery.target_m[0].tolist()
+        if plan_state.recovery.active and (not targets or targets[-1] != target):
+            targets.append(target)
+    return targets
+
+
+def test_a_recovery_leads_through_the_corner_that_two_cells_share() -> None:
+    ground = torch.full((1, 16, 20), 0.8)
+    ground[0, 4:9, 5] = 0.0
+    problem = with_start(factories.problem(ground, goal=(8.25, 1.75)), 2.45, 2.4, 0.0)
+    # From cell (4, 4) to (3, 5): a line to its centre would cut cell (4, 5).
+    assert astar.path_cells(astar.search(problem), torch.tensor([84]), 2).tolist() == [[84, 65]]
+    assert recovered(problem, 45) == [[2.5, 2.0], [2.75, 1.75]]
+    free = factories.problem(torch.full((1, 16, 20), 0.8), goal=(8.25, 1.75))
+    (first,) = astar.path_cells(astar.search(free), torch.tensor([84]), 2)[:, 1].tolist()
+    assert recovered(with_start(free, 2.45, 2.4, 0.0), 12) == [
+        [first % 20 / 2 + 0.25, first // 20 / 2 + 0.25]
+    ]
+
+
+def test_one_that_drives_is_left_alone_on_ground_that_holds_it() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.85))
+    driven = drive(Guided(GuideConfig(), Constant((0.9, 0.1))), problem, 0 * problem.risk_map, 5.0)
+    assert (driven.actions == torch.tensor([0.9, 0.1])).all()
+
+
+def test_the_local_planner_is_told_what_was_taken_instead() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.85))
+    planner = Guided(GuideConfig(), Constant((0.0, 0.2)))
+    state = planner.init(problem, generator())
+    actions = []
+    for _ in range(12):
+        action, state, _ = planner.plan(first(problem), state)
+        actions.append(action)
+    assert torch.equal(torch.stack(state.local), torch.stack(actions))
+    assert actions[9].tolist() == [[0.0, pytest.approx(0.2)]]
+    assert actions[10][0, 0] > 0.5
+
+
+# --- The guide.
+
+
+def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
+    slow = torch.full((2, 12, 24), 1.0)
+    slow[0, 3:9, 5:8] = 0.31
+    slow[1, :9, 6] = 0.1
+    problem = factories.problem(slow, start=(1.75, 3.25), goal=(10.25, 3.25))
+    given = []
+    for config in (GuideConfig(), GuideConfig(lookahead_m=2.0), GuideConfig(by_time=True)):
+        local = Constant((0.5, 0.0))
+        planner = Guided(config, local)
+        planner.plan(first(problem), planner.init(problem, generator()))
+        points = astar.path_points(problem, astar.search(problem, config.by_time), problem.start, 30)
+        expected, _ = choose_waypoint(ground_costs(problem, config.by_time), points, config.lookahead_m)
+        torch.testing.assert_close(local.targets[0], expected)
+        given.append(expected[0])
+    assert not any(torch.equal(given[0], other) for other in given[1:])
+
+
+def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
+    problem = factories.problem(torch.full((2, 16, 24), 0.9), start=(1.1, 6.6), goal=(10.3, 2.2))
+    planner = Guided(GuideConfig(lookahead_m=1.0), Constant((0.5, 0.0)))
+    state = planner.init(problem, generator())
+    action, _, plan = planner.plan(first(problem), state)
+    assert plan.reference.numel() == 0
+    again, _, plan = planner.plan(first(problem, draw=True), state)
+    assert torch.equal(action, again)
+    torch.testing.assert_close(plan.reference[:, 0], problem.start[:, :2])
+    torch.testing.assert_close(plan.reference[:, -1], problem.goal_m)
+
+
+def test_it_says_whose_objectives_it_follows() -> None:
+    assert Guided(GuideConfig(), Constant((0, 0))).follows == "path length (A*), J (constant)"
+    assert Guided(GuideConfig(by_time=True), Constant((0, 0))).follows == "travel time (A*), J (constant)"
+    with pytest.raises(ConfigError, match="lookahead_m"):
+        GuideConfig(lookahead_m=0)
+
+
+@pytest.mark.parametrize("by_time", [False, True])
+def test_no_tensor_is_made_on_another_device_but_by_the_search(
+    monkeypatch: pytest.MonkeyPatch, by_time: bool
+) -> None:
+    real = factories.problem(torch.full((2, 16, 24), 0.9), robot=Bicycle())
+    searched = astar.search(real)
+    with fake_cuda(real) as problem:
+        moved = astar.CostToGo(searched.cost.to("cuda"), searched.following.to("cuda"))
+        monkeypatch.setattr(astar, "search", lambda *_: moved)
+        planner = Guided(GuideConfig(by_time=by_time), Constant((0.5, 0.0)))
+        state = planner.init(problem, generator())
+        action, following, plan = planner.plan(first(problem, draw=True), state)
+        recovery = following.recovery
+        assert on_cuda(action, plan.reference, planner.local.targets[0])
+        assert on_cuda(recovery.place_m, recovery.steps, recovery.driven_m, recovery.active)

@@ -1,0 +1,318 @@
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.planning.objective import GoalDistance
+from benchnav.planning.planners.check.contract import check_planner
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.straight import Straight
+from benchnav.planning.problem import Problem
+from benchnav.planning.robots import DifferentialDrive, Unicycle
+
+FEW = {"samples": 128, "horizon": 20}
+SMALL = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 50}}
+
+
+@dataclass
+class Carried:
+    """A plan state that can be written into."""
+
+    problem: Problem
+    last: Tensor
+    noise: Tensor
+    count: int = 0
+
+
+class Good:
+    """Turns by what is predicted, by its noise and by what it did last; draws a line when asked to."""
+
+    steers = (("speed_mps", "turn_rate_radps"),)
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Any:
+        noise = torch.rand((), generator=generator)
+        return Carried(problem, torch.zeros(len(problem)), noise)
+
+    def plan(self, step: Step, plan_state: Any) -> Any:
+        speed = plan_state.problem.traversability_at(step.state).clamp(max=1)
+        turn = 0.5 * plan_state.last + 0.1 * plan_state.noise
+        following = replace(plan_state, last=turn, count=plan_state.count + 1)
+        path = step.state[:, None, :2].repeat(1, 3 if step.draw else 0, 1)
+        return torch.stack((speed, turn), dim=1), following, Plan.empty(len(turn), path=path)
+
+
+def acting(act: Callable[[Step, Any], object]) -> Good:
+    """Good, but for what it does before it plans."""
+
+    class Bad(Good):
+        def plan(self, step: Step, plan_state: Any) -> Any:
+            act(step, plan_state)
+            return super().plan(step, plan_state)
+
+    return Bad()
+
+
+def answering(change: Callable[[Tensor, Any, Plan, Step], Any]) -> Good:
+    """Good, but for what it answers."""
+
+    class Bad(Good):
+        def plan(self, step: Step, plan_state: Any) -> Any:
+            return change(*super().plan(step, plan_state), step)
+
+    return Bad()
+
+
+def action_of(change: Callable[[Tensor, Step], Tensor]) -> Good:
+    return answering(lambda action, following, plan, step: (change(action, step), following, plan))
+
+
+def plan_of(change: Callable[[Plan], Any]) -> Good:
+    return answering(lambda action, following, plan, step: (action, following, change(plan)))
+
+
+def preparing(act: Callable[[Problem, torch.Generator], object]) -> Good:
+    class Bad(Good):
+        def init(self, problem: Problem, generator: torch.Generator) -> Any:
+            act(problem, generator)
+            return super().init(problem, generator)
+
+    return Bad()
+
+
+def having(**attributes: Any) -> Good:
+    return type("Bad", (Good,), attributes)()
+
+
+def count_up(plan_state: Any) -> None:
+    plan_state.count += 1
+
+
+def poke(action: Tensor, step: Step) -> Tensor:
+    action = action.clone()
+    action[-1, 1] = torch.nan
+    return action
+
+
+def leave_the_map(step: Step, plan_state: Any) -> None:
+    if (step.state[:, :2] < 0).any():
+        raise IndexError("off the map")
+
+
+class OnSelf(Good):
+    """Remembers its last turn itself."""
+
+    last = 0.0
+
+    def plan(self, step: Step, plan_state: Any) -> Any:
+        action, following, plan = super().plan(step, plan_state)
+        self.last = 0.5 * self.last + 0.1
+        return action + torch.tensor([0.0, self.last]), following, plan
+
+
+class ProblemOnSelf(Good):
+    """Remembers the problem itself."""
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Any:
+        self.goal_m = problem.goal_m
+        return super().init(problem, generator)
+
+    def plan(self, step: Step, plan_state: Any) -> Any:
+        action, following, plan = super().plan(step, plan_state)
+        return action + 0 * self.goal_m.expand(len(action), 2), following, plan
+
+
+class LastSeen(Good):
+    """Remembers how many episodes it was given last, itself."""
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Any:
+        self.turn = 0.5 if problem.traversability[0, 0, 0] > 0.5 else 0.1
+        return super().init(problem, generator)
+
+    def plan(self, step: Step, plan_state: Any) -> Any:
+        action, following, plan = super().plan(step, plan_state)
+        return torch.stack((action[:, 0], torch.full_like(action[:, 1], self.turn)), 1), following, plan
+
+
+class Unseeded(Good):
+    def init(self, problem: Problem, generator: torch.Generator) -> Any:
+        return super().init(problem, torch.Generator().manual_seed(torch.Generator().seed() % 2**60))
+
+
+class NoiseOfBatch(Good):
+    """Draws noise for each episode in turn, so that an episode's hangs on its place."""
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Any:
+        return replace(super().init(problem, generator), noise=torch.rand(len(problem), generator=generator))
+
+
+class Draws(Good):
+    """Keeps a generator in its plan state and draws from it while it plans."""
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Any:
+        made = super().init(problem, generator)
+        made.generator = generator
+        return made
+
+    def plan(self, step: Step, plan_state: Any) -> Any:
+        noise = torch.rand((), generator=plan_state.generator)
+        action, following, plan = super().plan(step, plan_state)
+        following.generator = plan_state.generator
+        return action + noise * torch.tensor([0.0, 0.1]), following, plan
+
+
+BAD: dict[str, tuple[Any, str]] = {
+    "no planner": (object(), "Expected an answer from `init`, got AttributeError"),
+    "writes into the states": (acting(lambda step, _: step.state.zero_()), "got another step.state."),
+    "writes into what was felt": (acting(lambda step, _: step.felt.zero_()), "got another step.felt."),
+    "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got another problem.risk_map."),
+    "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments as they were"),
+    "writes into the prediction": (preparing(lambda p, _: p.mixture.means.zero_()), "problem.mixture.means"),
+    "writes into the image": (preparing(lambda p, _: p.observation.rgb.add_(1)), "problem.observation.rgb"),
+    "writes into the plan state": (acting(lambda _, s: s.last.add_(0.1)), "got another plan_state.last."),
+    "counts in the plan state": (acting(lambda _, s: count_up(s)), "got another plan_state.count."),
+    "draws from the plan state": (Draws(), "got another plan_state.generator"),
+    "no number": (action_of(poke), "Expected finite actions"),
+    "one action for all": (action_of(lambda action, _: action[:1]), "Expected actions of shape [4, 2], got [1, 2]"),
+    "doubles": (action_of(lambda action, _: action.double()), "dtype torch.float32, got torch.float64"),
+    "elsewhere": (action_of(lambda action, _: action.to("meta")), "device cpu, got meta"),
+    "too fast": (action_of(lambda action, _: action + 0.5), "within the robot's bounds"),
+    "no plan": (plan_of(lambda plan: None), "Expected a Plan beside the actions"),
+    "an unknown status": (plan_of(lambda plan: replace(plan, status=plan.status + 3)), "`Plan.status` in 0–2"),
+    "a status for all": (plan_of(lambda plan: replace(plan, status=plan.status[:1])), "status` of shape [4], got [1]"),
+    "a path for all": (plan_of(lambda plan: replace(plan, path=plan.path[:1])), "shape [4, N, 2], got [1, 3, 2]"),
+    "raises": (acting(lambda step, _: step.state[9]), "Expected an answer from `plan`, got IndexError"),
+    "raises off the map": (acting(leave_the_map), "got IndexError: off the map"),
+    "raises in init": (preparing(lambda p, _: p.goal_m[9]), "Expected an answer from `init`, got IndexError"),
+    "PyTorch's generator": (acting(lambda *_: torch.rand(1)), "PyTorch's global generator"),
+    "PyTorch's seed in init": (preparing(lambda *_: torch.manual_seed(0)), "PyTorch's global generator"),
+    "NumPy's generator": (acting(lambda *_: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
+    "Python's generator": (acting(lambda *_: random.random()), "Python's global generator"),
+    "evolves on self": (OnSelf(), "got another when asked again"),
+    "keeps the problem on self": (ProblemOnSelf(), "same after other steps and problems"),
+    "keeps what it saw on self": (LastSeen(), "same after other steps and problems"),
+    "no seed": (Unseeded(), "from a generator of the same seed, got another"),
+    "drives otherwise when drawn": (action_of(lambda a, step: 0.9 * a if step.draw else a), "whether it is drawn"),
+    "an action of the batch": (action_of(lambda a, _: a - 0.1 * a.mean(0)), "Expected for an episode alone"),
+    "noise of the batch": (NoiseOfBatch(), "Expected for an episode alone"),
+    "blind that is not": (having(blind=True), "Expected of a `blind` planner"),
+    "blind by a word": (having(blind="yes"), "Expected `blind` of type bool, got 'yes'"),
+    "follows no text": (having(follows=3), "Expected `follows` of type str, got 3"),
+    "steers by one name": (having(steers=("speed_mps", "turn_rate_radps")), "`steers` as tuples of action names"),
+    "steers nothing": (having(steers=()), "Expected a robot among those tried that it steers, got none"),
+    "remarks that are no tuple": (having(remarks=lambda self, task: "slow"), "to give a tuple of single lines"),
+    "remarks that raise": (having(remarks=lambda self, task: task.wheels), "from `remarks`, got AttributeError"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("planner", "expected"), BAD.values(), ids=BAD.keys())
+def test_a_breach_is_caught_and_named(planner: Any, expected: str) -> None:
+    states = torch.random.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    try:
+        with pytest.raises(ConfigError) as caught:
+            check_planner(planner)
+    finally:
+        torch.random.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_good_planner_passes_on_maps_worth_trying() -> None:
+    problems: list[Problem] = []
+    steps: list[Step] = []
+
+    class Spy(Good):
+        def init(self, problem: Problem, generator: torch.Generator) -> Any:
+            problems.append(problem)
+            return super().init(problem, generator)
+
+        def plan(self, step: Step, plan_state: Any) -> Any:
+            steps.append(step)
+            return super().plan(step, plan_state)
+
+    check_planner(Spy())
+    tried = {(len(one), *one.grid.shape) for one in problems}
+    assert tried == {(batch, *shape) for batch in (4, 3, 1) for shape in ((24, 24), (20, 33))}
+    # The robot stands on ground predicted 0 in one of them, and a wall is closed in another.
+    assert (problems[0].risk_map.amin(dim=(1, 2)) == 0).tolist() == [False, False, True, True]
+    starts = [one.grid.lookup(one.grid.pad(one.risk_map, 0.0), *one.start.T[:2]) for one in problems[:1]]
+    assert starts[0][2] == 0
+    shut = ~problems[0].free.any(dim=2)
+    assert shut.any(dim=1).tolist() == [False, True, False, False]
+    assert {one.draw for one in steps} == {True, False}
+    assert any(one.felt.isnan().all() for one in steps)
+    assert any(one.felt.isfinite().all() for one in steps)
+    assert max(one.time_s for one in steps) > 0
+    assert any((one.state[:, :2] < 0).any() for one in steps)
+
+
+def test_every_breach_is_named_once_with_the_robots_and_maps_it_was_found_on() -> None:
+    bad = answering(
+        lambda a, following, plan, step: (a + 5, following, replace(plan, status=plan.status + 3))
+    )
+    with pytest.raises(ConfigError) as caught:
+        check_planner(bad, robots=["unicycle", DifferentialDrive()], shapes=((9, 16), (12, 14)))
+    message = str(caught.value)
+    assert message.count("within the robot's bounds") == message.count("`Plan.status` in 0–2") == 1
+    places = "[unicycle on 9×16, unicycle on 12×14, DifferentialDrive on 9×16, DifferentialDrive on 12×14]"
+    assert message.count(places) == 2
+    assert "(1) " in message
+    assert "(2) " in message
+
+
+def test_a_robot_that_it_does_not_steer_is_left_out() -> None:
+    named: list[tuple[str, ...]] = []
+
+    class Names(Good):
+        def init(self, problem: Problem, generator: torch.Generator) -> Any:
+            named.append(problem.robot.action_names)
+            return super().init(problem, generator)
+
+    check_planner(Names(), shapes=((12, 12),))
+    assert set(named) == {("speed_mps", "turn_rate_radps")}
+    with pytest.raises(ConfigError, match="that it steers"):
+        check_planner(Names(), robots=["bicycle"])
+
+
+def test_parts_are_taken_by_name_mapping_or_as_objects() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'straight'"):
+        check_planner("straigt")
+    seen: list[Problem] = []
+    spy = preparing(lambda problem, _: seen.append(problem))
+    check_planner(spy, robots=[{"part": "unicycle", "options": {"dt_s": 0.2}}], objective="travel_time")
+    assert {one.dt_s for one in seen} == {0.2}
+    assert type(seen[0].objective).__name__ == "TravelTime"
+    assert seen[0].objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
+    seen.clear()
+    check_planner(spy, robots=[Unicycle()])
+    assert isinstance(seen[0].objective, GoalDistance)
+
+
+def test_the_tolerance_is_of_an_episode_alone() -> None:
+    nearly = action_of(lambda action, _: action - 1e-2 * action.mean(0))
+    check_planner(nearly, tolerance=0.02)
+    with pytest.raises(ConfigError, match="episode alone"):
+        check_planner(nearly)
+
+
+def test_a_blind_planner_may_be_right_about_itself() -> None:
+    assert Straight.blind
+    check_planner(Straight())
+
+
+@pytest.mark.parametrize("robot", registry.names("robot"))
+@pytest.mark.parametrize("planner", registry.names("planner"))
+def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -> None:
+    made = registry.make("planner", {"part": planner, "options": SMALL.get(planner, {})})
+    known = getattr(made, "steers", None)
+    if known is not None and registry.make("robot", robot).action_names not in known:
+        pytest.skip("it does not steer this robot")
+    check_planner(made, robots=[robot])
