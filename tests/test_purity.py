@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchnav import gridgraph, registry, rng
-from benchnav.datagen.files.block import Block
+from benchnav.datagen.files.writer import pack
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.schema import entry_digests
@@ -64,7 +64,8 @@ def test_datagen() -> None:
     same_after(lambda: rng.normal(1, indices, (3,)), indices)
     maps = generate(tiny_recipe(), "test/hg", np.arange(2))
     same_after(lambda: entry_digests(maps), *maps.values())
-    same_after(lambda: Block.of(maps), *maps.values())
+    entry = {"scenario": "hg", "maps": 2, "parts": []}
+    same_after(lambda: pack("d", tiny_recipe(), "test/hg", entry, maps), *maps.values())
 
 
 def maps_of(problem: Problem) -> tuple[torch.Tensor, ...]:

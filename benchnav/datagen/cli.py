@@ -1,15 +1,20 @@
-"""The command `benchnav-datagen`: make, list, show, check, mend, combine, import and draw datasets."""
+"""The command `benchnav-datagen`: make, list, show, check, combine, import and draw datasets."""
 
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from benchnav.command import INTERRUPTED, Command, run
 
 if TYPE_CHECKING:
+    from benchnav.datagen.files.check import Fault
     from benchnav.datagen.files.reader import TerrainDataset
+
+
+# A dataset of more becomes a folder of files.
+_MOST_CELLS_OF_A_FILE = 2**28
 
 
 def create(
@@ -20,6 +25,9 @@ def create(
     seed: int | None = None,
     splits: list[str] | None = None,
     first: int = 0,
+    shard: str = "",
+    backend: Literal["local", "dask"] = "local",
+    scheduler: str = "",
     overwrite: bool = False,
 ) -> None:
     """Make a dataset from a recipe.
@@ -27,24 +35,31 @@ def create(
     Args:
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
         overrides: Changes to it, such as id=mine splits.train.maps=50 scenarios.hs.severity=0.5.
-        out: File to write; datasets/ID.h5 when not given.
+        out: File .h5 to write, or else a folder of many files; datasets/ID.h5 if not given, datasets/ID for many maps.
         jobs: Worker processes. The result is the same for any number.
         seed: Root seed in place of the recipe's: a sibling, of id ID-seedN, with other maps of the same classes.
         splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
         first: Only the first so many maps of each split; the same maps as in the whole. 0 makes all.
-        overwrite: Replace a file that is there.
+        shard: Make only this share of the maps, such as 2/5; the others may be made on other machines.
+        backend: Worker processes on this machine, or those of a Dask cluster.
+        scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
+        overwrite: Replace what is there.
     """
     from rich.console import Console
 
     from benchnav.command import show_progress
     from benchnav.datagen.difficulty import explain, table
     from benchnav.datagen.files.create import create as create_dataset
-    from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.datagen.files.reader import TerrainDataset, is_dataset
     from benchnav.datagen.recipe.recipe import load_recipe
     from benchnav.errors import ConfigError
+    from benchnav.share import read_share
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
+    if (backend == "dask") != bool(scheduler):
+        raise ConfigError("Expected `backend` dask and `scheduler` together, got one without the other.")
+    share = read_share(shard)
     chosen = load_recipe(recipe, overrides)
     if seed is not None and seed != chosen.seed:
         chosen = replace(chosen, seed=seed, id=f"{chosen.id}-seed{seed}")
@@ -60,8 +75,18 @@ def create(
     if first:
         kept = {name: replace(spec, maps=min(first, spec.maps)) for name, spec in chosen.splits.items()}
         chosen = replace(chosen, splits=kept)
-    path = Path(out or f"datasets/{chosen.id}.h5").expanduser()
-    show_progress(_tell_kept(create_dataset(chosen, path, jobs=jobs, overwrite=overwrite)), "maps")
+    cells = sum(spec.maps for spec in chosen.splits.values()) * chosen.height * chosen.width
+    is_folder = share is not None or cells > _MOST_CELLS_OF_A_FILE
+    path = Path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}").expanduser()
+    steps = create_dataset(chosen, path, jobs, scheduler, share, overwrite)
+    show_progress(_tell_kept(steps), "maps")
+    if not is_dataset(path):
+        print(f"{path}: shard {share} is made")
+        print(
+            f"when the others are: benchnav-datagen merge {path} OTHER … --out OUT, or, where they are made in the"
+        )
+        print("same folder, nothing more: the last of them finishes it")
+        return
     made = TerrainDataset(path)
     _report(made)
     console = Console(highlight=False)
@@ -76,7 +101,7 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
-    from benchnav.datagen.files.reader import TerrainDataset, dataset_folders
+    from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset, dataset_folders
     from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
     from benchnav.errors import DatasetError
 
@@ -87,7 +112,9 @@ def list_datasets(folder: str = "") -> None:
     if folder and not Path(folder).is_dir():
         raise DatasetError(f"Expected `folder` to be one, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
-        files = sorted(place.glob("*.h5"))
+        files = sorted(
+            [*place.glob("*.h5"), *(manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}"))]
+        )
         print(f"files in {place}:" if files else f"no files in {place}")
         for path in files:
             try:
@@ -140,56 +167,42 @@ def validate(file: str) -> int:
         return 1
     for line in summarise(faults):
         print(line)
+    dataset = TerrainDataset(path)
     if faults:
-        print(f"{path}: {len(faults)} fault(s)")
+        print(f"{path}: {len(faults)} fault(s)\n{_remedy(dataset, faults)}")
         return 1
-    splits = TerrainDataset(path).splits
+    splits = dataset.splits
     print(f"{path}: sound, {sum(entry['maps'] for entry in splits.values())} maps in {len(splits)} split(s)")
     return 0
 
 
-def repair(file: str) -> None:
-    """Make the damaged maps of a dataset anew, and only those.
-
-    Args:
-        file: Path or id of a dataset.
-    """
-    from benchnav.command import show_progress
-    from benchnav.datagen.files.check import find_faults
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.datagen.files.repair import maps_to_make
-    from benchnav.datagen.files.repair import repair as repair_dataset
-
-    path = find_dataset(file)
-    faults = find_faults(path)
-    if not faults:
-        print(f"{path}: sound, nothing to repair")
-        return
-    dataset = TerrainDataset(path)
-    chosen = maps_to_make(dataset, faults)
-    show_progress(repair_dataset(dataset, chosen), "maps")
-    for split, indices in chosen.items():
-        if len(indices):
-            print(f"  {split}: made anew {len(indices)} map(s): {', '.join(map(str, indices))}")
-    _report(TerrainDataset(path))
+def _remedy(dataset: "TerrainDataset", faults: "list[Fault]") -> str:
+    """How damaged maps are made anew."""
+    if not all("recipe" in part for entry in dataset.splits.values() for part in entry["parts"]):
+        return "These maps were imported: import them again."
+    files = sorted({fault.file for fault in faults if fault.file})
+    if files:
+        names = " ".join(files)
+        return f"To make them anew, remove {names} in {dataset.path} and give the command again that made it."
+    return "To make them anew, make the file again with --overwrite: the same recipe and version give the same digests."
 
 
 def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> None:
     """Combine datasets of the same grid and classes to one; splits of one name are joined.
 
     Args:
-        files: Paths or ids of two or more datasets.
-        out: File to write.
-        id: Id of the new dataset; the name of the file when not given.
-        overwrite: Replace a file that is there.
+        files: Paths or ids of two or more datasets, or folders with the shards of one.
+        out: File .h5 to write, or else a folder of many files.
+        id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
+        overwrite: Replace what is there.
     """
     from benchnav.command import show_progress
     from benchnav.datagen.files.merge import merge as merge_datasets
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
     path = Path(out).expanduser()
-    sources = [find_dataset(file) for file in files]
-    show_progress(merge_datasets(sources, path, id or path.stem, overwrite), "maps")
+    sources = [Path(file) if Path(file).is_dir() else find_dataset(file) for file in files]
+    show_progress(merge_datasets(sources, path, id, overwrite), "maps")
     _report(TerrainDataset(path))
 
 
@@ -300,7 +313,9 @@ def _tell_kept(steps: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
 def _report(dataset: "TerrainDataset") -> None:
     from rich.filesize import decimal
 
-    print(f"wrote {dataset.path} ({decimal(dataset.path.stat().st_size)})")
+    files = {piece.path for split in dataset.splits for piece in dataset.pieces(split)}
+    size = decimal(sum(path.stat().st_size for path in files))
+    print(f"wrote {dataset.path} ({size}{f' in {len(files)} files' if len(files) > 1 else ''})")
     for name, split in dataset.splits.items():
         print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
 
@@ -312,12 +327,11 @@ def main() -> None:
         "list": Command(list_datasets),
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
-        "repair": Command(repair, ("file",)),
         "merge": Command(merge, ("files",)),
         "import-dem": Command(import_dem, ("dem",)),
         "preview": Command(preview, ("file",)),
     }
-    description = "Make, list, show, check, mend, combine, import and draw terrain datasets."
+    description = "Make, list, show, check, combine, import and draw terrain datasets."
     status = run("benchnav-datagen", description, commands)
     if status == INTERRUPTED and sys.argv[1] == "create":
         print("benchnav-datagen: to go on, give the same command again", file=sys.stderr)

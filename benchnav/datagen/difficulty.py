@@ -11,7 +11,6 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from benchnav.datagen.files.block import BLOCK_MAPS, spans
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
@@ -86,11 +85,7 @@ def of_split(dataset: TerrainDataset, split: str) -> Difficulty:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    pieces = (
-        of_maps(dataset.read(split, range(*span), _FIELDS), dataset.recipe)
-        for span in spans(dataset.map_count(split), BLOCK_MAPS)
-    )
-    return _together(pieces)
+    return _together(of_maps(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS))
 
 
 def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.ndarray:

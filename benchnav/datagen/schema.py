@@ -1,7 +1,8 @@
-"""Dataset formats 1.0 and 1.1: fields, manifest and content digests; `docs/format.md` describes it for readers.
+"""Dataset formats 1.0 to 1.2: fields, manifest and content digests; `docs/format.md` describes it for readers.
 
 One HDF5 file is one dataset. Groups are splits; each holds the fields of `FIELDS` and the SHA-256 of
-every entry. The manifest is a JSON text in the dataset `manifest`. Digests cover logical arrays, not
+every entry. The manifest is a JSON text in the dataset `manifest`. A folder of such files, with a manifest
+of its own that says which maps lie in which, is one dataset too, of format 1.2. Digests cover logical arrays, not
 the file's bytes, so they are the same whatever compression, machine or number of workers wrote it.
 """
 
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 FORMAT = "benchnav-dataset"
-FORMAT_VERSION = (1, 1)  # the newest that is read
+FORMAT_VERSION = (1, 2)  # the newest that is read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32

@@ -42,11 +42,11 @@ def run_command(
     """
     from benchnav.command import show_progress
     from benchnav.errors import ConfigError
-    from benchnav.eval.folder.shard import read_shard
     from benchnav.eval.run.runner import run_suite
+    from benchnav.share import read_share
 
     workers = _workers(jobs, backend, scheduler)
-    share = read_shard(shard)
+    share = read_share(shard)
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = Path(out)

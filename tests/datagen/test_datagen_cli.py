@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from benchnav.datagen import cli
-from benchnav.datagen.files.block import Block
+from benchnav.datagen.files import create
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.shard import Shard
 from benchnav.datagen.recipe.classes import SoftSpots
-from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
 from benchnav.errors import ConfigError
 
 Call = Callable[..., int]
@@ -61,10 +62,9 @@ def test_a_dataset_from_making_to_mending(datagen: Call, tmp_path: Path, capsys)
     Path("d.h5").write_bytes(raw)
     capsys.readouterr()
     assert datagen("validate", "d.h5") == 1
-    assert "test/hg: map 0: field 'elevation_m' is damaged" in capsys.readouterr().out
-    assert datagen("repair", "d.h5") == 0
-    assert "made anew 1 map(s): 0" in capsys.readouterr().out
-    assert datagen("validate", "d.h5") == 0
+    told = capsys.readouterr().out
+    assert "test/hg: map 0: field 'elevation_m' is damaged" in told
+    assert "make the file again with --overwrite" in told
 
 
 def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
@@ -74,13 +74,12 @@ def test_damage_is_one_line_for_every_command(datagen: Call, capsys) -> None:  #
     for arguments in (["show", "d.h5"], ["merge", "d.h5", "d.h5", "--out", "m.h5"]):
         capsys.readouterr()
         assert datagen(*arguments) == 2
-        assert "repair" in capsys.readouterr().err
+        assert "validate" in capsys.readouterr().err
     whole = Path("d.h5").read_bytes()
     Path("d.h5").write_bytes(whole[: len(whole) // 2])
     capsys.readouterr()
     assert datagen("validate", "d.h5") == 1
     assert "1 fault" in capsys.readouterr().out
-    assert datagen("repair", "d.h5") == 2
 
 
 def test_parts_made_apart_are_merged(datagen: Call) -> None:
@@ -90,6 +89,48 @@ def test_parts_made_apart_are_merged(datagen: Call) -> None:
     assert TerrainDataset("c.h5").id == "c"
     assert set(TerrainDataset("c.h5").splits) == {"train", "valid"}
     assert datagen("merge", "a.h5", "c.h5", "--out", "e.h5") == 2
+
+
+def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    assert datagen("create", "tiny-v1", *SMALL, "--out", "whole.h5") == 0
+    for index, folder in ((1, "part1"), (2, "part2")):
+        assert datagen("create", "tiny-v1", *SMALL, "--shard", f"{index}/2", "--out", folder) == 0
+        assert f"{folder}: shard {index}/2 is made" in capsys.readouterr().out
+    assert datagen("show", "part1") == 2
+    assert "merge" in capsys.readouterr().err
+    assert datagen("merge", "part1", "part2", "--out", "big") == 0
+    assert " files)" in capsys.readouterr().out
+    assert datagen("merge", "part1", "part2", "--out", "one.h5") == 0
+    assert (
+        TerrainDataset("big").digest == TerrainDataset("one.h5").digest == TerrainDataset("whole.h5").digest
+    )
+    assert (TerrainDataset("big").id, TerrainDataset("one.h5").id) == ("tiny-v1", "tiny-v1")
+    for command in (["show"], ["validate"], ["preview", "--out", "p.png"]):
+        assert datagen(command[0], "big", *command[1:]) == 0
+    capsys.readouterr()
+    assert datagen("list", "--folder", ".") == 0
+    listed = capsys.readouterr().out
+    assert "  big " in listed
+    assert "part1" not in listed
+    assert datagen("merge", "part1", "--out", "some") == 2
+    assert "of train" in capsys.readouterr().err
+    assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 2
+    assert "exists" in capsys.readouterr().err
+    (shard,) = Path("big").glob("train*")
+    shard.unlink()
+    assert datagen("validate", "big") == 1
+    assert f"remove {shard.name} in big and give the command again" in capsys.readouterr().out
+    assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0
+    assert datagen("validate", "big") == 0
+
+
+def test_a_large_dataset_is_a_folder(datagen: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "_MOST_CELLS_OF_A_FILE", 32 * 32 * 4)
+    Path("datasets").mkdir()
+    assert datagen("create", "tiny-v1", "--first", "2", "--splits", "[train,valid]") == 0
+    assert datagen("create", "tiny-v1", "--first", "3", "--splits", "[train,valid]", "--seed", "1") == 0
+    assert TerrainDataset("datasets/tiny-v1.h5").map_count("train") == 2
+    assert TerrainDataset("datasets/tiny-v1-seed1").map_count("train") == 3
 
 
 def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
@@ -140,6 +181,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
     assert capsys.readouterr().out.splitlines() == [
         "train: maps 0–2: field 'start_m' does not match its digest",
         "d.h5: 3 fault(s)",
+        "To make them anew, make the file again with --overwrite: the same recipe and version give the same digests.",
     ]
 
 
@@ -217,7 +259,10 @@ def test_a_bad_recipe_is_one_clear_line_and_status_2(
         ["create", "tiny-v1", "--seed", "many"],
         ["show", "nope"],
         ["validate", "r.yaml"],
-        ["repair", "nope"],
+        ["create", "tiny-v1", "--shard", "3/2"],
+        ["create", "tiny-v1", "--shard", "1/2", "--out", "d.h5"],
+        ["create", "tiny-v1", "--backend", "dask"],
+        ["create", "tiny-v1", "--scheduler", "tcp://127.0.0.1:1"],
         ["merge", "nope", "--out", "d.h5"],
         ["merge", "--out", "d.h5"],
         ["preview", "nope"],
@@ -272,10 +317,6 @@ def test_a_dataset_with_stakes_from_making_to_mending(datagen: Call, tmp_path: P
         file["train/start_m"][1] = 0
         file["test/hg/traversability"][0] = 0
     assert datagen("validate", "d.h5") == 1
-    assert datagen("repair", "d.h5") == 0
-    # Repair tells digests, and not again how hard the maps are.
-    assert "λ_stuck" not in capsys.readouterr().out
-    assert datagen("validate", "d.h5") == 0
     assert datagen("preview", "d.h5", "--split", "train", "--out", "p.png") == 0
     assert datagen("preview", "d.h5", "--split", "train", "--contact-sheet") == 0
 
@@ -336,15 +377,15 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
     datagen: Call, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = ("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "d.h5")
-    save = Block.save
+    make = create.make
 
-    def interrupted(self: Block, path: Path) -> None:
-        if path.name.startswith("test"):
+    def interrupted(recipe: Recipe, shard: Shard) -> bytes:
+        if shard.split.startswith("test"):
             raise KeyboardInterrupt
-        save(self, path)
+        return make(recipe, shard)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Block, "save", interrupted)
+        patched.setattr(create, "make", interrupted)
         assert datagen(*asked) == 130
     assert (
         capsys.readouterr().err.splitlines()[-1] == "benchnav-datagen: to go on, give the same command again"

@@ -92,7 +92,8 @@ def test_a_line_along_rows_columns_and_a_diagonal() -> None:
 def test_a_split_is_measured_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = TerrainDataset(tiny_dataset(tmp_path / "d.h5", small_stakes()))
     whole = difficulty.of_maps(dataset.read("train"), dataset.recipe)
-    monkeypatch.setattr(difficulty, "BLOCK_MAPS", 3)
+    chunks = dataset.chunks
+    monkeypatch.setattr(dataset, "chunks", lambda *given: chunks(*given, cells=3 * 32 * 32))
     asked, read = [], dataset.read
     monkeypatch.setattr(dataset, "read", lambda *given: asked.append(list(given[1])) or read(*given))
     pieces = difficulty.of_split(dataset, "train")

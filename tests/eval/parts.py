@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import signal
 import time
 import uuid
 from pathlib import Path
@@ -86,6 +87,8 @@ class Faulty:
             raise RuntimeError("no way on")
         if self.fault == "exit":
             raise SystemExit(0)
+        if self.fault == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
         if self.fault == "hang":
             time.sleep(600)
         if self.fault == "give up":

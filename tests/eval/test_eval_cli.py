@@ -11,8 +11,8 @@ from benchnav.errors import ConfigError
 from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
 from benchnav.eval.folder.folder import open_run
-from benchnav.eval.folder.shard import Shard
 from benchnav.eval.run.runner import run_suite
+from benchnav.share import Share
 
 SMALL = (
     "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1",
@@ -77,7 +77,7 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
     [
         ((), {}),
         (("--jobs", "3", "--overwrite"), {"jobs": 3, "overwrite": True}),
-        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Shard(index=2, of=4)}),
+        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Share(index=2, of=4)}),
         (("--backend", "dask", "--scheduler", "tcp://a:1"), {"scheduler": "tcp://a:1"}),
     ],
 )  # fmt: skip

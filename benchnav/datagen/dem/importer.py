@@ -25,14 +25,17 @@ from scipy import sparse
 
 from benchnav.datagen.dem.raster import SLACK, Raster, crs_name, load_rasterio, opened
 from benchnav.datagen.dem.resample import Rule, heights, shares, snapped
-from benchnav.datagen.files.block import BLOCK_MAPS, Block, spans
-from benchnav.datagen.files.writer import check_target, named_errors, writing
+from benchnav.datagen.files.create import join
+from benchnav.datagen.files.folder import Contents
+from benchnav.datagen.files.writer import check_target, named_errors, pack
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.datagen.synth.generate import Maps, class_map, complete, reference_time_s
 from benchnav.errors import ConfigError, DatasetError
+from benchnav.files import sole_writer
 
 _VALUES_AT_ONCE = 2**21
+_MAPS_AT_ONCE = 32
 _CACHE_MB = 128  # of raster that GDAL keeps; what it would choose grows with the machine
 _MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
 
@@ -94,19 +97,19 @@ def import_dem(
         stack.enter_context(named_errors(out))
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent))
         made = []
-        for first, stop in spans(cut.maps, BLOCK_MAPS):
-            numbers = np.arange(first, stop)
-            made.append(_make(recipe, split, cut, layers, numbers, Path(folder) / f"{first}.block"))
-            yield stop, cut.maps
+        for first in range(0, cut.maps, _MAPS_AT_ONCE):
+            numbers = np.arange(first, min(first + _MAPS_AT_ONCE, cut.maps))
+            made.append(_make(recipe, split, cut, layers, numbers, Path(folder) / f"{first}.h5"))
+            yield first + len(numbers), cut.maps
         source = _source(cut, layers, made)
         count = len(source["kept"])
         recipe = replace(recipe, splits={split: replace(only, maps=count)})
         parts = [{"maps": count, "source": source}]
         splits = {split: {"scenario": scenario, "maps": count, "parts": parts}}
-        with writing(out, dataset_id, [recipe], splits, overwrite) as write:
-            for block in made:
-                if len(block.numbers):
-                    write(split, Block.load(block.path))
+        files = {split: [some.path for some in made if len(some.numbers)]}
+        with sole_writer(out, str(out)):
+            check_target(out, overwrite)
+            join(out, Contents(id=dataset_id, recipes=[recipe], splits=splits, files=files))
 
 
 @dataclass(frozen=True)
@@ -179,7 +182,7 @@ class _Layer:
 
 @dataclass(frozen=True)
 class _Made:
-    """What came of some maps: a block of those kept, their numbers and lowest elevations, and a count."""
+    """What came of some maps: a file of those kept, their numbers and lowest elevations, and a count."""
 
     path: Path
     numbers: np.ndarray
@@ -219,7 +222,9 @@ def _make(
         maps["reference_time_s"] = reference_time_s(recipe, maps)
         kept = np.isfinite(maps["reference_time_s"])
     if kept.any():
-        Block.of({name: maps[name][kept].astype(FIELDS[name].dtype) for name in FIELDS}).save(path)
+        entry = {"scenario": spec.scenario, "maps": int(kept.sum()), "parts": []}
+        stored = {name: maps[name][kept].astype(FIELDS[name].dtype) for name in FIELDS}
+        path.write_bytes(pack(recipe.id, recipe, split, entry, stored))
     return _Made(path, numbers[kept], lowest_m[kept], int((~kept).sum()))
 
 

@@ -9,8 +9,10 @@ import h5py
 import numpy as np
 
 from benchnav.datagen import schema
-from benchnav.datagen.files.block import BLOCK_MAPS, spans
-from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset
+from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, open_file
+from benchnav.errors import DatasetError
+
+_MAPS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, order=True)
@@ -22,12 +24,14 @@ class Fault:
         map: which map; −1 where it is not one map.
         field: which array of the split; empty where it is none of them.
         problem: what is wrong with it.
+        file: name of the shard that holds it; empty where the dataset is one file.
     """
 
     split: str
     map: int
     field: str
     problem: str
+    file: str = ""
 
     def __str__(self) -> str:
         """One line."""
@@ -37,9 +41,9 @@ class Fault:
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
     """Writes a line a fault, consecutive maps with the same fault in one."""
-    kinds: dict[tuple[str, str, str], list[Fault]] = {}
+    kinds: dict[tuple[str, str, str, str], list[Fault]] = {}
     for fault in sorted(faults):
-        kinds.setdefault((fault.split, fault.field, fault.problem), []).append(fault)
+        kinds.setdefault((fault.split, fault.field, fault.problem, fault.file), []).append(fault)
     for alike in kinds.values():
         maps = np.array([fault.map for fault in alike])
         for run in np.split(maps, np.flatnonzero(np.diff(maps) != 1) + 1):
@@ -51,14 +55,15 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
 
 def _line(fault: Fault, place: str) -> str:
     words = [fault.split, place, f"field {fault.field!r} {fault.problem}" if fault.field else fault.problem]
-    return ": ".join(word for word in words if word)
+    where = f" ({fault.file})" if fault.file else ""
+    return ": ".join(word for word in words if word) + where
 
 
 def find_faults(path: str | Path) -> list[Fault]:
     """Reads everything in a dataset and names what is wrong.
 
     Args:
-        path: the file.
+        path: the file or folder.
 
     Returns:
         The faults, every damaged map and field among them; empty when the file is sound.
@@ -67,61 +72,85 @@ def find_faults(path: str | Path) -> list[Fault]:
         DatasetError: the file or its manifest cannot be read at all.
     """
     dataset = TerrainDataset(path)
-    faults: list[Fault] = []
-    with h5py.File(path, "r") as file:
-        for split in dataset.splits:
-            faults += _split_faults(dataset, file, split)
-    return faults
+    return [fault for split in dataset.splits for fault in _split_faults(dataset, split)]
 
 
-def _split_faults(dataset: TerrainDataset, file: h5py.File, split: str) -> Iterator[Fault]:
-    maps = dataset.splits[split]["maps"]
-    height, width = dataset.grid.shape
-    sound: dict[str, h5py.Dataset] = {}
-    wanted = {name: (field.dtype, field.entry_shape(height, width)) for name, field in schema.FIELDS.items()}
-    wanted[schema.ENTRY_DIGESTS] = ("|u1", (len(schema.FIELDS), schema.DIGEST_BYTES))
-    for name, (dtype, entry) in wanted.items():
+def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
+    digest = schema.SplitDigest(dataset.map_count(split), *dataset.grid.shape)
+    unlike: list[Fault] = []  # maps that do not match the digests beside them
+    readable = True
+    for piece in dataset.pieces(split):
+        name = piece.path.name if piece.path != dataset.path else ""
         try:
-            array = file[f"{split}/{name}"]
-            found = (array.dtype.str, array.shape)
-        except READ_ERRORS:
-            yield Fault(split, -1, name, "is missing or cannot be opened")
+            file = open_file(piece.path)
+        except DatasetError:
+            yield Fault(split, -1, "", "is missing or cannot be opened", name)
+            readable = False
             continue
-        if found == (dtype, (maps, *entry)):
-            sound[name] = array
-        else:
-            yield Fault(split, -1, name, f"is {found[0]} {list(found[1])}, not {dtype} {[maps, *entry]}")
-    digest, readable = schema.SplitDigest(maps, height, width), set(schema.FIELDS) <= set(sound)
-    unlike: list[tuple[int, str]] = []
-    for start, block in _read_blocks(sound, maps):
-        yield from (Fault(split, start, name, "is damaged") for name in sound if name not in block)
-        fields = [name for name in schema.FIELDS if name in block]
-        for name in fields:
-            yield from _out_of_range(split, name, block[name], start, len(dataset.recipe.classes))
-        readable = readable and len(fields) == len(schema.FIELDS)
-        if not fields:
-            continue
-        digests = schema.entry_digests(block, fields)
-        if readable:
-            digest.update(digests)
-        if schema.ENTRY_DIGESTS in block:
-            columns = [list(schema.FIELDS).index(name) for name in fields]
-            differ = (digests != block[schema.ENTRY_DIGESTS][:, columns]).any(axis=2)
-            unlike += [(start + index, fields[column]) for index, column in np.argwhere(differ).tolist()]
+        with file:
+            sound, faults = _arrays(file, split, piece.maps, dataset)
+            yield from (replace(fault, file=name) for fault in faults)
+            readable = readable and set(schema.FIELDS) <= set(sound)
+            for start, maps in _read_some(sound, piece.maps):
+                first = piece.first + start
+                yield from (
+                    Fault(split, first, field, "is damaged", name) for field in sound if field not in maps
+                )
+                fields = [field for field in schema.FIELDS if field in maps]
+                for field in fields:
+                    faulty = _out_of_range(field, maps[field], len(dataset.recipe.classes))
+                    yield from (Fault(split, first + i, field, "is out of range", name) for i in faulty)
+                readable = readable and len(fields) == len(schema.FIELDS)
+                if not fields:
+                    continue
+                digests = schema.entry_digests(maps, fields)
+                if readable:
+                    digest.update(digests)
+                if schema.ENTRY_DIGESTS in maps:
+                    columns = [list(schema.FIELDS).index(field) for field in fields]
+                    differ = (digests != maps[schema.ENTRY_DIGESTS][:, columns]).any(axis=2)
+                    unlike += [
+                        Fault(split, first + index, fields[column], "does not match its digest", name)
+                        for index, column in np.argwhere(differ).tolist()
+                    ]
     if readable and digest.hexdigest() == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
-        for index in sorted({index for index, _ in unlike}):
-            yield Fault(split, index, schema.ENTRY_DIGESTS, "does not match the map")
+        told = {fault.map: fault for fault in unlike}
+        for index in sorted(told):
+            yield replace(told[index], field=schema.ENTRY_DIGESTS, problem="does not match the map")
         return
-    for index, name in unlike:
-        yield Fault(split, index, name, "does not match its digest")
+    yield from unlike
     if readable and not unlike:
         yield Fault(split, -1, "", "the maps do not match the digest in the manifest")
 
 
-def _read_blocks(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Reads blocks of maps; of one that cannot be read whole, each map, with the arrays that can be read."""
-    for start, stop in spans(maps, BLOCK_MAPS):
+def _arrays(
+    file: h5py.File, split: str, maps: int, dataset: TerrainDataset
+) -> tuple[dict[str, h5py.Dataset], list[Fault]]:
+    """The arrays of a split in a file that are as they should be, and what is wrong with the others."""
+    shapes = {name: field.entry_shape(*dataset.grid.shape) for name, field in schema.FIELDS.items()}
+    wanted = {name: (field.dtype, shapes[name]) for name, field in schema.FIELDS.items()}
+    wanted[schema.ENTRY_DIGESTS] = ("|u1", (len(schema.FIELDS), schema.DIGEST_BYTES))
+    sound, faults = {}, []
+    for name, (dtype, entry) in wanted.items():
+        try:
+            array = file[f"{split}/{name}"]
+            found = (array.dtype.str, array.shape)
+        except (*READ_ERRORS, TypeError, AttributeError):
+            faults.append(Fault(split, -1, name, "is missing or cannot be opened"))
+            continue
+        if found == (dtype, (maps, *entry)):
+            sound[name] = array
+        else:
+            problem = f"is {found[0]} {list(found[1])}, not {dtype} {[maps, *entry]}"
+            faults.append(Fault(split, -1, name, problem))
+    return sound, faults
+
+
+def _read_some(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Reads some maps at a time; of those that cannot be read together each one, with the arrays that can be read."""
+    for start in range(0, maps, _MAPS_AT_ONCE):
+        stop = min(start + _MAPS_AT_ONCE, maps)
         try:
             yield start, {name: array[start:stop] for name, array in arrays.items()}
         except READ_ERRORS:
@@ -133,11 +162,11 @@ def _read_blocks(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[i
                 yield index, readable
 
 
-def _out_of_range(split: str, name: str, values: np.ndarray, start: int, classes: int) -> Iterator[Fault]:
+def _out_of_range(name: str, values: np.ndarray, classes: int) -> list[int]:
+    """Which maps have a value that may not be."""
     field = schema.FIELDS[name]
     most = classes - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
     if name in ("reference_time_s", "traversability"):  # not asked for; not observed
         allowed |= np.isnan(values)
-    for index in np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)):
-        yield Fault(split, start + int(index), name, "is out of range")
+    return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

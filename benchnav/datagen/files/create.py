@@ -1,137 +1,198 @@
-"""Making datasets: blocks of maps in parallel, kept until the file is whole.
+"""Making datasets: shard by shard, in parallel, gone on with after a kill.
 
-Blocks are kept in the target's workspace; a killed run goes on from those it finished. They are made
-by processes forked from this one where the system can: they start at once and end with it. (Threads
-hand the interpreter's lock over too often to gain anything.)
+A dataset of one file is made in the folder `.NAME.partial` beside it, whose shards are joined at the end. One
+of many files is made where it is to be, and is finished when its manifest is written.
 """
 
-import gc
-import json
 import multiprocessing
 import os
+import re
 import shutil
 import signal
-import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import joblib
 
 import benchnav
-from benchnav.datagen.files.block import BLOCK_MAPS, Block, spans
-from benchnav.datagen.files.writer import check_target, named_errors, workspace, writing_into
+from benchnav.cluster import connected, parallel, told_when_lost
+from benchnav.datagen.files.folder import Contents, write_manifest
+from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
+from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make
+from benchnav.datagen.files.writer import check_target, named_errors, writing
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.synth.generate import generate
-from benchnav.errors import ConfigError
-from benchnav.files import write_text
+from benchnav.errors import ConfigError, DatasetError
+from benchnav.files import replacing, sole_writer
+from benchnav.share import Share
 
-Span = tuple[str, int, int]  # split, first map, one past the last
+_Made = tuple[Shard, bytes]
+
+_SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
 
 
 def create(
-    recipe: Recipe, path: Path, jobs: int = 1, block_maps: int = BLOCK_MAPS, overwrite: bool = False
+    recipe: Recipe,
+    path: Path,
+    jobs: int = 1,
+    scheduler: str = "",
+    share: Share | None = None,
+    overwrite: bool = False,
+    shard_cells: int = SHARD_CELLS,
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset, yielding (maps done, maps in all) as it goes; to be iterated to the end.
 
-    What comes first is told before anything is made: the maps that a killed run has left, and those in all.
+    What comes first is told before anything is made: the maps that are there already, and those in all.
 
     Args:
         recipe: what to make.
-        path: file to write.
+        path: file to write, of suffix `.h5`; else a folder.
         jobs: processes to make maps in.
-        block_maps: maps a unit of work; changes nothing in the result.
-        overwrite: replace a file that is there.
+        scheduler: address of a Dask cluster's scheduler, whose workers take their place; empty for none.
+        share: which of the shards are made here; None for all.
+        overwrite: replace what is there.
+        shard_cells: cells of a shard; of a single file it changes nothing.
 
     Raises:
-        DatasetError: the file exists, another run is writing it, or it cannot be written.
+        DatasetError: the dataset exists, another run is writing it, or it cannot be written.
         ConfigError: the recipe cannot be met.
     """
-    check_target(path, overwrite=True)
-    work = [(split, *span) for split, spec in recipe.splits.items() for span in spans(spec.maps, block_maps)]
-    total = sum(stop - start for _, start, stop in work)
-    splits = {
-        name: {
-            "scenario": spec.scenario,
-            "maps": spec.maps,
-            "parts": [{"maps": spec.maps, "recipe": 0, "split": name, "first": 0}],
-        }
-        for name, spec in recipe.splits.items()
-    }
-    with named_errors(path), _workers(jobs) as run, workspace(path, overwrite) as folder:
-        _drop_other_blocks(folder, recipe, block_maps)
-        make = partial(_make_block, recipe, folder)
-        there = {span for span in work if _block_path(folder, span).exists()}
-        done = sum(stop - start for _, start, stop in there)
+    shards = cut(recipe, shard_cells)
+    own = [
+        shard for place, shard in enumerate(shards) if share is None or place % share.of == share.index - 1
+    ]
+    is_file = path.suffix == ".h5"
+    if is_file and share is not None:
+        raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
+    with named_errors(path), _held(path, share):
+        folder = path.parent / f".{path.name}.partial" if is_file else path
+        missing = _missing(recipe, path, folder, shards, own, overwrite)
+        total = sum(shard.maps for shard in own)
+        done = total - sum(shard.maps for shard in missing)
         yield done, total
-        with _left_nothing(folder), writing_into(folder, path, recipe.id, [recipe], splits) as write:
-            for (split, start, stop), finished in zip(work, run(make, work), strict=True):
-                write(split, Block.load(finished))
-                done += 0 if (split, start, stop) in there else stop - start
+        with _runner(recipe, jobs, scheduler if missing else "") as run, _left_nothing(folder, path):
+            for shard, content in run(missing):
+                with replacing(folder / shard.name) as partial:
+                    partial.write_bytes(content)
+                done += shard.maps
                 yield done, total
-        shutil.rmtree(folder, ignore_errors=True)
+        contents = _contents(recipe, folder, shards)
+        if is_file:
+            join(path, contents)
+            shutil.rmtree(folder)
+        elif all((folder / shard.name).exists() for shard in shards):
+            write_manifest(folder, contents)
 
 
-def _make_block(recipe: Recipe, folder: Path, span: Span) -> Path:
-    split, start, stop = span
-    path = _block_path(folder, span)
-    if not Block.is_whole(path):
-        Block.of(generate(recipe, split, np.arange(start, stop))).save(path)
-    return path
+def join(path: Path, contents: Contents) -> None:
+    """Writes one file of many.
+
+    Args:
+        path: file to write or replace.
+        contents: what it is to hold.
+    """
+    room = sum(file.stat().st_size for files in contents.files.values() for file in files)
+    with writing(path, contents.id, contents.recipes, contents.splits, room) as writer:
+        for split, files in contents.files.items():
+            for file in files:
+                with open_file(file) as stored:
+                    writer.copy(split, stored[split])
 
 
-def _block_path(folder: Path, span: Span) -> Path:
-    split, start, stop = span
-    return folder / f"{split.replace('/', '+')}-{start:07d}-{stop:07d}.block"
+def _held(path: Path, share: Share | None) -> Any:
+    """Holds the dataset for one process, or the share of it: those of several may be made at once."""
+    name = path.name if share is None else f"{path.name}.{share.index}-of-{share.of}"
+    return sole_writer(path.with_name(name), str(path))
+
+
+def _missing(
+    recipe: Recipe, path: Path, folder: Path, shards: Sequence[Shard], own: Sequence[Shard], overwrite: bool
+) -> list[Shard]:
+    """Which shards are to be made; those of another recipe, cut or version are removed where they may be.
+
+    Raises:
+        DatasetError: what is there may not be replaced.
+    """
+    is_file = folder != path
+    if is_file:
+        if path.exists() and not overwrite:
+            shutil.rmtree(folder, ignore_errors=True)
+        check_target(path, overwrite)
+    else:
+        _check_folder(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    known = {shard.name: shard for shard in shards}
+    every = sorted(folder.glob("*.h5"))
+    there = [file for file in every if file.name in known and is_there(file, recipe, known[file.name])]
+    foreign = [file for file in every if file not in there]
+    if foreign and not is_file and not overwrite:
+        raise DatasetError(
+            f"Expected `out` to be new or to hold shards of this recipe and version, but {foreign[0]} is another. "
+            "Choose another `out`, or pass --overwrite."
+        )
+    missing = [shard for shard in own if folder / shard.name not in there]
+    manifest = folder / FOLDER_MANIFEST
+    if manifest.exists():
+        if not missing and not overwrite:
+            raise DatasetError(
+                f"Expected `out` to be a new folder, but {path} exists. Pass --overwrite to replace it."
+            )
+        missing = list(own) if overwrite else missing
+        manifest.unlink()
+    # What is half-written of this share is of a killed run.
+    half = [
+        file for file in folder.glob(".*.partial") if any(f".{shard.name}." in file.name for shard in own)
+    ]
+    for file in (*foreign, *half):
+        file.unlink()
+    return missing
+
+
+def _check_folder(path: Path) -> None:
+    """Refuses a folder that holds anything but shards and their manifest, which no option may remove."""
+    if path.exists() and not path.is_dir():
+        raise DatasetError(f"Expected `out` to be a folder or a file .h5, got the file {path}.")
+    for file in sorted(path.iterdir()) if path.exists() else ():
+        is_ours = file.name == FOLDER_MANIFEST or _SHARD.fullmatch(file.name) or file.name.startswith(".")
+        if not is_ours:
+            raise DatasetError(
+                f"Expected `out` to be a new folder or one of shards, but {path} holds {file.name}."
+            )
 
 
 @contextmanager
-def _left_nothing(folder: Path) -> Iterator[None]:
-    """Removes the finished blocks of a recipe that cannot be met: there is nothing to go on to."""
-    try:
-        yield
-    except ConfigError:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-
-
-def _drop_other_blocks(folder: Path, recipe: Recipe, block_maps: int) -> None:
-    """Removes finished blocks that are not of this recipe, cut and version."""
-    made_of = {"recipe": recipe.to_dict(), "block_maps": block_maps, "version": benchnav.__version__}
-    stamp, text = folder / "made_of.json", json.dumps(made_of, sort_keys=True)
-    if not stamp.exists() or stamp.read_text() != text:
-        for finished in folder.glob("*.block"):
-            finished.unlink()
-        write_text(stamp, text)
-
-
-@contextmanager
-def _workers(jobs: int) -> Iterator[Callable[[Callable[[Span], Path], list[Span]], Iterable[Path]]]:
-    """Gives a `map` that runs in `jobs` processes; here when it is one."""
-    if jobs == 1:
-        _keep_freed_memory()
-        yield map
+def _runner(
+    recipe: Recipe, jobs: int, scheduler: str
+) -> Iterator[Callable[[Sequence[Shard]], Iterable[_Made]]]:
+    """Gives a function that makes shards, here, in processes of this machine or on a cluster, each as it is done."""
+    if scheduler:
+        with connected(scheduler) as client, told_when_lost(scheduler):
+            _check_workers(client)
+            yield lambda shards: parallel(client)(joblib.delayed(_make)(recipe, shard) for shard in shards)
         return
-    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
-    executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker)
+    if jobs == 1:
+        yield lambda shards: (_make(recipe, shard) for shard in shards)
+        return
+    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_start_worker)
     try:
-        # Fork now: a worker shall hold neither the lock nor the file that are opened next.
-        executor.submit(int).result()
-        yield executor.map
+        yield lambda shards: (
+            done.result() for done in as_completed(executor.submit(_make, recipe, shard) for shard in shards)
+        )
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def _make(recipe: Recipe, shard: Shard) -> _Made:
+    return shard, make(recipe, shard)
 
 
 def _start_worker() -> None:
     # An interrupt is for the parent to act on; and a parent that is killed takes its workers along.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Collecting garbage would walk through, and so copy, all that was forked.
-    gc.freeze()
-    _keep_freed_memory()
 
 
 def _end_with_parent() -> None:
@@ -141,10 +202,41 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _keep_freed_memory() -> None:
-    """Keeps the C library from handing each freed array back to the kernel, to be zeroed and mapped anew.
+def _check_workers(client: Any) -> None:
+    """Refuses workers of another version.
 
-    glibc raises its thresholds to the largest array that was ever freed. It saves a third of the time;
-    other C libraries take no notice.
+    Raises:
+        ConfigError: there is one.
     """
-    np.empty(4_000_000)
+    own = _version()
+    for address, version in client.run(_version, on_error="return").items():
+        if version != own:
+            raise ConfigError(f"Expected workers with benchnav {own}, got {address} with {version}.")
+
+
+def _version() -> str:
+    return benchnav.__version__
+
+
+def _contents(recipe: Recipe, folder: Path, shards: Sequence[Shard]) -> Contents:
+    splits = {
+        name: {
+            "scenario": spec.scenario,
+            "maps": spec.maps,
+            "parts": [{"maps": spec.maps, "recipe": 0, "split": name, "first": 0}],
+        }
+        for name, spec in recipe.splits.items()
+    }
+    files = {name: [folder / shard.name for shard in shards if shard.split == name] for name in recipe.splits}
+    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
+
+
+@contextmanager
+def _left_nothing(folder: Path, path: Path) -> Iterator[None]:
+    """Removes what was made of a file whose recipe cannot be met: there is nothing to go on to."""
+    try:
+        yield
+    except ConfigError:
+        if folder != path:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise

@@ -4,22 +4,22 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-import h5py
 from rich.markup import escape
 from rich.table import Table
 
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset
+from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, open_file
 
 
 def describe(dataset: TerrainDataset) -> dict[str, Any]:
     """Gathers what `show` shows, ready for JSON."""
     manifest, recipe = dataset.manifest, dataset.recipe
-    with dataset.open() as file:
-        stored = {split: _stored_bytes(dataset, file, split) for split in dataset.splits}
+    stored = {split: _stored_bytes(dataset, split) for split in dataset.splits}
+    files = {piece.path for split in dataset.splits for piece in dataset.pieces(split)}
     return {
         "path": str(dataset.path),
-        "bytes": dataset.path.stat().st_size,
+        "bytes": sum(path.stat().st_size for path in files),
+        "files": len(files),
         "id": dataset.id,
         "format_version": manifest["format_version"],
         "generator": manifest["generator"],
@@ -36,22 +36,25 @@ def describe(dataset: TerrainDataset) -> dict[str, Any]:
     }
 
 
-def _stored_bytes(dataset: TerrainDataset, file: h5py.File, split: str) -> int:
+def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
     total, name = 0, ""
-    try:
-        for name in schema.FIELDS:
-            total += file[split][name].id.get_storage_size()
-    except READ_ERRORS as error:
-        raise dataset.damage(split, name, error) from error
+    for piece in dataset.pieces(split):
+        with open_file(piece.path) as file:
+            try:
+                for name in schema.FIELDS:
+                    total += file[split][name].id.get_storage_size()
+            except READ_ERRORS as error:
+                raise damage(piece.path, split, name, error) from error
     return total
 
 
 def tables(described: dict[str, Any]) -> Iterator[Table | str]:
     """Lays out what `describe` gathered, for a terminal."""
     grid, generator = described["grid"], described["generator"]
+    files = f" in {described['files']} files" if described["files"] > 1 else ""
     yield (
         f"{described['path']}: {described['id']}, format {described['format_version']}, "
-        f"{described['bytes'] / 1e6:.1f} MB, written by {generator['package']} {generator['version']}"
+        f"{described['bytes'] / 1e6:.1f} MB{files}, written by {generator['package']} {generator['version']}"
     )
     yield (
         f"maps of {grid['height']} × {grid['width']} cells of {grid['resolution_m']:g} m, "

@@ -1,6 +1,7 @@
 """A split as a map-style PyTorch dataset, for training loops of one's own."""
 
 import os
+from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,18 +13,21 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, find_dataset, open_file
 from benchnav.errors import DatasetError
+
+# Files that a process keeps open; far fewer than systems allow.
+_MOST_OPEN = 100
 
 
 class TerrainMaps(Dataset[dict[str, Tensor]]):
     """The maps of a split, each a dict of tensors by field.
 
-    Safe under DataLoader workers, forked or spawned: each process opens the file for itself, at its
-    first map. Only the fields asked for are read.
+    Safe under DataLoader workers, forked or spawned: each process opens files for itself, at the first map of
+    each. Only the fields asked for are read.
 
     Args:
-        path: dataset file, or the id of one at hand.
+        path: dataset file or folder, or the id of one at hand.
         split: name of one of its splits.
         fields: names of `schema.FIELDS`.
         in_memory: read all maps at once, here; worth it for what is read many times.
@@ -51,11 +55,12 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
                 f"Expected `fields` among {list(schema.FIELDS)}, got {unknown or list(fields)}."
             )
         self._maps = self.dataset.map_count(split)
+        self._pieces = self.dataset.pieces(split)
         self._memory: dict[str, Tensor] | None = None
         if in_memory:
             read = self.dataset.read(split, fields=self.fields)
             self._memory = {name: torch.from_numpy(values) for name, values in read.items()}
-        self._opened: tuple[int, dict[str, h5py.Dataset]] | None = None
+        self._opened: tuple[int, dict[Path, dict[str, h5py.Dataset]]] = (0, {})
 
     def __len__(self) -> int:
         """Number of maps."""
@@ -75,20 +80,26 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         index = int(index) % len(self)
         if self._memory is not None:
             return {name: values[index].clone() for name, values in self._memory.items()}
+        piece = self._pieces[bisect_right(self._pieces, index, key=lambda piece: piece.first) - 1]
         sample, name = {}, self.fields[0]
         try:
-            for name, array in self._arrays().items():
-                sample[name] = torch.from_numpy(np.asarray(array[index]))
+            for name, array in self._arrays(piece.path).items():
+                sample[name] = torch.from_numpy(np.asarray(array[index - piece.first]))
         except READ_ERRORS as error:
-            raise self.dataset.damage(self.split, name, error) from error
+            raise damage(piece.path, self.split, name, error) from error
         return sample
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leaves out the open file, so that it may be sent to other processes."""
-        return self.__dict__ | {"_opened": None}
+        """Leaves out the open files, so that it may be sent to other processes."""
+        return self.__dict__ | {"_opened": (0, {})}
 
-    def _arrays(self) -> dict[str, h5py.Dataset]:
-        if self._opened is None or self._opened[0] != os.getpid():
-            group = self.dataset.open()[self.split]
-            self._opened = os.getpid(), {name: group[name] for name in self.fields}
-        return self._opened[1]
+    def _arrays(self, path: Path) -> dict[str, h5py.Dataset]:
+        if self._opened[0] != os.getpid():
+            self._opened = os.getpid(), {}
+        opened = self._opened[1]
+        if path not in opened:
+            if len(opened) == _MOST_OPEN:
+                opened.pop(next(iter(opened)))
+            group = open_file(path)[self.split]
+            opened[path] = {name: group[name] for name in self.fields}
+        return opened[path]

@@ -1,8 +1,13 @@
-"""Combines datasets: splits side by side, and those of one name end to end."""
+"""Combines datasets: splits side by side, those of one name end to end; and the shares of one dataset.
+
+What is merged is packed already: files are copied into a folder, or their chunks into one file.
+"""
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, is_dataclass
+from contextlib import ExitStack
+from dataclasses import asdict, is_dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -10,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from benchnav.datagen import schema
-from benchnav.datagen.files.block import BLOCK_MAPS, Block, spans
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.writer import check_target, writing
+from benchnav.datagen.files.create import join
+from benchnav.datagen.files.folder import Contents, write_manifest
+from benchnav.datagen.files.reader import TerrainDataset, is_dataset
+from benchnav.datagen.files.writer import check_target, named_errors
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
 from benchnav.errors import ConfigError, DatasetError
+from benchnav.files import sole_writer
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
@@ -25,20 +32,69 @@ _SHARED = (
 
 
 def merge(
-    paths: Sequence[Path], out: Path, dataset_id: str, overwrite: bool = False
+    paths: Sequence[Path], out: Path, dataset_id: str = "", overwrite: bool = False
 ) -> Iterator[tuple[int, int]]:
-    """Writes the maps of several datasets to one; yields (maps done, maps in all).
+    """Writes the maps of several datasets, or of the shares of one, to one; yields (maps done, maps in all).
 
     Args:
-        paths: two or more files. The first fixes the order of splits.
-        out: file to write.
-        dataset_id: id of the new dataset.
-        overwrite: replace a file that is there.
+        paths: two or more datasets, of which the first fixes the order of splits; or folders of shares.
+        out: file to write, of suffix `.h5`; else a folder.
+        dataset_id: id of the new dataset; the name of `out` when empty. Shares keep that of their recipe.
+        overwrite: replace what is there.
 
     Raises:
-        DatasetError: the datasets are unlike, with every reason; one is damaged; or `out` exists.
+        DatasetError: the datasets are unlike, with every reason; one is damaged; shares are missing; or `out` exists.
     """
-    check_target(out, overwrite=True)
+    whole = [path for path in paths if is_dataset(path) or not path.is_dir()]
+    if whole and len(whole) < len(paths):
+        raise DatasetError("Expected either datasets or shares of one dataset, got both.")
+    contents = _of_datasets(whole, dataset_id or out.stem) if whole else _of_shares(paths)
+    total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
+    is_file = out.suffix == ".h5"
+    with named_errors(out), sole_writer(out, str(out)):
+        if is_file:
+            check_target(out, overwrite)
+        elif out.exists() and not overwrite:
+            raise DatasetError(
+                f"Expected `out` to be a new folder, but {out} exists. Pass --overwrite to replace it."
+            )
+        for split, files in contents.files.items():
+            for path in files:
+                for count in _check(TerrainDataset(path), split):
+                    done += count
+                    yield done, total
+        if is_file:
+            join(out, contents)
+        else:
+            _copy(out, contents)
+
+
+def _copy(out: Path, contents: Contents) -> None:
+    """Copies files into a folder that takes its place when it is whole."""
+    partial = out.with_name(f".{out.name}.partial")
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, partial, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        copies: dict[Path, Path] = {}
+        for files in contents.files.values():
+            for path in files:
+                if path not in copies:
+                    taken = {copy.name for copy in copies.values()}
+                    name = path.name if path.name not in taken else f"{len(copies)}-{path.name}"
+                    copies[path] = Path(shutil.copy2(path, partial / name))
+        copied = {split: [copies[path] for path in own] for split, own in contents.files.items()}
+        write_manifest(partial, replace(contents, files=copied))
+        if out.exists():
+            dropped = out.with_name(f".{out.name}.dropped")
+            out.rename(dropped)
+            partial.rename(out)
+            shutil.rmtree(dropped)
+        else:
+            partial.rename(out)
+
+
+def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
     datasets = [TerrainDataset(path) for path in paths]
     reasons = list(why_unlike(datasets))
     if len(datasets) < 2:
@@ -50,15 +106,52 @@ def merge(
     if reasons:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
     recipes, splits = _table_of_contents(datasets)
-    total, done = sum(entry["maps"] for entry in splits.values()), 0
-    with writing(out, dataset_id, recipes, splits, overwrite) as write:
-        for split in splits:
-            for dataset in datasets:
-                maps = dataset.splits.get(split, {"maps": 0})["maps"]
-                for start, stop in spans(maps, BLOCK_MAPS):
-                    write(split, _read_checked(dataset, split, range(start, stop)))
-                    done += stop - start
-                    yield done, total
+    files = {
+        split: [
+            piece.path for dataset in datasets if split in dataset.splits for piece in dataset.pieces(split)
+        ]
+        for split in splits
+    }
+    return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files)
+
+
+def _of_shares(folders: Sequence[Path]) -> Contents:
+    """Gathers the shards that lie in folders.
+
+    Raises:
+        DatasetError: there are none, they are of several recipes or versions, or some are missing.
+    """
+    shards = [TerrainDataset(path) for folder in folders for path in sorted(folder.glob("*.h5"))]
+    if not shards:
+        raise DatasetError(
+            f"Expected datasets or shares of one, got {', '.join(map(str, folders))} without any."
+        )
+    first = shards[0].manifest
+    for shard in shards:
+        for name in ("recipes", "generator"):
+            if shard.manifest[name] != first[name]:
+                raise DatasetError(
+                    f"Expected shares of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
+                )
+    recipe = recipe_from_dict(first["recipes"][0], f"in {shards[0].path}")
+    splits: dict[str, Any] = {}
+    files: dict[str, list[Path]] = {}
+    lacking = []
+    for name, spec in recipe.splits.items():
+        own = {shard.splits[name]["parts"][0]["first"]: shard for shard in shards if name in shard.splits}
+        place, files[name] = 0, []
+        for begin in sorted(own):
+            if begin != place:
+                lacking.append(f"maps {place}–{begin - 1} of {name}")
+            files[name].append(own[begin].path)
+            place = begin + own[begin].splits[name]["maps"]
+        if place != spec.maps:
+            lacking.append(f"maps {place}–{spec.maps - 1} of {name}")
+        part = {"maps": spec.maps, "recipe": 0, "split": name, "first": 0}
+        splits[name] = {"scenario": spec.scenario, "maps": spec.maps, "parts": [part]}
+    if lacking:
+        raise DatasetError(f"Expected all shares of {recipe.id}, got none with {'; '.join(lacking)}.")
+    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
 
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
@@ -130,11 +223,16 @@ def _table_of_contents(datasets: Sequence[TerrainDataset]) -> tuple[list[Recipe]
     return recipes, splits
 
 
-def _read_checked(dataset: TerrainDataset, split: str, indices: range) -> Block:
-    block = Block.of(dataset.read(split, indices))
-    if not np.array_equal(dataset.entry_digests(split, indices), block.digests):
-        raise DatasetError(
-            f"Maps of split {split!r} in {dataset.path} do not match their digests. "
-            "Run `benchnav-datagen validate` on it, and `repair`."
-        )
-    return block
+def _check(dataset: TerrainDataset, split: str) -> Iterator[int]:
+    """Holds maps against their digests, yielding how many.
+
+    Raises:
+        DatasetError: one does not match.
+    """
+    for indices, maps in dataset.chunks(split):
+        if not np.array_equal(dataset.entry_digests(split, indices), schema.entry_digests(maps)):
+            raise DatasetError(
+                f"Maps of split {split!r} in {dataset.path} do not match their digests. "
+                "Run `benchnav-datagen validate` on it, which says how to make it anew."
+            )
+        yield len(indices)

@@ -1,11 +1,13 @@
-"""Reading datasets of formats 1.0 and 1.1 (HDF5).
+"""Reading datasets of formats 1.0 to 1.2: a file (HDF5), or a folder of such files with one manifest.
 
-Readers open the file at each call, so they may be passed to other processes.
+Readers open files at each call, so they may be passed to other processes. Letters in shapes: B maps.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +26,32 @@ from benchnav.mixture import TraversabilityMixture
 from benchnav.terrain import Grid, Terrain
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
-READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, MemoryError)
+READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
+
+CHUNK_CELLS = 2**17
+FOLDER_MANIFEST = "manifest.json"
 
 
-class TerrainDataset:
-    """Reads a dataset of format 1.0 or 1.1.
+@dataclass(frozen=True, kw_only=True)
+class Piece:
+    """What one file holds of a split: all maps under the split's name.
 
     Args:
         path: the file.
+        first: place of its first map in the split.
+        maps: how many it holds.
+    """
+
+    path: Path
+    first: int
+    maps: int
+
+
+class TerrainDataset:
+    """Reads a dataset.
+
+    Args:
+        path: the file, or the folder.
 
     Raises:
         DatasetError: there is no such file, or it is damaged, foreign, or of a newer format.
@@ -40,13 +60,7 @@ class TerrainDataset:
     def __init__(self, path: str | Path) -> None:
         """Reads and checks the manifest."""
         self.path = Path(path)
-        if not self.path.is_file():
-            raise DatasetError(
-                f"Expected a dataset file, got {self.path}, which is not there. "
-                "Make one with `benchnav-datagen create`."
-            )
-        with self.open() as file:
-            self.manifest: dict[str, Any] = self._read_manifest(file)
+        self.manifest: dict[str, Any] = read_manifest(self.path)
 
     @property
     def id(self) -> str:
@@ -101,8 +115,7 @@ class TerrainDataset:
                 raise DatasetError(
                     f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen.tolist()}."
                 )
-        with self.open() as file:
-            return {name: self._read_array(file, split, name, indices) for name in names}
+        return self._read(split, names, indices)
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
@@ -111,23 +124,62 @@ class TerrainDataset:
             DatasetError: no such split, or a stored chunk is damaged.
         """
         self.map_count(split)
-        with self.open() as file:
-            return self._read_array(file, split, schema.ENTRY_DIGESTS, indices)
+        return self._read(split, (schema.ENTRY_DIGESTS,), indices)[schema.ENTRY_DIGESTS]
 
-    def _read_array(
-        self, file: h5py.File, split: str, name: str, indices: Sequence[int] | None
-    ) -> np.ndarray:
+    def chunks(
+        self, split: str, fields: Iterable[str] | None = None, cells: int = CHUNK_CELLS
+    ) -> Iterator[tuple[range, Maps]]:
+        """Reads a split from its first map to its last, some maps at a time.
+
+        Args:
+            split: name of a split.
+            fields: which fields; None for all.
+            cells: most cells at a time, but for one map that has more.
+
+        Yields:
+            Which maps, and what `read` gives of them.
+        """
+        names = None if fields is None else tuple(fields)
+        size = max(1, cells // (self.grid.height * self.grid.width))
+        count = self.map_count(split)
+        for first in range(0, count, size):
+            indices = range(first, min(first + size, count))
+            yield indices, self.read(split, indices, names)
+
+    def pieces(self, split: str) -> list[Piece]:
+        """The files that hold a split's maps, in their order."""
+        count = self.map_count(split)
+        if "shards" not in self.manifest:
+            return [Piece(path=self.path, first=0, maps=count)]
+        shards = self.manifest["shards"][split]
+        firsts = accumulate((shard["maps"] for shard in shards), initial=0)
+        return [
+            Piece(path=self.path / shard["file"], first=first, maps=shard["maps"])
+            for shard, first in zip(shards, firsts, strict=False)
+        ]
+
+    def _read(self, split: str, names: Sequence[str], indices: Sequence[int] | None) -> Maps:
+        pieces = self.pieces(split)
+        if indices is None:
+            return _joined([self._read_piece(split, piece, names, slice(None)) for piece in pieces])
         # HDF5 reads ascending indices, each once; the asked order is made afterwards.
-        everything = (slice(None), slice(None))
-        chosen, order = (
-            everything
-            if indices is None
-            else np.unique(np.asarray(indices, dtype=np.int64), return_inverse=True)
-        )
-        try:
-            return file[split][name][chosen][order]
-        except READ_ERRORS as error:
-            raise self.damage(split, name, error) from error
+        chosen, order = np.unique(np.asarray(indices, dtype=np.int64), return_inverse=True)
+        ends = [piece.first + piece.maps for piece in pieces]
+        parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
+        wanted = [(piece, part) for piece, part in zip(pieces, parts, strict=True) if len(part)]
+        wanted = wanted or [(pieces[0], chosen)]  # of no map the shape is still asked
+        read = _joined([self._read_piece(split, piece, names, part - piece.first) for piece, part in wanted])
+        return {name: values[order] for name, values in read.items()}
+
+    def _read_piece(self, split: str, piece: Piece, names: Sequence[str], which: Any) -> Maps:
+        with open_file(piece.path) as file:
+            read = {}
+            for name in names:
+                try:
+                    read[name] = _values(file[split][name], which)
+                except READ_ERRORS as error:
+                    raise damage(piece.path, split, name, error) from error
+            return read
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> Terrain:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
@@ -145,50 +197,86 @@ class TerrainDataset:
             )
         return self.splits[split]["maps"]
 
-    def open(self) -> h5py.File:
-        """Opens the file for reading.
 
-        Raises:
-            DatasetError: it is no HDF5 file, or its structure is damaged.
-        """
-        try:
-            return h5py.File(self.path, "r")
-        except FileNotFoundError as error:
-            raise DatasetError(
-                f"Expected a dataset file, got {self.path}, which is not there any more."
-            ) from error
-        except OSError as error:
-            raise DatasetError(f"{self.path} is no readable HDF5 file: {error}. Make it again.") from error
+def open_file(path: Path) -> h5py.File:
+    """Opens a file for reading.
 
-    def damage(self, split: str, field: str, error: Exception) -> DatasetError:
-        """Says that a field cannot be read, and what to do."""
-        return DatasetError(
-            f"Field {field!r} of split {split!r} in {self.path} is damaged: {error}. Run `benchnav-datagen "
-            "validate` on the file, and `benchnav-datagen repair` to make its damaged maps anew."
-        )
+    Raises:
+        DatasetError: it is not there, is no HDF5 file, or its structure is damaged.
+    """
+    try:
+        return h5py.File(path, "r")
+    except FileNotFoundError as error:
+        raise DatasetError(f"Expected a dataset file, got {path}, which is not there any more.") from error
+    except OSError as error:
+        raise DatasetError(f"{path} is no readable HDF5 file: {error}. Make it again.") from error
 
-    def _read_manifest(self, file: h5py.File) -> dict[str, Any]:
-        try:
-            if schema.MANIFEST not in file:
-                raise DatasetError(
-                    f"Expected a {schema.FORMAT} file with a manifest, got {self.path} without one."
-                )
-            text = file[schema.MANIFEST][()]
-            manifest = json.loads(text)
-            kind, version = manifest["format"], manifest["format_version"]
-            major, minor = (int(part) for part in version.split("."))
-            if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
-                return schema.unseal(text)
-        except READ_ERRORS as error:
-            raise DatasetError(
-                f"The manifest of {self.path} is damaged: {str(error)[:200]}. Make the file again."
-            ) from error
-        if kind != schema.FORMAT:
-            raise DatasetError(f"Expected format {schema.FORMAT!r} in {self.path}, got {kind!r}.")
+
+def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError:
+    """Says that a field cannot be read, and what to do."""
+    return DatasetError(
+        f"Field {field!r} of split {split!r} in {path} is damaged: {error}. Run `benchnav-datagen validate` "
+        "on the dataset, which says how to make it anew."
+    )
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Reads the manifest of a file or a folder.
+
+    Raises:
+        DatasetError: there is none, or it is damaged, foreign, or of a newer format.
+    """
+    if not path.exists():
         raise DatasetError(
-            f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {self.path}, "
-            f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+            f"Expected a dataset file, got {path}, which is not there. "
+            "Make one with `benchnav-datagen create`."
         )
+    try:
+        text = _manifest_text(path)
+        manifest = json.loads(text)
+        kind, version = manifest["format"], manifest["format_version"]
+        major, minor = (int(part) for part in version.split("."))
+        if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
+            return schema.unseal(text)
+    except (*READ_ERRORS, TypeError, AttributeError) as error:
+        raise DatasetError(
+            f"The manifest of {path} is damaged: {str(error)[:200]}. Make the dataset again."
+        ) from error
+    if kind != schema.FORMAT:
+        raise DatasetError(f"Expected format {schema.FORMAT!r} in {path}, got {kind!r}.")
+    raise DatasetError(
+        f"Expected format version at most {'.'.join(map(str, schema.FORMAT_VERSION))} in {path}, "
+        f"got {version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+    )
+
+
+def _values(array: h5py.Dataset, which: Any) -> np.ndarray:
+    """Some maps of an array; one at a time where they cannot be read together, which may be for want of memory."""
+    try:
+        return array[which]
+    except OSError:
+        indices = np.arange(len(array))[which]
+        return np.concatenate([array[index : index + 1] for index in indices])
+
+
+def _manifest_text(path: Path) -> str | bytes:
+    if path.is_dir():
+        if not (path / FOLDER_MANIFEST).is_file():
+            raise DatasetError(
+                f"Expected a folder with a finished dataset, got {path} without {FOLDER_MANIFEST}. "
+                "Finish it by the command that began it, or by `benchnav-datagen merge` of its shares."
+            )
+        return (path / FOLDER_MANIFEST).read_text()
+    with open_file(path) as file:
+        if schema.MANIFEST not in file:
+            raise DatasetError(f"Expected a {schema.FORMAT} file with a manifest, got {path} without one.")
+        return file[schema.MANIFEST][()]
+
+
+def _joined(parts: Sequence[Maps]) -> Maps:
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
@@ -235,17 +323,22 @@ def dataset_folders() -> list[Path]:
     return [here] if here.resolve() == shipped.resolve() else [here, shipped]
 
 
+def is_dataset(path: Path) -> bool:
+    """Whether there is a file, or a folder with the manifest of a finished dataset."""
+    return path.is_file() or (path / FOLDER_MANIFEST).is_file()
+
+
 def find_dataset(source: str | Path) -> Path:
     """Finds a dataset by path, or by id in `dataset_folders`.
 
     Raises:
         DatasetError: neither is there.
     """
-    if Path(source).is_file():
-        return Path(source)
+    if is_dataset(Path(source)) or any(Path(source).glob("*.h5")):
+        return Path(source)  # of shards without a manifest the reader tells what to do
     for folder in dataset_folders():
-        for name in (f"{source}.h5", f"{source}-test.h5"):
-            if (folder / name).is_file():
+        for name in (f"{source}.h5", f"{source}", f"{source}-test.h5"):
+            if is_dataset(folder / name):
                 return folder / name
     if Path(source).suffix == ".h5":
         raise DatasetError(

@@ -1,30 +1,133 @@
-"""Writing dataset files (HDF5), whole or not at all, one writer at a time.
+"""Writing dataset files (HDF5), whole or not at all.
 
-What is unfinished lives in the folder `.NAME.partial` beside the target, whose name never holds a
-partial file.
+HDF5's own filters compress and checksum: byte shuffle, deflate, Fletcher-32. Letters in shapes: B maps.
 """
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 import benchnav
 from benchnav.datagen import schema
-from benchnav.datagen.files import block
-from benchnav.datagen.files.block import Block
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import DatasetError
-from benchnav.files import sole_writer
+from benchnav.files import replacing
 
+# Structures of HDF5 1.10 carry checksums of their own, so that damage to them is found as well.
+_LIBRARY = ("v110", "v110")
+
+_VALUES_A_CHUNK = 1024
 # Room for what is not maps: HDF5's structures, small fields, digests, manifest.
 _SPARE_BYTES = 1 << 18
-_SPARE_BYTES_A_MAP = 512
+_SPARE_BYTES_A_MAP = 1024
+
+
+class Writer:
+    """Fills an open file with a dataset, each split's maps in their order.
+
+    Args:
+        file: empty.
+        dataset_id: name and version of the dataset.
+        recipes: what the splits' parts refer to by number. The first gives grid and class table.
+        splits: by name, the manifest's entry of each split without its digest.
+    """
+
+    def __init__(
+        self,
+        file: h5py.File,
+        dataset_id: str,
+        recipes: Sequence[Recipe],
+        splits: Mapping[str, Mapping[str, Any]],
+    ) -> None:
+        """Makes the empty arrays."""
+        self._file, self._id, self._recipes, self._splits = file, dataset_id, recipes, splits
+        height, width = recipes[0].grid.shape
+        # Kept until all is written: HDF5 writes an array out when it is let go.
+        self._arrays = {
+            name: _new_arrays(file.create_group(name), entry["maps"], height, width)
+            for name, entry in splits.items()
+        }
+        self._digests = {
+            name: schema.SplitDigest(entry["maps"], height, width) for name, entry in splits.items()
+        }
+        self._written = dict.fromkeys(splits, 0)
+
+    def add(self, split: str, maps: Mapping[str, np.ndarray]) -> None:
+        """Writes the next maps of a split, every field of `schema.FIELDS` of shape [B, *entry shape]."""
+        digests = schema.entry_digests(maps)
+        for name in schema.FIELDS:
+            self._put(split, name, maps[name])
+        self._finish(split, digests)
+
+    def copy(self, split: str, stored: h5py.Group) -> None:
+        """Writes all maps of a stored split as the next ones; what is packed alike is not unpacked."""
+        for name in schema.FIELDS:
+            target = self._arrays[split][name]
+            if name in schema.MAP_FIELDS and _packing(stored[name]) == _packing(target):
+                _copy_chunks(stored[name], target, self._written[split])
+            else:
+                self._put(split, name, stored[name][:])
+        self._finish(split, stored[schema.ENTRY_DIGESTS][:])
+
+    def close(self) -> None:
+        """Writes the manifest."""
+        assert self._written == {name: entry["maps"] for name, entry in self._splits.items()}
+        splits = {
+            name: {**entry, "digest": self._digests[name].hexdigest()} for name, entry in self._splits.items()
+        }
+        text = schema.seal(manifest_of(self._id, self._recipes, splits)).encode()
+        self._file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
+        self._file.flush()
+
+    def _put(self, split: str, name: str, values: np.ndarray) -> None:
+        first = self._written[split]
+        self._arrays[split][name][first : first + len(values)] = values
+
+    def _finish(self, split: str, digests: np.ndarray) -> None:
+        self._put(split, schema.ENTRY_DIGESTS, digests)
+        self._digests[split].update(digests)
+        self._written[split] += len(digests)
+
+
+def manifest_of(
+    dataset_id: str, recipes: Sequence[Recipe], splits: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """The manifest of a dataset, of splits with their digests."""
+    return {
+        "format": schema.FORMAT,
+        "format_version": schema.version_of([recipe.synthesis for recipe in recipes]),
+        "id": dataset_id,
+        "generator": {"package": "benchnav", "version": benchnav.__version__},
+        "fields": schema.field_table(*recipes[0].grid.shape),
+        "splits": dict(splits),
+        "recipes": [recipe.to_dict() for recipe in recipes],
+    }
+
+
+def pack(
+    dataset_id: str, recipe: Recipe, split: str, entry: Mapping[str, Any], maps: Mapping[str, np.ndarray]
+) -> bytes:
+    """Makes what a file of a few maps of one split holds, in memory.
+
+    Args:
+        dataset_id: name and version of the dataset.
+        recipe: by which they were made.
+        split: name of the split.
+        entry: the manifest's entry of the split without its digest.
+        maps: every field of `schema.FIELDS` of shape [B, *entry shape].
+    """
+    with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
+        writer = Writer(file, dataset_id, [recipe], {split: entry})
+        writer.add(split, maps)
+        writer.close()
+        return file.id.get_file_image()
 
 
 def check_target(path: Path, overwrite: bool) -> None:
@@ -45,118 +148,35 @@ def check_target(path: Path, overwrite: bool) -> None:
 def writing(
     path: Path,
     dataset_id: str,
-    recipes: list[Recipe],
-    splits: dict[str, dict[str, Any]],
-    overwrite: bool = False,
-) -> Iterator[Callable[[str, Block], None]]:
-    """Writes a dataset file, in a workspace of its own that it leaves no trace of.
+    recipes: Sequence[Recipe],
+    splits: Mapping[str, Mapping[str, Any]],
+    room: int,
+) -> Iterator[Writer]:
+    """Writes a dataset file that takes its place when it is whole.
 
     Args:
         path: file to write or replace.
         dataset_id: name and version of the dataset.
         recipes: what the splits' parts refer to by number. The first gives grid and class table.
         splits: by name, the manifest's entry of each split without its digest.
-        overwrite: replace a file that is there.
-
-    Yields:
-        A function to be given every block with the name of its split, each split's in the order of
-        its maps.
+        room: bytes that the maps take at most.
     """
-    with named_errors(path), workspace(path, overwrite) as folder:
-        try:
-            with writing_into(folder, path, dataset_id, recipes, splits) as write:
-                yield write
-        finally:
-            # What a killed run made of the same name is not this one's to remove.
-            if not any(folder.glob("*.block")):
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def writing_into(
-    folder: Path, path: Path, dataset_id: str, recipes: list[Recipe], splits: dict[str, dict[str, Any]]
-) -> Iterator[Callable[[str, Block], None]]:
-    """Writes a dataset file in a folder from `workspace`; see `writing`."""
-    height, width = recipes[0].grid.shape
-    digests = {name: schema.SplitDigest(entry["maps"], height, width) for name, entry in splits.items()}
-    written = dict.fromkeys(splits, 0)
-    unfinished = folder / "unfinished.h5"
-    room = _SPARE_BYTES + _SPARE_BYTES_A_MAP * sum(entry["maps"] for entry in splits.values())
-    try:
-        # Structures of HDF5 1.10 carry checksums of their own, so damage to them is found as well.
-        with h5py.File(unfinished, "w", libver=("v110", "v110")) as file, open(unfinished, "rb+") as raw:
-            _reserve(raw.fileno(), room)
-            arrays = {
-                name: block.new_split(file, name, entry["maps"], height, width)
-                for name, entry in splits.items()
-            }
-
-            def write(split: str, made: Block) -> None:
-                nonlocal room
-                room += sum(len(chunk) for encoded in made.chunks.values() for chunk in encoded)
-                _reserve(raw.fileno(), room)
-                block.write(arrays[split], written[split], made)
-                digests[split].update(made.digests)
-                written[split] += len(made)
-
-            yield write
-            assert written == {name: entry["maps"] for name, entry in splits.items()}
-            manifest = {
-                "format": schema.FORMAT,
-                "format_version": schema.version_of([recipe.synthesis for recipe in recipes]),
-                "id": dataset_id,
-                "generator": {"package": "benchnav", "version": benchnav.__version__},
-                "fields": schema.field_table(height, width),
-                "splits": {
-                    name: {**entry, "digest": digests[name].hexdigest()} for name, entry in splits.items()
-                },
-                "recipes": [recipe.to_dict() for recipe in recipes],
-            }
-            text = schema.seal(manifest).encode()
-            file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
-            file.flush()
+    room += _SPARE_BYTES + _SPARE_BYTES_A_MAP * sum(entry["maps"] for entry in splits.values())
+    with replacing(path) as unfinished:
+        with h5py.File(unfinished, "w", libver=_LIBRARY) as file:
+            _reserve(unfinished, room)
+            writer = Writer(file, dataset_id, recipes, splits)
+            yield writer
+            writer.close()
             size = file.id.get_filesize()
-        with open(unfinished, "rb+") as finished:
-            finished.truncate(size)
-            os.fsync(finished.fileno())
+        os.truncate(unfinished, size)
         if path.exists():
             shutil.copymode(path, unfinished)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def _reserve(descriptor: int, size: int) -> None:
-    """Takes room on the disk ahead of HDF5, which crashes if it meets a full one.
-
-    Raises:
-        OSError: there is no such room.
-    """
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(descriptor, 0, size)
-
-
-@contextmanager
-def workspace(path: Path, overwrite: bool) -> Iterator[Path]:
-    """Holds the folder for what is unfinished of a file, for one process; a kill frees it.
-
-    Raises:
-        BenchnavError: another process holds it.
-        DatasetError: the file is there, and not to be replaced.
-    """
-    folder = path.parent / f".{path.name}.partial"
-    with sole_writer(path, str(path)):
-        folder.mkdir(exist_ok=True)
-        # Asked here, since another run may have finished it before this one came to hold the folder.
-        if path.exists() and not overwrite:
-            shutil.rmtree(folder, ignore_errors=True)
-        check_target(path, overwrite)
-        yield folder
 
 
 @contextmanager
 def named_errors(path: Path) -> Iterator[None]:
-    """Tells which file could not be written.
+    """Tells which dataset could not be written.
 
     Raises:
         DatasetError: the system, or HDF5, could not write.
@@ -175,3 +195,47 @@ def named_errors(path: Path) -> Iterator[None]:
             f"Could not write {path}: {reason}. Its name holds what it held before; when that is mended, "
             "give the same command again."
         ) from error
+
+
+def _new_arrays(group: h5py.Group, maps: int, height: int, width: int) -> dict[str, h5py.Dataset]:
+    """The empty arrays of a split, those of cells with a map a chunk."""
+    shapes = {name: field.entry_shape(height, width) for name, field in schema.FIELDS.items()}
+    kinds = {name: field.dtype for name, field in schema.FIELDS.items()}
+    shapes[schema.ENTRY_DIGESTS], kinds[schema.ENTRY_DIGESTS] = (
+        (len(schema.FIELDS), schema.DIGEST_BYTES),
+        "|u1",
+    )
+    arrays = {}
+    for name, entry in shapes.items():
+        chunk = 1 if name in schema.MAP_FIELDS else max(1, min(maps, _VALUES_A_CHUNK))
+        arrays[name] = group.create_dataset(
+            name, (maps, *entry), kinds[name], chunks=(chunk, *entry),
+            shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
+        )  # fmt: skip
+        if name in schema.FIELDS:
+            arrays[name].attrs["unit"] = schema.FIELDS[name].unit
+            arrays[name].attrs["meaning"] = schema.FIELDS[name].meaning
+    return arrays
+
+
+def _packing(array: h5py.Dataset) -> tuple[object, ...]:
+    """What has to be alike for a chunk of one array to be one of another; the level of deflate need not be."""
+    return array.dtype.str, array.chunks, array.shuffle, array.compression, array.fletcher32
+
+
+def _copy_chunks(source: h5py.Dataset, target: h5py.Dataset, first: int) -> None:
+    within = (0,) * (source.ndim - 1)
+    for index in range(len(source)):
+        mask, chunk = source.id.read_direct_chunk((index, *within))
+        target.id.write_direct_chunk((first + index, *within), chunk, mask)
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Takes room on the disk ahead of HDF5, which crashes if it meets a full one.
+
+    Raises:
+        OSError: there is no such room.
+    """
+    if hasattr(os, "posix_fallocate"):
+        with open(path, "rb+") as raw:
+            os.posix_fallocate(raw.fileno(), 0, size)

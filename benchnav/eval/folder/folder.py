@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.shard import Shard
 from benchnav.eval.keep import Keep
 from benchnav.eval.trial import Trial, trial_from
 from benchnav.eval.unit import Extent, Unit
 from benchnav.files import replacing, write_text
+from benchnav.share import Share
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 3
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
@@ -45,7 +45,7 @@ class Run:
     about: dict[str, Any]
     version: int
     trials: dict[str, tuple[Trial, Extent]]
-    shard: Shard | None = None
+    shard: Share | None = None
 
 
 def open_run(folder: Path) -> Run:
@@ -64,7 +64,7 @@ def open_run(folder: Path) -> Run:
             )
         known = {} if version == 1 else about["trials"]
         trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in known.items()}
-        shard = Shard(**about["shard"]) if "shard" in about else None
+        shard = Share(**about["shard"]) if "shard" in about else None
         if not isinstance(about["suite"], dict):
             raise TypeError("no suite")
     except ConfigError:

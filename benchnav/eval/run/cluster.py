@@ -3,31 +3,25 @@
 Workers write nothing that lasts: the files that a unit makes come back as bytes, and the command that asked for
 them writes them. So workers share no disk with it, and a unit that was begun twice, since a worker died, is
 there once. Before each unit its worker compares what rows depend on with what the run was begun with.
-
-`distributed` is an extra of this package, imported when a cluster is asked for.
 """
 
-import logging
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, chdir, contextmanager, nullcontext
+from contextlib import chdir, contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import urlparse
 
 import joblib
 
+from benchnav import cluster
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.unit import Extent, Unit
 from benchnav.files import replacing
 
 RunUnit = Callable[[Unit, Path, str, float], None]
-
-_REACH_S = 5
-_WORKERS_S = 10
 
 
 @contextmanager
@@ -41,29 +35,7 @@ def connected(scheduler: str, planner_limit_s: float) -> Iterator[Any]:
     Raises:
         ConfigError: the scheduler cannot be reached, has no worker, or has one that is not fit.
     """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ConfigError(
-            f"Expected Dask for a cluster, got: {error}. Install it: pip install 'benchnav[dask]'"
-        ) from error
-    _check_address(scheduler)
-    with ExitStack() as stack:
-        stack.enter_context(_quiet())
-        try:
-            client = stack.enter_context(Client(scheduler, timeout=_REACH_S, set_as_default=False))
-        except (OSError, ValueError) as error:
-            raise ConfigError(
-                f"Expected `scheduler` to be the address of a running Dask scheduler, got {scheduler}, which gave "
-                f"no answer within {_REACH_S} s. Start one with `dask scheduler`."
-            ) from error
-        try:
-            client.wait_for_workers(1, timeout=_WORKERS_S)
-        except TimeoutError as error:
-            raise ConfigError(
-                f"Expected a cluster with workers, got {scheduler} with none for {_WORKERS_S} s. Start some with "
-                f"`dask worker {scheduler} --nworkers N --nthreads 1`."
-            ) from error
+    with cluster.connected(scheduler) as client:
         own = {
             "code": provenance.describe_code(),
             "datasets": {},
@@ -97,8 +69,8 @@ def run_on_cluster(
         joblib.delayed(_make)(run_unit, Path.cwd(), unit, about["run_id"], _subset(about, unit))
         for unit in missing
     )
-    with _told_when_lost(client.scheduler.address):
-        for unit, files in _parallel(client)(calls):
+    with cluster.told_when_lost(client.scheduler.address):
+        for unit, files in cluster.parallel(client)(calls):
             _store(folder, unit, files)
             yield
 
@@ -145,21 +117,6 @@ def check_worker(address: str, state: Mapping[str, Any] | BaseException, about: 
             f"Expected workers of the same code and data as this command's, but {address} differs in "
             f"{'; '.join(changed)}. Start it anew from the same environment."
         )
-
-
-def _parallel(client: Any) -> joblib.Parallel:
-    """Sends all calls at once, so that workers that join later have their share."""
-    from joblib._dask import DaskDistributedBackend
-
-    class Cluster(DaskDistributedBackend):
-        def effective_n_jobs(self, n_jobs: int) -> int:
-            # joblib would make the calls of a cluster of one worker in this process.
-            return max(2, super().effective_n_jobs(n_jobs))
-
-    backend = Cluster(client=client, wait_for_workers_timeout=_WORKERS_S)
-    return joblib.Parallel(
-        n_jobs=-1, backend=backend, return_as="generator_unordered", pre_dispatch="all", batch_size=1
-    )
 
 
 @cache
@@ -213,43 +170,3 @@ def _store(folder: Path, unit: Unit, files: Mapping[str, bytes]) -> None:
     for name in [*(name for name in sorted(files) if name != own), own]:
         with replacing(folder / name) as partial:
             partial.write_bytes(files[name])
-
-
-def _check_address(scheduler: str) -> None:
-    place = urlparse(scheduler)
-    try:
-        known = place.scheme in ("tcp", "tls") and place.hostname and place.port
-    except ValueError:  # a port that is no number
-        known = False
-    if not known:
-        raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
-
-
-@contextmanager
-def _told_when_lost(scheduler: str) -> Iterator[None]:
-    from distributed import CancelledError, KilledWorker
-
-    try:
-        yield
-    except CancelledError as error:
-        raise BenchnavError(
-            f"The scheduler at {scheduler} was lost. What was finished is kept: give the same command again."
-        ) from error
-    except KilledWorker as error:
-        raise BenchnavError(
-            f"A unit was given up, since several workers died over it, the last at {error.last_worker.address}: "
-            "see their logs, perhaps for want of memory. What was finished is kept."
-        ) from error
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps the library's own log off the terminal; what a user has to know is raised."""
-    levels = {name: logging.getLogger(name).level for name in ("distributed", "distributed.client")}
-    for name in levels:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)

@@ -21,12 +21,13 @@ from benchnav.eval.folder.folder import (
     unit_rows,
 )
 from benchnav.eval.folder.sameness import differences
-from benchnav.eval.folder.shard import Shard, shard_of
+from benchnav.eval.folder.shard import shard_of
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.driven_ground import keep_ground
 from benchnav.eval.unit import Unit, in_table_order, units
 from benchnav.files import replacing, sole_writer, write_text
+from benchnav.share import Share
 
 _NOT_OF_UNITS = ("units", "figures")
 
@@ -181,6 +182,6 @@ def _copy_rest(part: Path, folder: Path) -> None:
                 shutil.copyfile(path, partial)
 
 
-def _shard(run: Run) -> Shard:
+def _shard(run: Run) -> Share:
     assert run.shard is not None
     return run.shard

@@ -10,6 +10,7 @@ import shutil
 import traceback
 import warnings
 from collections.abc import Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 import joblib
 
-from benchnav.errors import ConfigError
+from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.changes import changed_options
 from benchnav.eval.folder.folder import (
@@ -33,7 +34,7 @@ from benchnav.eval.folder.folder import (
     write_errors,
     write_unit,
 )
-from benchnav.eval.folder.shard import Shard
+from benchnav.eval.folder.shard import shard_of
 from benchnav.eval.folder.steps import align_steps, write_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_suite
@@ -55,6 +56,7 @@ from benchnav.eval.trial import Trial, check_labels
 from benchnav.eval.unit import Extent, Unit, in_table_order, units
 from benchnav.files import sole_writer, write_text
 from benchnav.planning.world.outcome import Outcome
+from benchnav.share import Share
 
 Trials = dict[str, tuple[Trial, Extent]]
 
@@ -75,7 +77,7 @@ class Work:
     trials: Trials
     keep: Keep
     planner_limit_s: float = 0.0
-    shard: Shard | None = None
+    shard: Share | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +105,7 @@ def run_suite(
     overwrite: bool = False,
     planner_limit_s: float = 0.0,
     say: Say = lambda line: None,
-    shard: Shard | None = None,
+    shard: Share | None = None,
     scheduler: str = "",
 ) -> Iterator[tuple[int, int]]:
     """Runs what is not finished of a suite, yielding (units done, units in all); to be iterated to the end.
@@ -146,7 +148,7 @@ def run_work(
             _drop(folder)
         about, trials = _begin(work, folder, say)
         every = units(trials, work.keep)
-        own = [unit for unit in every if work.shard is None or work.shard.has(unit)]
+        own = [unit for unit in every if work.shard is None or shard_of(unit, work.shard.of) == work.shard]
         known = [(unit, about_unit(folder, unit, about["run_id"])) for unit in own]
         # With what it has kept, so that a run is never the poorer for being asked for more.
         missing = [
@@ -222,7 +224,13 @@ def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs:
         with warnings.catch_warnings():
             # A worker whose memory has grown is replaced; that is no concern of a user's.
             warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-            next(finished)
+            try:
+                next(finished)
+            except BrokenProcessPool as error:
+                raise BenchnavError(
+                    "A worker was killed, perhaps for want of memory. What was finished is kept: give the same "
+                    "command again, if need be with fewer `jobs`."
+                ) from error
         yield
 
 
@@ -278,7 +286,7 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
     return now, trials
 
 
-def _share(shard: Shard | None) -> str:
+def _share(shard: Share | None) -> str:
     return "a whole run" if shard is None else f"shard {shard} of one"
 
 

@@ -6,17 +6,21 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
-from benchnav.datagen.files.block import Block
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import BenchnavError, ConfigError, DatasetError
+from benchnav.share import Share
 from tests.factories import tiny_dataset, tiny_recipe
 
 ROOT = Path(__file__).parents[3]
+CELLS = 32 * 32  # of a map of the tiny recipe
 
 
 def digests(path: Path) -> dict[str, str]:
@@ -27,7 +31,7 @@ def creating(path: Path, train: int, jobs: int) -> subprocess.Popen[bytes]:
     code = (
         "from pathlib import Path; from tests.factories import tiny_recipe; "
         "from benchnav.datagen.files.create import create\n"
-        f"for _ in create(tiny_recipe(train={train}), Path({str(path)!r}), jobs={jobs}, block_maps=20): pass"
+        f"for _ in create(tiny_recipe(train={train}), Path({str(path)!r}), jobs={jobs}, shard_cells={20 * CELLS}): pass"
     )
     return subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True)
 
@@ -45,7 +49,7 @@ def test_digest_does_not_depend_on_workers_or_blocks(tmp_path: Path) -> None:
     found = []
     for name, jobs, block in (("a", 1, 100), ("b", 2, 3), ("c", 1, 5)):
         path = tmp_path / f"{name}.h5"
-        for _ in create(recipe, path, jobs=jobs, block_maps=block):
+        for _ in create(recipe, path, jobs=jobs, shard_cells=block * CELLS):
             pass
         found.append(digests(path))
     assert found[0] == found[1] == found[2]
@@ -61,11 +65,11 @@ def test_an_existing_file_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_blocks(tmp_path: Path, jobs: int) -> None:
+def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_shards(tmp_path: Path, jobs: int) -> None:
     path = tmp_path / "d.h5"
     process = creating(path, 4000, jobs)
     folder = tmp_path / ".d.h5.partial"
-    while len(list(folder.glob("*.block"))) < 4:
+    while len(list(folder.glob("*.h5"))) < 4:
         time.sleep(0.02)
         assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)
@@ -75,8 +79,8 @@ def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_blocks(tmp_pat
     while alive(process.pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not alive(process.pid)
-    finished = {block: block.stat().st_mtime_ns for block in folder.glob("*.block")}
-    steps = create(tiny_recipe(train=4000), path, block_maps=20)
+    finished = {block: block.stat().st_mtime_ns for block in folder.glob("*.h5")}
+    steps = create(tiny_recipe(train=4000), path, shard_cells=20 * CELLS)
     for _ in range(len(finished) - jobs):
         done, total = next(steps)
         assert total == 4009
@@ -89,21 +93,21 @@ def test_a_killed_run_leaves_no_file_and_no_process_and_keeps_its_blocks(tmp_pat
 def test_a_resumed_run_has_the_digest_of_an_unbroken_one(tmp_path: Path) -> None:
     recipe = tiny_recipe(train=12)
     broken, whole = tmp_path / "broken.h5", tmp_path / "whole.h5"
-    steps = create(recipe, broken, block_maps=4)
+    steps = create(recipe, broken, shard_cells=4 * CELLS)
     assert [next(steps) for _ in range(3)] == [(0, 21), (4, 21), (8, 21)]
     steps.close()
     assert not broken.exists()
-    kept = next((tmp_path / ".broken.h5.partial").glob("*.block"))
-    content = bytearray(kept.read_bytes())
-    content[len(content) // 2] ^= 1
-    resumed = create(recipe, broken, block_maps=4)
+    kept = next((tmp_path / ".broken.h5.partial").glob("*.h5"))
+    resumed = create(recipe, broken, shard_cells=4 * CELLS)
     assert next(resumed) == (8, 21)
     resumed.close()
-    # A block that the disk did not keep whole is made again.
-    kept.write_bytes(content)
-    assert not Block.is_whole(kept)
+    # A shard that is not whole is made again.
+    kept.write_bytes(kept.read_bytes()[:1000])
+    resumed = create(recipe, broken, shard_cells=4 * CELLS)
+    assert next(resumed) == (4, 21)
+    resumed.close()
     for path in (broken, whole):
-        for _ in create(recipe, path, block_maps=4):
+        for _ in create(recipe, path, shard_cells=4 * CELLS):
             pass
     assert digests(broken) == digests(whole)
     assert find_faults(broken) == []
@@ -112,22 +116,22 @@ def test_a_resumed_run_has_the_digest_of_an_unbroken_one(tmp_path: Path) -> None
 
 def test_blocks_of_another_recipe_are_dropped(tmp_path: Path) -> None:
     path = tmp_path / "d.h5"
-    steps = create(tiny_recipe(), path, block_maps=4)
+    steps = create(tiny_recipe(), path, shard_cells=4 * CELLS)
     next(steps)
     next(steps)
     steps.close()
     other = replace(tiny_recipe(), seed=3)
-    for _ in create(other, path, block_maps=4):
+    for _ in create(other, path, shard_cells=4 * CELLS):
         pass
     assert digests(path) == digests(tiny_dataset(tmp_path / "other.h5", other))
 
 
 def test_two_runs_on_one_file_refuse_each_other(tmp_path: Path) -> None:
     path = tmp_path / "d.h5"
-    first = create(tiny_recipe(), path, block_maps=4)
+    first = create(tiny_recipe(), path, shard_cells=4 * CELLS)
     next(first)
     with pytest.raises(BenchnavError, match="Another run"):
-        next(create(tiny_recipe(), path, block_maps=4))
+        next(create(tiny_recipe(), path, shard_cells=4 * CELLS))
     first.close()
 
 
@@ -140,14 +144,14 @@ def test_a_full_disk_is_named_and_leaves_no_half_file(tmp_path: Path, room: int)
         # No file may grow beyond this: writing fails as on a full disk.
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
         with pytest.raises(DatasetError, match=r"Could not write .*d\.h5"):
-            for _ in create(tiny_recipe(), path, block_maps=4):
+            for _ in create(tiny_recipe(), path, shard_cells=4 * CELLS):
                 pass
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
     assert not path.exists()
     left = {item.suffix for item in (tmp_path / ".d.h5.partial").iterdir()}
-    assert left <= {".block", ".json", ""}
+    assert left <= {".h5", ""}
     assert digests(tiny_dataset(path)) == digests(tiny_dataset(tmp_path / "whole.h5"))
 
 
@@ -168,5 +172,87 @@ def test_a_file_that_another_run_finished_meanwhile_is_kept(tmp_path: Path) -> N
         next(late)
     assert path.read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["d.h5"]
-    with pytest.raises(DatasetError, match="got the folder"):
+    with pytest.raises(DatasetError, match="holds d"):
         next(create(tiny_recipe(), tmp_path, overwrite=True))
+    assert path.exists()
+
+
+def make(path: Path, recipe: Recipe | None = None, **how: Any) -> Path:
+    for _ in create(recipe or tiny_recipe(), path, **{"shard_cells": 3 * CELLS, **how}):
+        pass
+    return path
+
+
+def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path) -> None:
+    folder, file = TerrainDataset(make(tmp_path / "d")), TerrainDataset(make(tmp_path / "d.h5"))
+    assert folder.digest == file.digest
+    assert folder.manifest["format_version"] == "1.2"
+    assert file.manifest["format_version"] == "1.0"
+    assert [piece.maps for piece in folder.pieces("train")] == [3, 3, 2]
+    for indices in (None, [7, 0, 3, 3], [], [2], range(2, 7)):
+        for name, values in folder.read("train", indices).items():
+            np.testing.assert_array_equal(values, file.read("train", indices)[name])
+        np.testing.assert_array_equal(
+            folder.entry_digests("train", indices), file.entry_digests("train", indices)
+        )
+    for dataset in (folder, file):
+        chunks = list(dataset.chunks("train", ["class_id"], cells=5 * CELLS))
+        assert [list(indices) for indices, _ in chunks] == [[0, 1, 2, 3, 4], [5, 6, 7]]
+        joined = np.concatenate([maps["class_id"] for _, maps in chunks])
+        np.testing.assert_array_equal(joined, file.read("train")["class_id"])
+    assert find_faults(tmp_path / "d") == []
+
+
+def test_shares_of_a_folder_are_made_by_any_number_of_processes(tmp_path: Path) -> None:
+    whole = make(tmp_path / "whole")
+    path = tmp_path / "d"
+    made = []
+    for index in (2, 1, 3):
+        steps = list(create(tiny_recipe(), path, share=Share(index=index, of=3), shard_cells=3 * CELLS))
+        made.append(steps[-1][1])
+        assert (path / "manifest.json").exists() == (index == 3)
+    assert sum(made) == 17
+    assert max(made) < 10
+    assert TerrainDataset(path).manifest == TerrainDataset(whole).manifest
+
+
+def test_only_one_process_makes_a_share(tmp_path: Path) -> None:
+    first, second = Share(index=1, of=2), Share(index=2, of=2)
+    steps = create(tiny_recipe(), tmp_path / "d", share=first, shard_cells=3 * CELLS)
+    next(steps)
+    make(tmp_path / "d", share=second)
+    with pytest.raises(BenchnavError, match="Another run"):
+        make(tmp_path / "d", share=first)
+    steps.close()
+    make(tmp_path / "d", share=first)
+    assert TerrainDataset(tmp_path / "d").map_count("train") == 8
+
+
+def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None:
+    folder = make(tmp_path / "d")
+    before = {file: file.read_bytes() for file in folder.iterdir()}
+    for how in ({}, {"overwrite": True}):
+        other = replace(tiny_recipe(), seed=3)
+        (folder / "notes.txt").write_text("mine")
+        with pytest.raises(DatasetError, match=r"holds notes\.txt"):
+            make(folder, other, **how)
+        (folder / "notes.txt").unlink()
+    with pytest.raises(DatasetError, match="is another"):
+        make(folder, replace(tiny_recipe(), seed=3))
+    assert {file: file.read_bytes() for file in folder.iterdir()} == before
+    make(folder, replace(tiny_recipe(), seed=3), overwrite=True)
+    assert digests(folder) == digests(tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3)))
+    with pytest.raises(ConfigError, match="folder, since a shard"):
+        make(tmp_path / "e.h5", share=Share(index=1, of=2))
+
+
+def test_a_cluster_makes_the_same_maps(tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+    ) as cluster:
+        make(tmp_path / "d.h5", scheduler=cluster.scheduler_address)
+    assert digests(tmp_path / "d.h5") == digests(tiny_dataset(tmp_path / "here.h5"))
+    with pytest.raises(ConfigError, match="no answer"):
+        make(tmp_path / "e.h5", scheduler="tcp://127.0.0.1:9")

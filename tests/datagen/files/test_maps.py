@@ -37,9 +37,9 @@ def test_workers_read_what_this_process_reads(dataset_path: Path, context: str, 
 
 def test_another_process_opens_the_file_for_itself(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     maps = TerrainMaps(dataset_path, "train")
-    here = [maps._arrays()["rgb"] for _ in range(2)]
+    here = [maps._arrays(dataset_path)["rgb"] for _ in range(2)]
     monkeypatch.setattr("os.getpid", lambda: -1)
-    assert here[0] is here[1] is not maps._arrays()["rgb"]
+    assert here[0] is here[1] is not maps._arrays(dataset_path)["rgb"]
 
 
 def test_only_the_fields_asked_for_are_read(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_bad_requests_and_damage_are_named(tmp_path: Path) -> None:
     path.write_bytes(raw)
     maps = TerrainMaps(path, "train")
     assert maps[0]
-    with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
+    with pytest.raises(DatasetError, match=r"'rgb'.*validate"):
         maps[1]
 
 
@@ -80,5 +80,5 @@ def test_a_missing_array_is_damage(tmp_path: Path) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
     with h5py.File(path, "r+") as file:
         del file["train/rgb"]
-    with pytest.raises(DatasetError, match=r"'rgb'.*repair"):
+    with pytest.raises(DatasetError, match=r"'rgb'.*validate"):
         TerrainMaps(path, "train")[0]

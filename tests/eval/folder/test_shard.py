@@ -4,11 +4,12 @@ from dataclasses import replace
 import pytest
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.shard import Shard, read_shard, shard_of
+from benchnav.eval.folder.shard import shard_of
 from benchnav.eval.keep import Keep
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent, Unit, units
+from benchnav.share import Share, read_share
 
 
 def some_units(risks: tuple[str, ...] = ("mean", "var"), instances: int = 120, **draws: object) -> list[Unit]:
@@ -24,7 +25,7 @@ def test_every_unit_is_in_one_shard() -> None:
     assert len(every) == 4 * 2 * 2 * 3
     for of in (1, 2, 3, 7):
         for unit in every:
-            having = [index for index in range(1, of + 1) if Shard(index=index, of=of).has(unit)]
+            having = [index for index in range(1, of + 1) if shard_of(unit, of) == Share(index=index, of=of)]
             assert having == [shard_of(unit, of).index]
 
 
@@ -63,10 +64,10 @@ def test_trials_do_not_all_begin_in_one_shard() -> None:
 
 
 def test_a_shard_is_read_as_it_is_written() -> None:
-    assert read_shard("") is None
-    assert read_shard("2/5") == Shard(index=2, of=5)
-    assert str(Shard(index=2, of=5)) == "2/5"
-    assert Shard(**Shard(index=2, of=5).to_dict()) == Shard(index=2, of=5)
+    assert read_share("") is None
+    assert read_share("2/5") == Share(index=2, of=5)
+    assert str(Share(index=2, of=5)) == "2/5"
+    assert Share(**Share(index=2, of=5).to_dict()) == Share(index=2, of=5)
     for text in ("2", "0/5", "6/5", "1/0", "-1/5", "a/b", "2/5/7", "1.5/2"):
         with pytest.raises(ConfigError, match="shard"):
-            read_shard(text)
+            read_share(text)

@@ -119,6 +119,11 @@ def test_a_planner_that_is_made_here_and_not_in_a_unit_ends_its_own_units(
     assert rows[rows["planner"] == "straight"]["success"].all()
 
 
+def test_a_worker_that_is_killed_ends_the_run_with_a_line(dataset_path: Path, tmp_path: Path) -> None:
+    with pytest.raises(BenchnavError, match="A worker was killed"):
+        run(dataset_path, tmp_path / "run", "kill", jobs=2)
+
+
 def test_a_planner_that_gives_up_is_no_fault(dataset_path: Path, tmp_path: Path) -> None:
     rows = run(dataset_path, tmp_path / "run", "give up")
     assert rows["outcome"].tolist() == ["planner_failure"] * 2

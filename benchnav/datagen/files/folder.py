@@ -1,0 +1,55 @@
+"""Datasets of many shards: a folder of files, and a manifest that says which maps lie in which."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchnav.datagen import schema
+from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
+from benchnav.datagen.files.writer import manifest_of
+from benchnav.datagen.recipe.recipe import Recipe
+from benchnav.files import write_text
+
+FORMAT_VERSION = "1.2"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contents:
+    """What a dataset is to hold, and the files that hold it.
+
+    Args:
+        id: name and version of the dataset.
+        recipes: what the splits' parts refer to by number.
+        splits: by name, the manifest's entry of each split without its digest.
+        files: by split the files that hold its maps, in their order, each under the split's name.
+    """
+
+    id: str
+    recipes: Sequence[Recipe]
+    splits: Mapping[str, Mapping[str, Any]]
+    files: Mapping[str, Sequence[Path]]
+
+
+def write_manifest(folder: Path, contents: Contents) -> None:
+    """Makes a dataset of files that lie in a folder.
+
+    Args:
+        folder: where they lie.
+        contents: what they hold.
+    """
+    height, width = contents.recipes[0].grid.shape
+    splits: dict[str, Any] = {}
+    shards: dict[str, list[dict[str, Any]]] = {}
+    for name, entry in contents.splits.items():
+        digest, shards[name] = schema.SplitDigest(entry["maps"], height, width), []
+        for path in contents.files[name]:
+            with open_file(path) as file:
+                digests = file[name][schema.ENTRY_DIGESTS][:]
+            digest.update(digests)
+            shards[name].append({"file": path.name, "maps": len(digests)})
+        splits[name] = {**entry, "digest": digest.hexdigest()}
+    manifest = manifest_of(contents.id, contents.recipes, splits)
+    manifest |= {"format_version": FORMAT_VERSION, "shards": shards}
+    write_text(folder / FOLDER_MANIFEST, schema.seal(json.loads(json.dumps(manifest))))
