@@ -284,13 +284,13 @@ def _fit_classifier(
 
 def _fit_gp(config: LatentGPConfig, dataset: "TerrainDataset", seed: int, options: "FitOptions") -> "Part":
     from benchnav.models.checkpoint import Part
-    from benchnav.models.quality.measure import measure_latent, read_chunks
+    from benchnav.models.quality.measure import measure_latent
     from benchnav.models.slope_gp.sums import sum_split
     from benchnav.models.training.train import fit_gps, training_digest
 
     model = fit_gps(config, sum_split(dataset, "train"), options)
     _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
-    measured = measure_latent(model.tabulate(), read_chunks(dataset, "valid"))
+    measured = measure_latent(model.tabulate(), dataset.terrain_chunks("valid"))
     metrics = {f"valid_{name}": value for name, value in measured.items()}
     _say(
         f"gp: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "

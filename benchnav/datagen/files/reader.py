@@ -146,6 +146,11 @@ class TerrainDataset:
             indices = range(first, min(first + size, count))
             yield indices, self.read(split, indices, names)
 
+    def terrain_chunks(self, split: str, cells: int = CHUNK_CELLS) -> Iterator[Terrain]:
+        """Reads a split as Terrain, some maps at a time, as `chunks` does."""
+        for _, maps in self.chunks(split, schema.MAP_FIELDS, cells):
+            yield terrain_of(maps, self.recipe)
+
     def pieces(self, split: str) -> list[Piece]:
         """The files that hold a split's maps, in their order."""
         count = self.map_count(split)

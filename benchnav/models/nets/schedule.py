@@ -17,7 +17,9 @@ def one_cycle(
         learning_rate: the highest.
         weight_decay: of AdamW.
     """
-    optimizer = torch.optim.AdamW(module.parameters(), learning_rate, weight_decay=weight_decay, fused=True)
+    # Under mixed precision the fused kind unscales gradients by itself, and Lightning would not clip them.
+    fused = not module.trainer.gradient_clip_val
+    optimizer = torch.optim.AdamW(module.parameters(), learning_rate, weight_decay=weight_decay, fused=fused)
     steps = int(module.trainer.estimated_stepping_batches)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, learning_rate, total_steps=max(steps, 2), pct_start=_WARM_UP_SHARE

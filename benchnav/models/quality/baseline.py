@@ -8,8 +8,6 @@ from torch import Tensor
 
 from benchnav.datagen.files.reader import TerrainDataset
 
-_CHUNK_MAPS = 32
-
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
     """Takes for each cell the class whose colour in full light is nearest, by Euclidean distance.
@@ -32,9 +30,8 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
 def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
     """Share of a split's cells whose class `nearest_colour` tells."""
     colours = torch.tensor([item.colour for item in dataset.recipe.classes])
-    maps, right = dataset.map_count(split), 0.0
-    for start in range(0, maps, _CHUNK_MAPS):
-        read = dataset.read(split, range(start, min(start + _CHUNK_MAPS, maps)), ("rgb", "class_id"))
-        found = nearest_colour(torch.from_numpy(read["rgb"]), colours)
-        right += float((found == torch.from_numpy(read["class_id"]).long()).double().mean((1, 2)).sum())
-    return right / maps
+    right = 0.0
+    for _, maps in dataset.chunks(split, ("rgb", "class_id")):
+        found = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
+        right += float((found == torch.from_numpy(maps["class_id"]).long()).double().mean((1, 2)).sum())
+    return right / dataset.map_count(split)

@@ -41,8 +41,6 @@ from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information
 from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.terrain import Terrain
 
-CHUNK_CELLS = 2**17
-
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
@@ -180,17 +178,8 @@ def evaluate(
     """
     alike = twins(dataset.recipe.classes)
     for split in choose_splits(model, dataset, splits):
-        chunks = read_chunks(dataset, split)
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
-        yield split, measure(model, chunks, generator, alike)
-
-
-def read_chunks(dataset: TerrainDataset, split: str) -> Iterator[Terrain]:
-    """Reads the maps of a split, some at a time."""
-    step = max(1, CHUNK_CELLS // (dataset.grid.height * dataset.grid.width))
-    count = dataset.map_count(split)
-    for start in range(0, count, step):
-        yield dataset.terrain(split, range(start, min(start + step, count)))
+        yield split, measure(model, dataset.terrain_chunks(split), generator, alike)
 
 
 def measure(

@@ -84,10 +84,7 @@ def read_cells(dataset: TerrainDataset, split: str, chunk_cells: int = CHUNK_CEL
         DatasetError: there is no such split.
     """
     names = ("class_id", "slope_deg", "traversability")
-    count = dataset.map_count(split)
-    step = max(1, chunk_cells // (dataset.grid.height * dataset.grid.width))
-    for start in range(0, count, step):
-        maps = dataset.read(split, range(start, min(start + step, count)), names)
+    for _, maps in dataset.chunks(split, names, chunk_cells):
         class_id, slope_deg, traversability = (torch.from_numpy(maps[name]) for name in names)
         yield observed_cells(class_id, slope_deg, traversability, len(dataset.recipe.classes))
 

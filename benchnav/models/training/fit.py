@@ -226,7 +226,8 @@ def fit(
             gone on with.
         callbacks: what else is to happen.
         data: loaders or data module, as arguments of the trainer's `fit`.
-        trainer: settings of Lightning's trainer, where the options say nothing.
+        trainer: settings of Lightning's trainer, where the options say nothing; of `precision`, which may be left
+            out, `default_precision`.
 
     Returns:
         What was measured, by name.
@@ -238,6 +239,7 @@ def fit(
     folder = options.folder / part if options.folder else None
     chosen: dict[str, Any] = {"devices": 1, **trainer, **options.trainer}
     chosen["accelerator"] = _accelerator(chosen.get("accelerator", "auto"))
+    chosen.setdefault("precision", default_precision(chosen["accelerator"]))
     callbacks = [*callbacks, Progress(part)]
     with _quiet():
         if folder is None:
@@ -276,9 +278,9 @@ def forget(folder: Path, part: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def default_precision() -> str:
-    """bf16-mixed where the CPU or GPU has bfloat16 arithmetic, 32-true elsewhere."""
-    if torch.cuda.is_available():
+def default_precision(accelerator: str) -> str:
+    """bf16-mixed where what is trained on, "cpu" or a GPU, has bfloat16 arithmetic, 32-true elsewhere."""
+    if accelerator != "cpu":
         known = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
         known = bool(torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -14,7 +14,7 @@ from benchnav.models.slope_gp.gp import LatentGPs, load_batches
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
 from benchnav.models.slope_gp.sums import SlopeSums
 from benchnav.models.training.data import TRAIN, VALID, MapData, MapDataset
-from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.fit import FitOptions, KeepBest, fit
 from benchnav.models.training.temperature import fit_temperature, sample_logits
 
 CHUNK_CELLS = 2**17
@@ -62,7 +62,6 @@ def fit_classifier(
         [KeepBest(), stopping],
         {"datamodule": data},
         max_epochs=config.max_epochs,
-        precision=default_precision(),
     )
     model.cpu().eval()
     if half_precision:

@@ -11,7 +11,7 @@ from benchnav.models.checkpoint import as_stored
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MDN, MixtureDensityNetwork, censored_nll
 from benchnav.models.training.data import MapData, MapDataset
-from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.fit import FitOptions, KeepBest, fit
 from benchnav.models.training.train import training_digest
 
 _CHUNK_CELLS = 2**17
@@ -52,7 +52,6 @@ def fit_mdn(
         [KeepBest(), stopping],
         {"datamodule": data},
         max_epochs=config.max_epochs,
-        precision=default_precision(),
     )
     network.cpu().eval()
     if half_precision:

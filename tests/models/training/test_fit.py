@@ -16,6 +16,7 @@ from benchnav.files import sole_writer
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.training import fit as fit_module
 from benchnav.models.training import train as training
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
@@ -157,7 +158,49 @@ def test_bfloat16_is_chosen_where_it_is_known(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for known, precision in ((True, "bf16-mixed"), (False, "32-true")):
         monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation, k=known: k)
-        assert default_precision() == precision
+        assert default_precision("cuda") == precision
+
+
+def test_the_precision_is_that_of_what_is_trained_on(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    assert default_precision("cpu") == "32-true"
+    seen = []
+
+    class Watch(Callback):
+        def on_train_start(self, trainer, module) -> None:  # type: ignore[no-untyped-def]
+            seen.append(trainer.precision)
+
+    monkeypatch.undo()
+    asked: list[str] = []
+    monkeypatch.setattr(fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed")
+    data = MapData(dataset, 4, 0)
+    model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+    options = FitOptions(trainer={"accelerator": "cpu", "limit_train_batches": 1})
+    fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
+    assert asked == ["cpu"]
+    assert seen == ["bf16-mixed"]
+
+
+def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) -> None:
+    norms: list[float] = []
+
+    class Watch(Callback):
+        def on_train_batch_end(self, trainer, module, *given) -> None:  # type: ignore[no-untyped-def]
+            gradients = [value.grad.norm() for value in module.parameters() if value.grad is not None]
+            norms.append(float(torch.stack(gradients).norm()))
+
+    data = MapData(dataset, 4, 0)
+    for settings in ({}, {"gradient_clip_val": 1e-3}):
+        model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+        trainer = {**CPU, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
+        fit(model, "x", FitOptions(trainer=trainer), {}, [Watch()], {"datamodule": data}, max_epochs=1)
+    free, clipped = norms
+    assert free > 0.01
+    assert clipped == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
