@@ -43,6 +43,32 @@ def test_colours_are_normalised_by_the_training_maps() -> None:
     torch.testing.assert_close(seen[0], expected)
 
 
+def test_logits_are_divided_by_the_temperature_once_training_is_over() -> None:
+    model, rgb = build(), image(32, 32)
+    with torch.no_grad():
+        plain = model(rgb)
+        model.temperature = 2.5
+        torch.testing.assert_close(model(rgb), plain / 2.5)
+
+
+@pytest.mark.parametrize("smoothing", [0.0, 0.2])
+@pytest.mark.parametrize("dice", [0.0, 0.7])
+def test_the_loss_is_what_the_settings_say(dice: float, smoothing: float) -> None:
+    generator = torch.Generator().manual_seed(2)
+    logits = torch.randn(2, 4, 8, 8, generator=generator)
+    class_id = torch.randint(0, 4, (2, 8, 8), generator=generator)
+    chosen = torch.nn.functional.one_hot(class_id, 4).movedim(-1, 1).double()
+    log_p = logits.double().log_softmax(1)
+    target = (1 - smoothing) * chosen + smoothing / 4
+    expected = -(target * log_p).sum(1).mean()
+    if dice:
+        shares, axes = log_p.exp(), (0, 2, 3)
+        overlap = 2 * (shares * chosen).sum(axes) / (shares + chosen).sum(axes)
+        expected += dice * (1 - overlap).mean()
+    found = build(dice=dice, label_smoothing=smoothing).loss(logits, class_id)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
+
+
 def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
     before = torch.random.get_rng_state()
     first, second, other = (next(build(seed).network.parameters()) for seed in (0, 0, 1))

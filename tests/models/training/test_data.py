@@ -50,6 +50,19 @@ def test_an_epoch_has_every_map_once_in_batches_of_nearly_one_size() -> None:
     assert [len(batch) for batch in batches] == [4, 3, 3]
 
 
+def test_training_maps_are_turned_and_validation_maps_are_not(dataset: TerrainDataset) -> None:
+    data = MapData(dataset, 4, seed=0, jitter=0.1)
+    turned, changed = set(), []
+    for _, which, factors in data.train_dataloader().sampler:
+        turned |= set(which.tolist())
+        changed.append(bool((factors != 1).any()))
+    assert len(turned) > 2
+    assert all(changed)
+    for _, which, factors in data.val_dataloader().sampler:
+        assert not which.any()
+        assert bool((factors == 1).all())
+
+
 def test_loaders_give_fixed_keys_and_leave_the_global_generator_alone(dataset: TerrainDataset) -> None:
     data = MapData(dataset, 4, seed=0)
     before = torch.random.get_rng_state()

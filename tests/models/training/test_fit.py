@@ -1,3 +1,4 @@
+import copy
 import json
 import os
 import subprocess
@@ -5,10 +6,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import lightning
 import pandas as pd
 import pytest
 import torch
 from lightning.pytorch.callbacks import Callback
+from torch.utils.data import DataLoader
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import BenchnavError, CheckpointError, ConfigError
@@ -20,6 +23,7 @@ from benchnav.models.training import fit as fit_module
 from benchnav.models.training import train as training
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.temperature import fit_temperature, sample_logits
 from benchnav.models.training.train import fit_classifier
 
 CPU = {"precision": "32-true", "accelerator": "cpu"}
@@ -75,6 +79,74 @@ def test_a_resumed_training_ends_with_the_weights_and_the_history_of_an_unbroken
     assert again.temperature == whole[1].temperature
     first, second = (folder / "classifier/metrics.csv" for folder in (whole[0], cut))
     assert first.read_text() == second.read_text()
+
+
+class Counting(lightning.LightningModule):
+    """Its weight counts epochs, and its validation loss is as told."""
+
+    losses = (3.0, 1.0, 2.0, 2.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+
+    def training_step(self, batch: torch.Tensor, index: int) -> torch.Tensor:
+        return -self.weight.sum()
+
+    def validation_step(self, batch: torch.Tensor, index: int) -> None:
+        self.log("valid_loss", self.losses[self.current_epoch])
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=1.0)
+
+
+def test_the_best_epoch_before_a_kill_is_kept_when_it_is_resumed(tmp_path: Path) -> None:
+    class KillInTheThird(Callback):
+        def on_train_epoch_start(self, trainer, module) -> None:  # type: ignore[no-untyped-def]
+            if trainer.current_epoch == 2:
+                raise Killed
+
+    loader = DataLoader(torch.zeros(1, 1))
+    data = {"train_dataloaders": loader, "val_dataloaders": loader}
+
+    def run(module: Counting, resume: bool, *callbacks: Callback) -> dict[str, float]:
+        options = FitOptions(folder=tmp_path, resume=resume, trainer=CPU)
+        return fit(module, "x", options, {}, [KeepBest(), *callbacks], data, max_epochs=4)
+
+    with pytest.raises(Killed):
+        run(Counting(), False, KillInTheThird())
+    module = Counting()
+    measured = run(module, True)
+    assert float(module.weight) == 2
+    assert (measured["valid_loss"], measured["epoch"]) == (1, 2)
+    assert list(pd.read_csv(tmp_path / "x/metrics.csv")["epoch"]) == [1, 2, 3, 4]
+
+
+def test_the_temperature_is_of_the_validation_maps(
+    dataset: TerrainDataset, whole: tuple[Path, TerrainClassifier]
+) -> None:
+    bare = copy.deepcopy(whole[1])
+    bare.temperature = 1.0
+    data = MapData(dataset, 4, 1)
+    of_valid, of_train = (fit_temperature(*sample_logits(bare, maps, 1)) for maps in (data.valid, data.train))
+    assert whole[1].temperature == pytest.approx(of_valid, rel=1e-6)
+    assert of_train != pytest.approx(of_valid, rel=0.01)
+
+
+def test_settings_of_the_optimiser_reach_it(dataset: TerrainDataset) -> None:
+    seen = []
+
+    class Watch(Callback):
+        def on_train_start(self, trainer, module) -> None:  # type: ignore[no-untyped-def]
+            (group,) = trainer.optimizers[0].param_groups
+            seen.append((group["weight_decay"], group["max_lr"]))
+
+    data = MapData(dataset, 4, 0)
+    config = replace(SMALL, weight_decay=0.123, learning_rate=0.045)
+    model = TerrainClassifier(config, 10, *data.colour_statistics())
+    options = FitOptions(trainer={**CPU, "limit_train_batches": 1})
+    fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
+    assert seen == [(0.123, 0.045)]
 
 
 def test_logs_have_a_row_an_epoch_and_events_for_tensorboard(whole: tuple[Path, TerrainClassifier]) -> None:
