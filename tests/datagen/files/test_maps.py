@@ -5,10 +5,12 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from benchnav.datagen.files import maps as maps_module
+from benchnav.datagen.files.create import create
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import DatasetError
-from tests.factories import tiny_dataset
+from tests.factories import tiny_dataset, tiny_recipe
 
 
 @pytest.mark.parametrize("in_memory", [False, True])
@@ -82,3 +84,17 @@ def test_a_missing_array_is_damage(tmp_path: Path) -> None:
         del file["train/rgb"]
     with pytest.raises(DatasetError, match=r"'rgb'.*validate"):
         TerrainMaps(path, "train")[0]
+
+
+def test_maps_of_a_folder_are_those_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for _ in create(tiny_recipe(), tmp_path / "d", shard_cells=3 * 32 * 32):
+        pass
+    monkeypatch.setattr(maps_module, "_MOST_OPEN", 2)
+    whole = TerrainMaps(tiny_dataset(tmp_path / "d.h5"), "train")
+    parts = TerrainMaps(tmp_path / "d", "train")
+    for index in (7, 0, 3, 5, 2, 6, 1, 4):
+        for name, values in parts[index].items():
+            assert torch.equal(values, whole[index][name])
+    assert len(parts._opened[1]) == 2
+    loaded = torch.cat([batch["rgb"] for batch in DataLoader(parts, batch_size=3, num_workers=2)])
+    assert torch.equal(loaded, torch.stack([whole[index]["rgb"] for index in range(8)]))
