@@ -9,6 +9,7 @@ import pandas as pd
 
 from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.figures import trial_name
+from benchnav.eval.report.tables import rate_in_words
 from benchnav.eval.stats.best import TOLD, competing
 from benchnav.planning.world.outcome import FAILURES
 
@@ -142,7 +143,7 @@ def _why(
 
 def _rate(row: Mapping[Any, Any]) -> str:
     # Never 100 % of what failed once, nor 0 % of what once arrived.
-    return f"{100 * row['success_rate']:.1f}".removesuffix(".0") + " %"
+    return f"{rate_in_words(row)} %"
 
 
 def _shares(outcomes: pd.Series) -> str:

@@ -12,7 +12,7 @@ import pandas as pd
 from benchnav.eval.report.charts.panels import blocks
 from benchnav.eval.report.figures import display_name
 from benchnav.eval.report.rendering import latex, latex_label
-from benchnav.eval.report.tables import bold_note
+from benchnav.eval.report.tables import bold_note, rate_in_words
 from benchnav.eval.trial import NOT_USED
 
 _MOST_ACROSS = 3
@@ -100,7 +100,7 @@ def _body(known: list[tuple[str, pd.DataFrame]], labels: list[str]) -> Iterator[
 def _numbers(row: Mapping[Any, Any] | None) -> tuple[str, ...]:
     if row is None:
         return ("--",) * len(_MEASURES)
-    rate = f"{100 * row['success_rate']:.0f}"
+    rate = rate_in_words(row)
     rate = rf"\textbf{{{rate}}}" if row["best_alike"] and row["best_rivals"] else rate
     interval = f"{100 * row['success_low']:.0f}--{100 * row['success_high']:.0f}"
     return (

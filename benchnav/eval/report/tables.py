@@ -128,6 +128,11 @@ def bold_note(summary: pd.DataFrame) -> str:
     return " ".join(words).replace(" ;", ";") + "."
 
 
+def rate_in_words(row: Mapping[Any, Any]) -> str:
+    """Writes a success rate in per cent, so that one failure of 200 does not read as none."""
+    return f"{100 * row['success_rate']:.1f}".removesuffix(".0")
+
+
 def failures_in_words(row: Mapping[Any, Any]) -> str:
     """Says how a trial's failures ended, such as `2 stuck, 1 stalled`; a dash where there are none.
 
@@ -145,7 +150,7 @@ def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
     if 0 < row["traversability_n"] < row["n_episodes"]:
         met += f" (n = {row['traversability_n']})"
     return (
-        f"{100 * row['success_rate']:.0f}",
+        rate_in_words(row),
         f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}",
         _with_interval(row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]),
         _spread(row["success_time_mean_s"], row["success_time_std_s"]),

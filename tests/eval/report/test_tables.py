@@ -3,6 +3,7 @@ import re
 import numpy as np
 import pytest
 
+from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.tables import failures_in_words, result_table
 from benchnav.eval.stats.summary import LABELS, summarise
@@ -163,3 +164,10 @@ def test_failures_in_words(outcomes: list[str], expected: str) -> None:
     failed = (made.row(labels, i, None, outcome=outcome) for i, outcome in enumerate(outcomes))
     summary = summarise(made.rows(made.row(labels, 99), failed))
     assert failures_in_words(summary.to_dict("records")[0]) == expected
+
+
+def test_one_failure_of_many_does_not_read_as_none() -> None:
+    labels = made.trial()
+    episodes = made.rows(made.row(labels, i, 30.0 if i else None) for i in range(200))
+    assert table_of(episodes).rows[0][table_of(episodes).labels] == "99.5"
+    assert r"99.5 {\scriptsize" in paper_table(made.summary(episodes), "run")
