@@ -31,6 +31,8 @@ def train_classifier(
     members: int = 1,
     seed: int = 0,
     trainer: dict[str, Any] | None = None,
+    workers: int = 0,
+    in_memory: bool = False,
     half_precision: bool = True,
     resume: bool = False,
     overwrite: bool = False,
@@ -44,12 +46,14 @@ def train_classifier(
         members: How many to train, with the seeds SEED, SEED + 1, …; their probabilities are averaged.
         seed: Root seed of weights, order and augmentation.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
+        workers: Processes that read maps ahead. The result is the same for any number.
+        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
         half_precision: Store the weights as float16.
         resume: Go on with a training that was interrupted; whole epochs are kept.
         overwrite: Replace classifiers, or a checkpoint of other classes, that are there.
     """
     dataset = _open_dataset(data)
-    classifier, options = _options(out, classifier, trainer, resume)
+    classifier, options = _options(out, classifier, trainer, resume, workers, in_memory)
     target = _open_target(out, dataset, _members(members), options, overwrite)
     _train_members(target, classifier, dataset, members, seed, options, half_precision)
 
@@ -93,6 +97,8 @@ def train_all(
     members: int = 1,
     seed: int = 0,
     trainer: dict[str, Any] | None = None,
+    workers: int = 0,
+    in_memory: bool = False,
     half_precision: bool = True,
     resume: bool = False,
     overwrite: bool = False,
@@ -107,12 +113,14 @@ def train_all(
         members: How many classifiers to train; their probabilities are averaged.
         seed: Root seed.
         trainer: Settings of Lightning's trainer for the classifiers; of the GPs' the accelerator.
+        workers: Processes that read maps ahead. The result is the same for any number.
+        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
         half_precision: Store the classifiers' weights as float16.
         resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
         overwrite: Replace a checkpoint that is there.
     """
     dataset = _open_dataset(data)
-    classifier, options = _options(out, classifier, trainer, resume)
+    classifier, options = _options(out, classifier, trainer, resume, workers, in_memory)
     target = _open_target(out, dataset, ["gp", *_members(members)], options, overwrite)
     if not target.holds("gp", asdict(gp), seed, asdict(LatentGPConfig())):
         target.add("gp", _fit_gp(gp, dataset, seed, options))
@@ -125,6 +133,8 @@ def train_mdn(
     mdn: MDNConfig = _DEFAULT_MDN,
     seed: int = 0,
     trainer: dict[str, Any] | None = None,
+    workers: int = 0,
+    in_memory: bool = False,
     half_precision: bool = True,
     resume: bool = False,
     overwrite: bool = False,
@@ -137,6 +147,8 @@ def train_mdn(
         mdn: Settings of the network.
         seed: Root seed of weights, order and augmentation.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
+        workers: Processes that read maps ahead. The result is the same for any number.
+        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
         half_precision: Store the weights as float16.
         resume: Go on with a training that was interrupted; whole epochs are kept.
         overwrite: Replace a checkpoint that is there.
@@ -148,7 +160,7 @@ def train_mdn(
     from benchnav.models.training.train_mdn import fit_mdn
 
     dataset = _open_dataset(data)
-    mdn, options = _options(out, mdn, trainer, resume)
+    mdn, options = _options(out, mdn, trainer, resume, workers, in_memory)
     fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=MDN)
     target = open_target(Path(out), fresh, [MDN], training_digest(dataset), options, overwrite)
     if target.holds(MDN, asdict(mdn), seed, asdict(MDNConfig())):
@@ -184,7 +196,7 @@ def _open_dataset(data: str) -> "TerrainDataset":
 
 
 def _options(
-    out: str, config: Config, trainer: dict[str, Any] | None, resume: bool
+    out: str, config: Config, trainer: dict[str, Any] | None, resume: bool, workers: int, in_memory: bool
 ) -> "tuple[Config, FitOptions]":
     """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
     from benchnav.models.checkpoint import training_folder
@@ -193,7 +205,10 @@ def _options(
     settings = dict(trainer or {})
     if "max_epochs" in settings:
         config = replace(config, max_epochs=settings.pop("max_epochs"))
-    return config, FitOptions(folder=training_folder(out), resume=resume, trainer=settings)
+    folder = training_folder(out)
+    return config, FitOptions(
+        folder=folder, resume=resume, trainer=settings, workers=workers, in_memory=in_memory
+    )
 
 
 def _members(count: int) -> list[str]:

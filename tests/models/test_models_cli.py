@@ -14,6 +14,7 @@ from benchnav.models.cli import main
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
+from benchnav.models.training import train, train_mdn
 from benchnav.models.training.data import read_maps
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.training.train import measure_classifier
@@ -291,3 +292,22 @@ def test_what_is_stored_is_what_was_measured_and_calibrated(
     assert part.config["temperature"] == fit_temperature(*sample_logits(plain, valid))
     for name, value in measure_classifier(plain, valid).items():
         assert part.metrics[name] == pytest.approx(value, rel=0 if half_precision else 1e-3, abs=1e-12), name
+
+
+@pytest.mark.parametrize("kind", ["classifier", "all", "mdn"])
+def test_how_maps_are_read_reaches_the_training(
+    kind: str, dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def opened(*_: object, in_memory: bool, workers: int) -> None:
+        seen.append((in_memory, workers))
+        raise KeyboardInterrupt
+
+    module = train_mdn if kind == "mdn" else train
+    monkeypatch.setattr(module, "MapData", opened)
+    quick = QUICK_GP if kind == "all" else []
+    for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):
+        where = ["--data", dataset.path, "--out", tmp_path / str(number)]
+        assert call(monkeypatch, kind, *where, *quick, *how) == 130
+    assert seen == [(False, 0), (False, 2), (True, 0)]

@@ -1,11 +1,12 @@
-"""Training data in whole maps, held in memory.
+"""Training data in whole maps, read as they are asked for, or held in memory.
 
 What a batch holds is a pure function of (seed, epoch, place in the epoch): order and augmentation
-come from named random streams, so a training that is resumed sees what it would have seen. Letters
-in shapes: B maps in memory, b maps in a batch, H×W cells.
+come from named random streams, so a training that is resumed sees what it would have seen, however many
+processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W cells.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import lightning
@@ -16,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from torchvision.transforms.v2 import functional as photometry
 
 from benchnav import rng
-from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 from benchnav.errors import ConfigError, DatasetError
 
 TRAIN, VALID = "train", "valid"
@@ -32,16 +33,19 @@ class MapDataset(Dataset[Batch]):
     """Maps by field; indexed by a whole batch at a time.
 
     Args:
-        fields: by name, each of shape [B, *, H, W]; `rgb` (uint8, [B, 3, H, W]) is among them.
+        read: gives every field of some maps by their indices, each of shape [b, *, H, W]; `rgb` (uint8, [b, 3, H,
+            W]) is among them.
+        count: how many maps there are.
+        shape: H and W.
     """
 
-    def __init__(self, fields: dict[str, Tensor]) -> None:
-        """Keeps the tensors."""
-        self.fields = fields
+    def __init__(self, read: Callable[[Sequence[int]], Batch], count: int, shape: tuple[int, int]) -> None:
+        """Reads nothing yet."""
+        self.read, self.count, self.shape = read, count, shape
 
     def __len__(self) -> int:
         """Number of maps."""
-        return len(self.fields["rgb"])
+        return self.count
 
     def __getitem__(self, key: MapKey) -> Batch:
         """Gives every field of the maps in `key`, shape [b, *, H, W].
@@ -51,8 +55,15 @@ class MapDataset(Dataset[Batch]):
                 factors of `apply_jitter`, shape [b, 3].
         """
         index, symmetry, factors = key
-        batch = {name: _turn(values[index], symmetry) for name, values in self.fields.items()}
+        batch = {name: _turn(values, symmetry) for name, values in self.read(index.tolist()).items()}
         return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
+
+    def chunks(self) -> Iterator[tuple[range, Batch]]:
+        """All maps as they are, in order, some at a time, with their indices."""
+        step = max(1, CHUNK_CELLS // (self.shape[0] * self.shape[1]))
+        for first in range(0, self.count, step):
+            indices = range(first, min(first + step, self.count))
+            yield indices, self.read(indices)
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
@@ -163,6 +174,8 @@ class MapData(lightning.LightningDataModule):
         seed: root seed of order and augmentation.
         jitter: largest relative change of brightness, contrast and saturation of a training map.
         fields: which fields to read beside `rgb`.
+        in_memory: hold all maps in memory.
+        workers: processes that read ahead; 0 reads in this one.
 
     Raises:
         DatasetError: a split is missing, or there are fewer than two maps to train on.
@@ -175,21 +188,24 @@ class MapData(lightning.LightningDataModule):
         seed: int,
         jitter: float = 0.0,
         fields: tuple[str, ...] = ("class_id",),
+        in_memory: bool = False,
+        workers: int = 0,
     ) -> None:
-        """Reads the maps into memory."""
+        """Opens the splits."""
         super().__init__()
         if batch_size < 2:
             raise ConfigError(f"Expected `batch_size` ≥ 2, got {batch_size}.")
-        self.batch_size, self.seed, self.jitter = batch_size, seed, jitter
-        self.train, self.valid = (read_maps(dataset, split, fields) for split in (TRAIN, VALID))
+        self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
+        self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
         if len(self.train) < 2:
             raise DatasetError(f"Expected at least 2 training maps in {dataset.path}, got {len(self.train)}.")
 
     def colour_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
-        counts = torch.stack(
-            [channel.flatten().bincount(minlength=256) for channel in self.train.fields["rgb"].unbind(1)]
-        )
+        counts = torch.zeros(3, 256, dtype=torch.int64)
+        for _, maps in self.train.chunks():
+            channels = maps["rgb"].unbind(1)
+            counts += torch.stack([channel.flatten().bincount(minlength=256) for channel in channels])
         share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
         mean = (share * level).sum(1)
         variance = (share * level**2).sum(1) - mean**2
@@ -197,7 +213,7 @@ class MapData(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
-        height, width = self.train.fields["rgb"].shape[-2:]
+        height, width = self.train.shape
         symmetries = _SYMMETRIES if height == width else _SYMMETRIES_OF_RECTANGLE
         return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
 
@@ -209,10 +225,31 @@ class MapData(lightning.LightningDataModule):
         share = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         sampler = MapSampler(len(maps), self.batch_size, self.seed, share=share, **order)
         # A generator of its own keeps the loader from drawing on PyTorch's global one.
-        return DataLoader(maps, batch_size=None, sampler=sampler, generator=torch.Generator())
+        return DataLoader(
+            maps, batch_size=None, sampler=sampler, generator=torch.Generator(),
+            num_workers=self.workers, persistent_workers=self.workers > 0,
+        )  # fmt: skip
 
 
-def read_maps(dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",)) -> MapDataset:
-    """Reads the colours and other fields of a split into memory."""
-    read = dataset.read(split, fields=("rgb", *fields))
-    return MapDataset({name: torch.from_numpy(values) for name, values in read.items()})
+def read_maps(
+    dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",), in_memory: bool = False
+) -> MapDataset:
+    """The colours and other fields of a split, read as they are asked for, or at once."""
+    names, count, shape = ("rgb", *fields), dataset.map_count(split), dataset.grid.shape
+    stored = partial(_read, dataset, split, names)
+    return MapDataset(partial(_take, stored(range(count))) if in_memory else stored, count, shape)
+
+
+def held_maps(fields: Batch) -> MapDataset:
+    """Maps that are in memory already, by field, each of shape [B, *, H, W]."""
+    height, width = fields["rgb"].shape[-2:]
+    return MapDataset(partial(_take, fields), len(fields["rgb"]), (height, width))
+
+
+def _read(dataset: TerrainDataset, split: str, names: tuple[str, ...], indices: Sequence[int]) -> Batch:
+    return {name: torch.from_numpy(values) for name, values in dataset.read(split, indices, names).items()}
+
+
+def _take(fields: Batch, indices: Sequence[int]) -> Batch:
+    which = torch.as_tensor(list(indices), dtype=torch.int64)
+    return {name: values[which] for name, values in fields.items()}

@@ -53,17 +53,23 @@ class FitOptions:
             nothing is written when None.
         resume: go on with the training that was interrupted there, if there is one.
         trainer: settings of Lightning's trainer by name.
+        in_memory: hold all maps in memory, in place of reading them as they are asked for.
+        workers: processes that read maps ahead; the outcome is the same for any number.
 
     Raises:
-        ConfigError: the trainer has no such setting, or it is set here.
+        ConfigError: `workers` is below 0; the trainer has no such setting, or it is set here.
     """
 
     folder: Path | None = None
     resume: bool = False
     trainer: Mapping[str, Any] = field(default_factory=dict)
+    in_memory: bool = False
+    workers: int = 0
 
     def __post_init__(self) -> None:
-        """Checks the names of the trainer's settings."""
+        """Checks the settings by name."""
+        if self.workers < 0:
+            raise ConfigError(f"Expected `workers` ≥ 0, got {self.workers}.")
         known = sorted(set(inspect.signature(lightning.Trainer.__init__).parameters) - _OWN)
         unknown = sorted(set(self.trainer) - set(known))
         if unknown:

@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from benchnav import rng
 from benchnav.models.training.data import MapDataset
 
-_CHUNK_CELLS = 2**17
 _MOST_CELLS = 200_000
 _LARGEST = 20.0
 
@@ -65,15 +64,14 @@ def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tup
     Returns:
         Logits [N, C] and true classes [N], int64.
     """
-    rgb, class_id = maps.fields["rgb"], maps.fields["class_id"].flatten(1).long()
-    cells = class_id.shape[1]
+    cells = maps.shape[0] * maps.shape[1]
     kept = min(cells, max(1, _MOST_CELLS // len(maps)))
     key = rng.stream_key(seed, "models", "temperature")
-    step, found = max(1, _CHUNK_CELLS // cells), []
+    found = []
     with torch.inference_mode():
-        for start in range(0, len(maps), step):
-            logits = classifier(rgb[start : start + step]).float().flatten(2)
-            for which, one in enumerate(logits, start):
-                place = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0][:kept])
-                found.append((one[:, place].T.clone(), class_id[which, place]))
+        for indices, some in maps.chunks():
+            logits, class_id = classifier(some["rgb"]).float().flatten(2), some["class_id"].flatten(1).long()
+            for place, which in enumerate(indices):
+                drawn = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0][:kept])
+                found.append((logits[place][:, drawn].T.clone(), class_id[place, drawn]))
     return torch.cat([logits for logits, _ in found]), torch.cat([classes for _, classes in found])

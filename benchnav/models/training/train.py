@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import torch
 from lightning.pytorch.callbacks import EarlyStopping
-from torchmetrics.functional.classification import multiclass_jaccard_index
+from torchmetrics.classification import MulticlassJaccardIndex
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import CLASSIFIER, GP, as_stored
@@ -16,8 +16,6 @@ from benchnav.models.slope_gp.sums import SlopeSums
 from benchnav.models.training.data import TRAIN, VALID, MapData, MapDataset
 from benchnav.models.training.fit import FitOptions, KeepBest, fit
 from benchnav.models.training.temperature import fit_temperature, sample_logits
-
-CHUNK_CELLS = 2**17
 
 _DEFAULT = FitOptions()
 
@@ -50,7 +48,9 @@ def fit_classifier(
         The classifier with its best weights and its temperature, on the CPU, and what was measured on
         `valid`, the loss before the temperature.
     """
-    data = MapData(dataset, config.batch_size, seed, config.jitter)
+    data = MapData(
+        dataset, config.batch_size, seed, config.jitter, in_memory=options.in_memory, workers=options.workers
+    )
     model = TerrainClassifier(config, len(dataset.recipe.classes), *data.colour_statistics(), seed)
     settings = {"config": asdict(config), "data": training_digest(dataset), "seed": seed}
     stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
@@ -78,19 +78,18 @@ def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, 
         model: in evaluation, on the CPU.
         maps: with `rgb` and `class_id`.
     """
-    rgb, class_id = maps.fields["rgb"], maps.fields["class_id"].long()
-    step, loss, found = max(1, CHUNK_CELLS // class_id[0].numel()), 0.0, []
+    loss, right, miou = 0.0, 0, MulticlassJaccardIndex(model.class_count)
     with torch.inference_mode():
-        for start in range(0, len(maps), step):
-            some = slice(start, start + step)
-            logits = model(rgb[some])
-            loss += float(model.loss(logits, class_id[some])) * len(logits)
-            found.append(logits.argmax(1))
-    chosen = torch.cat(found)
+        for indices, some in maps.chunks():
+            logits, class_id = model(some["rgb"]), some["class_id"].long()
+            loss += float(model.loss(logits, class_id)) * len(indices)
+            chosen = logits.argmax(1)
+            right += int((chosen == class_id).sum())
+            miou.update(chosen, class_id)
     return {
         "valid_loss": loss / len(maps),
-        "valid_accuracy": float((chosen == class_id).double().mean()),
-        "valid_miou": float(multiclass_jaccard_index(chosen, class_id, model.class_count)),
+        "valid_accuracy": right / (len(maps) * maps.shape[0] * maps.shape[1]),
+        "valid_miou": float(miou.compute()),
     }
 
 

@@ -14,8 +14,6 @@ from benchnav.models.training.data import MapData, MapDataset
 from benchnav.models.training.fit import FitOptions, KeepBest, fit
 from benchnav.models.training.train import training_digest
 
-_CHUNK_CELLS = 2**17
-
 _DEFAULT = FitOptions()
 
 
@@ -39,9 +37,14 @@ def fit_mdn(
     Returns:
         The network with its best weights, on the CPU, and what was measured on `valid`.
     """
-    data = MapData(dataset, config.batch_size, seed, config.jitter, ("slope_deg", "traversability"))
+    data = MapData(
+        dataset, config.batch_size, seed, config.jitter, ("slope_deg", "traversability"),
+        in_memory=options.in_memory, workers=options.workers,
+    )  # fmt: skip
     # Flat ground alone would have no scale.
-    scale = data.train.fields["slope_deg"].double().square().mean().sqrt().clamp(min=1).float()
+    squares = sum(maps["slope_deg"].double().square().sum() for _, maps in data.train.chunks())
+    cells = len(data.train) * data.train.shape[0] * data.train.shape[1]
+    scale = (torch.as_tensor(squares) / cells).sqrt().clamp(min=1).float()
     network = MixtureDensityNetwork(config, *data.colour_statistics(), scale, seed)
     stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
     metrics = fit(
@@ -67,13 +70,11 @@ def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[st
         network: in evaluation, on the CPU.
         maps: with `rgb`, `slope_deg` and `traversability`.
     """
-    fields, step = maps.fields, max(1, _CHUNK_CELLS // maps.fields["slope_deg"][0].numel())
     loss, squares, cells = 0.0, 0.0, 0
     with torch.inference_mode():
-        for start in range(0, len(maps), step):
-            batch = {name: values[start : start + step] for name, values in fields.items()}
-            log_weights, means, stds = network(batch["rgb"], batch["slope_deg"])
-            observed = batch["traversability"]
+        for _, some in maps.chunks():
+            log_weights, means, stds = network(some["rgb"], some["slope_deg"])
+            observed = some["traversability"]
             seen = observed.isfinite()
             count = int(seen.sum())
             loss += float(censored_nll(log_weights, means, stds, observed)) * count

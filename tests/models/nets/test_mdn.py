@@ -369,7 +369,7 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
     monkeypatch.setattr(mdn, "MapData", Watched)
     network, _ = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU))
     assert jitters == [SMALL.jitter]
-    slopes = MapData(dataset, 2, 0, fields=("slope_deg",)).train.fields["slope_deg"]
+    slopes = torch.from_numpy(dataset.read("train", fields=["slope_deg"])["slope_deg"])
     torch.testing.assert_close(network.slope_scale_deg, slopes.square().mean().sqrt())
 
 

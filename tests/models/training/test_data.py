@@ -23,12 +23,12 @@ def test_symmetries_of_a_rectangle_keep_its_shape(which: int) -> None:
 
 def test_image_and_classes_are_turned_together(dataset: TerrainDataset) -> None:
     data = MapData(dataset, 4, seed=0)
-    maps = data.train
+    maps, stored = data.train, data.train.read(range(8))
     key = (torch.arange(8), torch.arange(8), torch.ones(8, 3))
     batch = maps[key]
     for place in range(8):
-        assert torch.equal(batch["rgb"][place], apply_symmetry(maps.fields["rgb"][place], place))
-        assert torch.equal(batch["class_id"][place], apply_symmetry(maps.fields["class_id"][place], place))
+        assert torch.equal(batch["rgb"][place], apply_symmetry(stored["rgb"][place], place))
+        assert torch.equal(batch["class_id"][place], apply_symmetry(stored["class_id"][place], place))
 
 
 def test_order_is_keyed_by_seed_and_epoch() -> None:
@@ -42,6 +42,32 @@ def test_order_is_keyed_by_seed_and_epoch() -> None:
     for other in (draw(0, 4), draw(1, 3)):
         assert all(a != b for a, b in zip(draw(0, 3), other, strict=True))
     assert set(draw(0, 3)[1]) == set(range(8))
+
+
+@pytest.mark.parametrize("how", [{"in_memory": True}, {"workers": 2}, {"workers": 1, "in_memory": True}])
+def test_batches_are_the_same_however_maps_are_read(dataset: TerrainDataset, how: dict[str, int]) -> None:
+    plain, other = MapData(dataset, 3, 0, jitter=0.2), MapData(dataset, 3, 0, jitter=0.2, **how)
+    for load in ("train_dataloader", "val_dataloader"):
+        for one, two in zip(getattr(plain, load)(), getattr(other, load)(), strict=True):
+            assert all(torch.equal(one[name], two[name]) for name in one)
+    assert other.train_dataloader().num_workers == how.get("workers", 0)
+
+
+def test_maps_are_read_when_they_are_asked_for_or_at_once(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, asked = TerrainDataset.read, []
+    monkeypatch.setattr(
+        TerrainDataset, "read", lambda self, split, *given: asked.append(split) or read(self, split, *given)
+    )
+    lazy = MapData(dataset, 3, 0)
+    assert asked == []
+    next(iter(lazy.train_dataloader()))
+    assert asked == ["train"]
+    held = MapData(dataset, 3, 0, in_memory=True)
+    assert asked == ["train", "train", "valid"]
+    next(iter(held.train_dataloader()))
+    assert len(asked) == 3
 
 
 def test_an_epoch_has_every_map_once_in_batches_of_nearly_one_size() -> None:
@@ -72,7 +98,7 @@ def test_loaders_give_fixed_keys_and_leave_the_global_generator_alone(dataset: T
     assert batch["rgb"].dtype == torch.uint8
     assert batch["class_id"].dtype == torch.uint8
     valid = torch.cat([batch["class_id"] for batch in data.val_dataloader()])
-    assert torch.equal(valid, data.valid.fields["class_id"])
+    assert torch.equal(valid, data.valid.read(range(len(data.valid)))["class_id"])
 
 
 def test_colour_statistics_are_those_of_the_training_maps(dataset: TerrainDataset) -> None:

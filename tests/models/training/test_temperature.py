@@ -4,7 +4,7 @@ import torch
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.probabilities import sharpen
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
-from benchnav.models.training.data import MapData, MapDataset
+from benchnav.models.training.data import MapData, MapDataset, held_maps
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
 
 
@@ -50,7 +50,8 @@ def test_sampled_logits_stay_beside_their_class(
     monkeypatch.setattr("benchnav.models.training.temperature._MOST_CELLS", 200)
     logits, class_id = sample_logits(Colour(), maps)
     assert logits.shape == (200, 3)
-    pairs = torch.cat([maps.fields["rgb"], maps.fields["class_id"][:, None]], dim=1).flatten(2)
+    stored = maps.read(range(len(maps)))
+    pairs = torch.cat([stored["rgb"], stored["class_id"][:, None]], dim=1).flatten(2)
     for which in range(4):
         there = {tuple(cell) for cell in pairs[which].T.tolist()}
         part = slice(50 * which, 50 * (which + 1))
@@ -87,7 +88,7 @@ def witnessed(maps: int, seed: int) -> MapDataset:
     noise = torch.randn(maps, 3, CLASSES, 16, 16, generator=generator)
     steps = (2 + STRENGTH * (shown - 0.2) + noise).round().clamp(0, 5).long()
     rgb = steps[:, :, 0] + 6 * steps[:, :, 1] + 36 * steps[:, :, 2]
-    return MapDataset({"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)})
+    return held_maps({"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)})
 
 
 def ece(probabilities: torch.Tensor, class_id: torch.Tensor) -> float:
@@ -102,7 +103,8 @@ def test_a_pool_that_is_calibrated_as_a_whole_is_right_as_often_as_it_says() -> 
     for channel, boldness in enumerate((0.5, 2.0, 6.0)):  # each miscalibrated in its own way
         own = Witness(channel, boldness)
         members.append(Witness(channel, boldness, fit_temperature(*sample_logits(own, maps))))
-    rgb, class_id = fresh.fields["rgb"], fresh.fields["class_id"]
+    stored = fresh.read(range(len(fresh)))
+    rgb, class_id = stored["rgb"], stored["class_id"]
     alone = [member(rgb).softmax(1) for member in members]
     assert max(ece(one, class_id) for one in alone) < 0.03
     average = torch.stack(alone).mean(0)
