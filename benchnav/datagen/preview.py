@@ -26,6 +26,7 @@ from matplotlib.ticker import MaxNLocator
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.synth.appearance import light_direction, shade
+from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
 from benchnav.errors import ConfigError
 from benchnav.terrain import Grid
 
@@ -38,9 +39,9 @@ TITLES = {
 }
 STEEP_DEG = 30.0
 
-_WIDTH, _PAGE, _DPI = 7.2, 9.4, 300.0
+_PAGE, _DPI = 9.4, 300.0
 _LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.06, 0.42, 0.94, 0.12
-_TEXT, _TITLE, _LINE, _LETTER = 7.0, 8.0, 0.135, 0.054
+_LINE, _LETTER = 0.135, 0.054
 _UNOBSERVED = "0.7"
 _HATCH = "//////"
 _READ_MAPS = 20
@@ -53,12 +54,12 @@ _BLUE = LinearSegmentedColormap.from_list("blue", ["#092f52", "#35699d", "#79a9d
 
 def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path, kind: str) -> None:
     """Writes a `preview_figure` to the file `path` in the format `kind`, such as png or pdf."""
-    _save(preview_figure(dataset, split, indices), path, kind)
+    save(preview_figure(dataset, split, indices), path, kind)
 
 
 def save_contact_sheet(dataset: TerrainDataset, split: str, path: Path, kind: str, most: int = 100) -> None:
     """Writes a `contact_sheet_figure` to the file `path` in the format `kind`, such as png or pdf."""
-    _save(contact_sheet_figure(dataset, split, most), path, kind)
+    save(contact_sheet_figure(dataset, split, most), path, kind)
 
 
 def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) -> Figure:
@@ -96,7 +97,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     extent = (0.0, grid.extent_m[0], 0.0, grid.extent_m[1])
     for row, index in enumerate(indices):
         for column, field in enumerate(TITLES):
-            panel = _add_axes(figure, sheet.place(row, column), f"{field} {row}")
+            panel = add_axes(figure, sheet.place(row, column), f"{field} {row}")
             _draw_image(panel, maps[field][row], extent, **scales[field])
             if field == "elevation_m":
                 _draw_image(panel, veils[row], extent)
@@ -108,12 +109,12 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
             for name, style in _MARKS.items():
                 panel.plot(*maps[f"{name}_m"][row], **style)
             _tick(panel, sheet.panel, left=column == 0, bottom=row == len(indices) - 1)
-        _write(figure, 0.1, sheet.down[row], f"map {index}", rotation=90, ha="center", va="center")
+        write(figure, 0.1, sheet.down[row], f"map {index}", rotation=90, ha="center", va="center")
     for centre, title in zip(sheet.across, TITLES.values(), strict=True):
-        _write(figure, centre, _TOP - 0.05, title, size=_TITLE, ha="center", va="bottom")
-    _write(figure, 0.25, sheet.down.mean(), "y [m]", rotation=90, ha="center", va="center")
-    _write(figure, sheet.across[2], sheet.bottom + 0.2, "x [m]", ha="center", va="top")
-    _write(figure, _LEFT, 0.06, f"{dataset.id}, split {split}", size=_TITLE, va="top")
+        write(figure, centre, _TOP - 0.05, title, size=TITLE, ha="center", va="bottom")
+    write(figure, 0.25, sheet.down.mean(), "y [m]", rotation=90, ha="center", va="center")
+    write(figure, sheet.across[2], sheet.bottom + 0.2, "x [m]", ha="center", va="top")
+    write(figure, _LEFT, 0.06, f"{dataset.id}, split {split}", size=TITLE, va="top")
     _draw_bars(figure, sheet, levels)
     extra = _extra_marks(bool(np.isnan(maps["traversability"]).any()), bool(soft.any()))
     _draw_legends(figure, sheet, names, colours[shown], extra)
@@ -146,7 +147,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     across = grid.width * (2 if paired else 1)
     count, ratio, gap = min(held, most), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
-    wide = min(max((_WIDTH - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
+    wide = min(max((PAGE_WIDTH_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
     number = f"{held} maps" if count == held else f"first {count} of {held} maps"
     title = f"{dataset.id}, split {split} (scenario {dataset.splits[split]['scenario']}): {number}"
@@ -156,8 +157,8 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     # A whole number of dots a cell keeps all cells of one size, unless that takes too many dots.
     dots = max(1, round(_DPI * wide / across)) * across / wide
     figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
-    _write(figure, gap, 0.05, "\n".join(lines), size=_TITLE, va="top")
-    sheet = _add_axes(figure, (0, 0, width, height), "thumbnails")
+    write(figure, gap, 0.05, "\n".join(lines), size=TITLE, va="top")
+    sheet = add_axes(figure, (0, 0, width, height), "thumbnails")
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
     outline: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
@@ -172,7 +173,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
             if paired:
                 soft = soft_ground(block["class_id"][place], classes)
                 _draw_soft_ground(sheet, soft, (x, x + wide / 2, y + high, y), line=0.2)
-            label = sheet.text(x + 0.03, y + 0.03, str(index), size=_TEXT, color="white", va="top")
+            label = sheet.text(x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top")
             label.set_path_effects(outline)
     return figure
 
@@ -233,7 +234,7 @@ class _Sheet:
 
 def _lay_out(grid: Grid, rows: int, names: Sequence[str]) -> _Sheet:
     ratio, columns = grid.height / grid.width, len(TITLES)
-    widest = (_WIDTH - _LEFT - _RIGHT + _GAP) / columns - _GAP
+    widest = (PAGE_WIDTH_IN - _LEFT - _RIGHT + _GAP) / columns - _GAP
     high = min(widest * ratio, 2.0, max((_PAGE - _TOP - 1.1) / rows - _GAP, 0.8))
     column, row = max(high / ratio, 0.95), max(high, 0.5)
     bottom = _TOP + rows * (row + _GAP) - _GAP
@@ -324,8 +325,7 @@ def _tick(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> N
         # A tick at the very end is left out, as its number would touch the next panel's first.
         bins = int(np.clip(inches / 0.2, 1, 4))
         axis.set_major_locator(MaxNLocator(bins, steps=[1, 2, 5, 10], prune="upper"))
-    panel.tick_params(labelsize=_TEXT, length=2, width=0.5, pad=1.5, labelleft=left, labelbottom=bottom)
-    panel.spines[:].set_linewidth(0.5)
+    thin_ticks(panel, labelleft=left, labelbottom=bottom)
 
 
 def _draw_bars(figure: Figure, sheet: _Sheet, levels: np.ndarray) -> None:
@@ -333,16 +333,16 @@ def _draw_bars(figure: Figure, sheet: _Sheet, levels: np.ndarray) -> None:
     # Neither the colour image nor the classes have numbers to read off.
     for field, middle in list(zip(TITLES, sheet.across, strict=True))[2:]:
         wide = sheet.column - 0.12
-        bar = _add_axes(figure, (middle - wide / 2, sheet.bottom + 0.44, wide, 0.07), f"{field} bar")
+        bar = add_axes(figure, (middle - wide / 2, sheet.bottom + 0.44, wide, 0.07), f"{field} bar")
         extend = "max" if field == "slope_deg" else "neither"
         drawn_bar = figure.colorbar(drawn[f"{field} 0"], cax=bar, orientation="horizontal", extend=extend)
         drawn_bar.outline.set_linewidth(0.5)
         bar.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-        bar.tick_params(labelsize=_TEXT, length=2, width=0.5, pad=1.5)
+        bar.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
         if field == "elevation_m":
             bar.vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
             label = f"above the lowest point,\ncontours every {levels[1]:g} m"
-            bar.set_xlabel(label, size=_TEXT, labelpad=1.5, linespacing=1.1)
+            bar.set_xlabel(label, size=TEXT, labelpad=1.5, linespacing=1.1)
 
 
 def _extra_marks(unobserved: bool, soft: bool) -> list[Artist]:
@@ -363,7 +363,7 @@ def _draw_legends(
     marks += extra
     classes = [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
     style: dict[str, Any] = {
-        "fontsize": _TEXT, "frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.1,
+        "fontsize": TEXT, "frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.1,
         "handletextpad": 0.4, "columnspacing": 1, "labelspacing": 0.3, "bbox_transform": figure.transFigure,
     }  # fmt: skip
     right, below = 1 - _RIGHT / sheet.size[0], 1 - sheet.legend_top / sheet.size[1]
@@ -373,22 +373,3 @@ def _draw_legends(
     legend = figure.legend(handles=classes, loc="upper left", bbox_to_anchor=corner, ncols=columns, **style)
     for text in legend.get_texts():
         text.set_parse_math(False)
-
-
-def _add_axes(figure: Figure, place: tuple[float, float, float, float], label: str) -> Axes:
-    left, top, wide, high = place
-    width, height = figure.get_size_inches()
-    return figure.add_axes(
-        (left / width, 1 - (top + high) / height, wide / width, high / height), label=label
-    )
-
-
-def _write(figure: Figure, left: float, top: float, text: str, size: float = _TEXT, **style: Any) -> None:
-    width, height = figure.get_size_inches()
-    figure.text(left / width, 1 - top / height, text, size=size, parse_math=False, **style)
-
-
-def _save(figure: Figure, path: Path, kind: str) -> None:
-    # Type 42 embeds whole fonts, as publishers ask; composed images would be sampled anew in a PDF.
-    with matplotlib.rc_context({"pdf.fonttype": 42, "image.composite_image": False}):
-        figure.savefig(path, format=kind, dpi="figure")

@@ -4,9 +4,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 from matplotlib.figure import Figure
 
+from benchnav import drawing
 from benchnav.eval.trial import NOT_USED
 from benchnav.files import replacing
 
@@ -77,8 +77,7 @@ def save(figure: Figure, path: Path, trim: bool = True) -> None:
         path: of the PNG.
         trim: cut away white borders; a figure made for a column keeps its width without.
     """
-    box = "tight" if trim else None
     dpi = min(_DPI, _MOST_PIXELS / figure.get_figwidth())
     for suffix in (".png", ".pdf"):
-        with replacing(path.with_suffix(suffix)) as partial, matplotlib.rc_context({"pdf.fonttype": 42}):
-            figure.savefig(partial, dpi=dpi, format=suffix[1:], bbox_inches=box)
+        with replacing(path.with_suffix(suffix)) as partial:
+            drawing.save(figure, partial, suffix[1:], dpi, trim)

@@ -12,7 +12,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -21,17 +20,16 @@ from scipy.stats import binom
 
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
+from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, save, thin_ticks
 from benchnav.files import replacing
 from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 
-WIDTH = 7.2
 DPI = 300
-TEXT = 7.0
 
 _LEAST_WIDTH = 4.4
-_TITLE, _SMALL = 8.0, 5.5
+_SMALL = 5.5
 _BLUE, _ORANGE, _GREEN, _PINK, _SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
 _COLOURS = (_BLUE, _ORANGE, _GREEN, _PINK, _SKY, "#E69F00", "black")
 _MARKERS = "os^Dv<P"
@@ -82,7 +80,7 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
                 panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
         panel.set_xticks(range(len(names)), labels, rotation=90, parse_math=False)
         panel.set_yticks(range(len(names)), labels, parse_math=False)
-        panel.set_title(f"{split}: accuracy {quality.accuracy:.3f}", size=_TITLE)
+        panel.set_title(f"{split}: accuracy {quality.accuracy:.3f}", size=TITLE)
         panel.tick_params(labelsize=TEXT - 0.5, length=2, width=0.5, pad=1.5)
     _drop_rest(panels, len(qualities))
     for panel in panels[:, 0]:
@@ -127,7 +125,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
                 points = confidence[many], accuracy[many]
                 upper.plot(*points, "o", ms=3, mfc=fill, mec=_BLUE, mew=0.7, clip_on=False)
         upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
-        upper.set_title(f"{split}: ECE {quality.ece:.3f}", size=_TITLE)
+        upper.set_title(f"{split}: ECE {quality.ece:.3f}", size=TITLE)
         lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=_SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
@@ -135,7 +133,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
             upper.set_ylabel("how often right", size=TEXT)
             lower.set_ylabel("cells", size=TEXT)
         for panel in (upper, lower):
-            _tick(panel)
+            thin_ticks(panel)
     for place in range(len(qualities), rows * columns):
         row, column = divmod(place, columns)
         panels[2 * row, column].remove()
@@ -195,12 +193,12 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
             f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
             size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
         )  # fmt: skip
-        panel.set_title(split, size=_TITLE)
+        panel.set_title(split, size=TITLE)
         lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
         panel.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        _tick(panel)
+        thin_ticks(panel)
     _drop_rest(panels, len(qualities))
     figure.supxlabel("PIT of the realised λ", size=TEXT)
     figure.supylabel("density", size=TEXT)
@@ -244,7 +242,7 @@ def ladder_figure(
             if name == "entropy_auroc" and ensemble:
                 others = values(ladder, "mutual_information_auroc")
                 panel.plot(severities, others, ms=3, lw=1, ls=":", mfc="white", **style)
-        panel.set_title(title, size=_TITLE)
+        panel.set_title(title, size=TITLE)
         panel.margins(x=0.05, y=0.12)
         if ideal is not None:
             panel.axhline(ideal, color="0.4", lw=0.8, ls="--")
@@ -252,7 +250,7 @@ def ladder_figure(
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
         panel.grid(alpha=0.3, lw=0.5)
         panel.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-        _tick(panel)
+        thin_ticks(panel)
     figure.supxlabel("severity of the shift", size=TEXT)
     lines = [
         Line2D(
@@ -310,11 +308,11 @@ def latent_figure(
             panel.axhline(soft[number][1], color=_BLUE, lw=0.9, ls="-.")
         for share, shade in ((_RARE, 0.12), (0.0, 0.25)):
             panel.axvspan(_steeper_than(slope_cells[number], share), 90, color="0.4", alpha=shade, lw=0)
-        panel.set_title(one.name.replace("_", " "), size=_TITLE, parse_math=False)
+        panel.set_title(one.name.replace("_", " "), size=TITLE, parse_math=False)
         panel.text(
             0.05, 0.05, f"σ {noise[number]:.3f} ({one.noise:.3f})", size=TEXT, transform=panel.transAxes
         )
-        _tick(panel)
+        thin_ticks(panel)
     panels[0, 0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     _drop_rest(panels, len(classes))
     figure.supxlabel("slope [°]  (σ: noise, in brackets the true one)", size=TEXT)
@@ -356,7 +354,7 @@ def _with_soft(expected: np.ndarray, weight: float, mean: float, std: float) -> 
 def save_figure(figure: Figure, path: Path) -> None:
     """Writes a figure as PNG, whole or not at all; its folder is made."""
     with replacing(path, durable=False) as partial:
-        figure.savefig(partial, format="png", dpi=DPI)
+        save(figure, partial, "png", DPI)
 
 
 def _steeper_than(cells: Sequence[int], share: float) -> float:
@@ -378,7 +376,9 @@ def _grid(count: int, most: int) -> tuple[int, int]:
 
 def _figure(share: float, rows: int, high: float, rest: float) -> Figure:
     """A figure of this share of the full width, but wide enough for its legend."""
-    return Figure(figsize=(max(WIDTH * share, _LEAST_WIDTH), rows * high + rest), layout="constrained")
+    return Figure(
+        figsize=(max(PAGE_WIDTH_IN * share, _LEAST_WIDTH), rows * high + rest), layout="constrained"
+    )
 
 
 def _drop_rest(panels: np.ndarray, count: int) -> None:
@@ -389,14 +389,9 @@ def _drop_rest(panels: np.ndarray, count: int) -> None:
         panels.flat[place - columns].tick_params(labelbottom=True)
 
 
-def _tick(panel: Axes) -> None:
-    panel.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
-    panel.spines[:].set_linewidth(0.5)
-
-
 def _legend(figure: Figure, handles: Sequence[Any], most: int = 4) -> None:
     """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
-    columns = min(len(handles), most if figure.get_figwidth() == WIDTH else 2)
+    columns = min(len(handles), most if figure.get_figwidth() == PAGE_WIDTH_IN else 2)
     figure.legend(
         handles=handles, loc="outside upper center", ncols=columns, fontsize=TEXT, frameon=False,
         handlelength=1.6, columnspacing=1.4,

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -19,9 +18,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import class_colours
 from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.drawing import TEXT, add_axes, thin_ticks, write
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
 from benchnav.models.probabilities import class_probabilities
-from benchnav.models.quality.figures import TEXT
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
 
 TITLES = {
@@ -164,7 +163,7 @@ def map_sheet_figure(
         middle = left + _PANEL / 2
         for row, index in enumerate(sheet.indices):
             top = _TOP + row * (high + _GAP)
-            panel = _add_axes(figure, (left, top, _PANEL, high), f"{name} {row}")
+            panel = add_axes(figure, (left, top, _PANEL, high), f"{name} {row}")
             image = panel.imshow(
                 sheet.layers[name][row],
                 origin="lower",
@@ -175,23 +174,23 @@ def map_sheet_figure(
             )
             for axis in (panel.xaxis, panel.yaxis):
                 axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="upper"))
-            _tick(panel)
+            thin_ticks(panel)
             panel.tick_params(labelleft=column == 0, labelbottom=row == len(sheet.indices) - 1)
             if column == 0:
-                _write(figure, 0.1, top + high / 2, f"map {index}", rotation=90, ha="center", va="center")
-        _write(figure, middle, _TOP - 0.06, TITLES[name], size=TEXT + 1, ha="center", va="bottom")
-        _write(figure, middle, bottom + 0.2, "x [m]", ha="center", va="top")
+                write(figure, 0.1, top + high / 2, f"map {index}", rotation=90, ha="center", va="center")
+        write(figure, middle, _TOP - 0.06, TITLES[name], size=TEXT + 1, ha="center", va="bottom")
+        write(figure, middle, bottom + 0.2, "x [m]", ha="center", va="top")
         if name in _UNITS:
-            bar = _add_axes(figure, (left + 0.06, bottom + 0.42, _PANEL - 0.12, 0.07), f"{name} bar")
+            bar = add_axes(figure, (left + 0.06, bottom + 0.42, _PANEL - 0.12, 0.07), f"{name} bar")
             extend = {"error": "both", "expected": "neither", "expected_true": "neither"}.get(name, "max")
             drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
             drawn.outline.set_linewidth(0.5)
             bar.xaxis.set_major_locator(MaxNLocator(2 if name == "error" else 4, steps=[1, 2, 2.5, 5, 10]))
             bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            _tick(bar)
-            _write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")
-    _write(figure, _LEFT, 0.06, f"{title}, split {sheet.split}", size=TEXT + 1, weight="bold", va="top")
-    _write(figure, 0.26, (_TOP + bottom) / 2, "y [m]", rotation=90, ha="center", va="center")
+            thin_ticks(bar)
+            write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")
+    write(figure, _LEFT, 0.06, f"{title}, split {sheet.split}", size=TEXT + 1, weight="bold", va="top")
+    write(figure, 0.26, (_TOP + bottom) / 2, "y [m]", rotation=90, ha="center", va="center")
     if shown:
         colours = class_colours(classes)
         patches = [
@@ -211,25 +210,6 @@ def map_sheet_figure(
 def _shown_classes(sheet: MapSheet) -> list[int]:
     layers = [sheet.layers[name] for name in ("class_true", "class_found") if name in sheet.layers]
     return np.unique(layers).tolist() if layers else []
-
-
-def _add_axes(figure: Figure, place: tuple[float, float, float, float], label: str) -> Axes:
-    """Adds a panel at (left, top, width, height) in inches from the upper left corner."""
-    left, top, wide, high = place
-    width, height = figure.get_size_inches()
-    return figure.add_axes(
-        (left / width, 1 - (top + high) / height, wide / width, high / height), label=label
-    )
-
-
-def _write(figure: Figure, left: float, top: float, text: str, size: float = TEXT, **style: Any) -> None:
-    width, height = figure.get_size_inches()
-    figure.text(left / width, 1 - top / height, text, size=size, parse_math=False, **style)
-
-
-def _tick(panel: Axes) -> None:
-    panel.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
-    panel.spines[:].set_linewidth(0.5)
 
 
 def _round_up(value: float) -> float:
