@@ -23,7 +23,7 @@ from benchnav.cluster import connected, parallel, told_when_lost
 from benchnav.datagen.files.folder import Contents, write_manifest
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make
-from benchnav.datagen.files.writer import check_target, named_errors, writing
+from benchnav.datagen.files.writer import check_target, is_one_file, named_errors, writing
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import ConfigError, DatasetError
 from benchnav.files import replacing, sole_writer
@@ -49,7 +49,7 @@ def create(
 
     Args:
         recipe: what to make.
-        path: file to write, of suffix `.h5`; else a folder.
+        path: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         jobs: processes to make maps in.
         scheduler: address of a Dask cluster's scheduler, whose workers take their place; empty for none.
         share: which of the shards are made here; None for all.
@@ -64,7 +64,7 @@ def create(
     own = [
         shard for place, shard in enumerate(shards) if share is None or place % share.of == share.index - 1
     ]
-    is_file = path.suffix == ".h5"
+    is_file = is_one_file(path)
     if is_file and share is not None:
         raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
     with named_errors(path), _held(path, share):

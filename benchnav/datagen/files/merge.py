@@ -18,7 +18,7 @@ from benchnav.datagen import schema
 from benchnav.datagen.files.create import join
 from benchnav.datagen.files.folder import Contents, write_manifest
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
-from benchnav.datagen.files.writer import check_target, named_errors
+from benchnav.datagen.files.writer import check_target, is_one_file, named_errors
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
 from benchnav.errors import ConfigError, DatasetError
@@ -38,7 +38,7 @@ def merge(
 
     Args:
         paths: two or more datasets, of which the first fixes the order of splits; or folders of shares.
-        out: file to write, of suffix `.h5`; else a folder.
+        out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         dataset_id: id of the new dataset; the name of `out` when empty. Shares keep that of their recipe.
         overwrite: replace what is there.
 
@@ -50,7 +50,7 @@ def merge(
         raise DatasetError("Expected either datasets or shares of one dataset, got both.")
     contents = _of_datasets(whole, dataset_id or out.stem) if whole else _of_shares(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
-    is_file = out.suffix == ".h5"
+    is_file = is_one_file(out)
     with named_errors(out), sole_writer(out, str(out)):
         if is_file:
             check_target(out, overwrite)

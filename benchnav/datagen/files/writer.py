@@ -130,6 +130,11 @@ def pack(
         return file.id.get_file_image()
 
 
+def is_one_file(path: Path) -> bool:
+    """Whether a dataset of this name is one file; else it is a folder of shards."""
+    return path.suffix in (".h5", ".hdf5")
+
+
 def check_target(path: Path, overwrite: bool) -> None:
     """Refuses a target that is there, unless it is to be replaced, and one that is a folder.
 

@@ -256,3 +256,10 @@ def test_a_cluster_makes_the_same_maps(tmp_path: Path) -> None:
     assert digests(tmp_path / "d.h5") == digests(tiny_dataset(tmp_path / "here.h5"))
     with pytest.raises(ConfigError, match="no answer"):
         make(tmp_path / "e.h5", scheduler="tcp://127.0.0.1:9")
+
+
+@pytest.mark.parametrize("name", ["d.h5", "d.hdf5", "d", "d.v2"])
+def test_the_name_tells_a_file_from_a_folder(tmp_path: Path, name: str) -> None:
+    path = make(tmp_path / name)
+    assert path.is_file() == (name in ("d.h5", "d.hdf5"))
+    assert TerrainDataset(path).map_count("train") == 8
