@@ -104,7 +104,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     assert (
         TerrainDataset("big").digest == TerrainDataset("one.h5").digest == TerrainDataset("whole.h5").digest
     )
-    assert (TerrainDataset("big").id, TerrainDataset("one.h5").id) == ("tiny-v1", "tiny-v1")
+    assert (TerrainDataset("big").id, TerrainDataset("one.h5").id) == ("small", "small")
     for command in (["show"], ["validate"], ["preview", "--out", "p.png"]):
         assert datagen(command[0], "big", *command[1:]) == 0
     capsys.readouterr()
@@ -113,7 +113,7 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     assert "  big " in listed
     assert "part1" not in listed
     assert datagen("merge", "part1", "--out", "some") == 2
-    assert "of train" in capsys.readouterr().err
+    assert "of valid" in capsys.readouterr().err
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 2
     assert "exists" in capsys.readouterr().err
     (shard,) = Path("big").glob("train*")

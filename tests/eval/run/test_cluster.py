@@ -11,12 +11,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from benchnav import cluster as dask
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval import cli
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.run import cluster
 from benchnav.eval.run.cluster import check_worker
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
@@ -70,8 +70,8 @@ def cluster_of_two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_REACH_S", PATIENCE_S)
-    monkeypatch.setattr(cluster, "_WORKERS_S", PATIENCE_S)
+    monkeypatch.setattr(dask, "_REACH_S", PATIENCE_S)
+    monkeypatch.setattr(dask, "_WORKERS_S", PATIENCE_S)
 
 
 def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
@@ -180,7 +180,7 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Pat
 def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cluster, "_REACH_S", 0.2)
+    monkeypatch.setattr(dask, "_REACH_S", 0.2)
     suite = suite_on(dataset_path, tmp_path / "log", scenarios=("std",), risks=("mean",), seeds=(0,))
     list(run_suite(suite, tmp_path / "run"))
     before = sorted((tmp_path / "run").rglob("*"))

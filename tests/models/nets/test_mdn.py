@@ -26,6 +26,7 @@ from benchnav.models.nets.mdn import (
     censored_nll,
 )
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
+from benchnav.models.training import train_mdn
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.train_mdn import fit_mdn, measure_network
@@ -328,7 +329,7 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     whole, metrics = fit_mdn(SMALL, dataset, 3, FitOptions(trainer=CPU))
     assert set(metrics) == {"train_loss", "valid_loss", "valid_rmse", "epoch"}
     with monkeypatch.context() as patch:
-        patch.setattr(mdn, "KeepBest", KillInTheThirdEpoch)
+        patch.setattr(train_mdn, "KeepBest", KillInTheThirdEpoch)
         with pytest.raises(Killed):
             fit_mdn(SMALL, dataset, 3, FitOptions(folder=tmp_path, trainer=CPU))
     torch.manual_seed(99)  # what the global generator holds must not matter
@@ -362,11 +363,11 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
     jitters: list[float] = []
 
     class Watched(MapData):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
+        def __init__(self, *arguments: Any, **named: Any) -> None:
+            super().__init__(*arguments, **named)
             jitters.append(self.jitter)
 
-    monkeypatch.setattr(mdn, "MapData", Watched)
+    monkeypatch.setattr(train_mdn, "MapData", Watched)
     network, _ = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU))
     assert jitters == [SMALL.jitter]
     slopes = torch.from_numpy(dataset.read("train", fields=["slope_deg"])["slope_deg"])
