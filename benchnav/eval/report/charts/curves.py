@@ -24,6 +24,9 @@ _LEVEL = "risk.options.level"
 _NAMES = {_LEVEL: "level α", SEVERITY: "severity of the scenario"}
 
 Labels = Mapping[Any, Any]
+Groups = dict[tuple[str, ...], list[Line]]
+
+_MODEL = 3  # its place in what names a panel
 
 
 def sweep_name(number: str) -> str:
@@ -83,9 +86,10 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
 def _panels(sweep: Sweep, rows: Mapping[str, Labels]) -> list[tuple[str, list[Line]]]:
     """Titles and lines of the panels: split until no panel holds more lines than can be told apart."""
     for split in (("model",), ("model", "planner"), ("model", "planner", "risk")):
-        groups: dict[tuple[str, ...], list[Line]] = {}
+        groups: Groups = {}
         for line in sweep.lines:
             groups.setdefault(_place(sweep, line, rows, split), []).append(line)
+        groups = _with_blind(groups) if split == ("model",) else groups
         if max(map(len, groups.values())) <= _MOST_LINES:
             break
     differing = [i for i in range(len(next(iter(groups)))) if len({key[i] for key in groups}) > 1]
@@ -93,6 +97,23 @@ def _panels(sweep: Sweep, rows: Mapping[str, Labels]) -> list[tuple[str, list[Li
         (", ".join(key[i] for i in differing if key[i] != NOT_USED) or key[0], lines)
         for key, lines in groups.items()
     ]
+
+
+def _with_blind(groups: Groups) -> Groups:
+    """Puts what looks at nothing predicted into the panels of the models that it stands beside."""
+    found: Groups = {}
+    for key, lines in groups.items():
+        beside = [other for other in groups if other != key and _without_model(other) == _without_model(key)]
+        if key[_MODEL] != NOT_USED or not beside:
+            found[key] = [*found.get(key, []), *lines]
+            continue
+        for other in beside:
+            found[other] = [*lines, *found.get(other, [])]
+    return found
+
+
+def _without_model(key: tuple[str, ...]) -> tuple[str, ...]:
+    return key[:_MODEL] + key[_MODEL + 1 :]
 
 
 def _place(sweep: Sweep, line: Line, rows: Mapping[str, Labels], split: Sequence[str]) -> tuple[str, ...]:

@@ -93,6 +93,21 @@ def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:
         assert len(ranges) == 2
 
 
+def test_what_looks_at_nothing_stands_beside_every_model_over_all_severities() -> None:
+    blind = {"planner": "straight", "risk": "–", "model": "–"}
+    scenarios = ("std", "hg-050", "hg")
+    models = [made.trial(scenario=name, model=model) for name in scenarios for model in ("a", "b")]
+    figure = drawn(
+        *((made.trial(scenario=name, **blind), 2) for name in scenarios), *((one, 7) for one in models)
+    )
+    success = shown(figure)[:2]
+    assert [panel.get_title() for panel in success] == ["a", "b"]
+    for panel in success:
+        lines = [line for line in panel.lines if len(line.get_xdata()) == 3]
+        assert [list(line.get_xdata()) for line in lines] == [[0, 0.5, 1]] * 2
+        assert sorted(line.get_ydata()[0] for line in lines) == [20, 70]
+
+
 def test_many_lines_are_told_apart_by_panels() -> None:
     planners = [f"planner_{i}" for i in range(9)]
     figure = drawn(*((made.trial(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
