@@ -5,11 +5,9 @@ of many files is made where it is to be, and is finished when its manifest is wr
 """
 
 import multiprocessing
-import os
 import re
 import shutil
 import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -28,6 +26,7 @@ from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import ConfigError, DatasetError
 from benchnav.files import replacing, sole_writer
 from benchnav.share import Share
+from benchnav.workers import end_with_parent
 
 _Made = tuple[Shard, bytes]
 
@@ -192,14 +191,7 @@ def _make(recipe: Recipe, shard: Shard) -> _Made:
 def _start_worker() -> None:
     # An interrupt is for the parent to act on; and a parent that is killed takes its workers along.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
+    end_with_parent()
 
 
 def _check_workers(client: Any) -> None:

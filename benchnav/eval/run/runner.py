@@ -57,6 +57,7 @@ from benchnav.eval.unit import Extent, Unit, in_table_order, units
 from benchnav.files import sole_writer, write_text
 from benchnav.planning.world.outcome import Outcome
 from benchnav.share import Share
+from benchnav.workers import end_with_parent
 
 Trials = dict[str, tuple[Trial, Extent]]
 
@@ -218,7 +219,8 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
 def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs: int) -> Iterator[None]:
     # Workers may be older than this call, so that they are told where names of files begin.
     here, target, run_id, limit_s = Path.cwd(), folder.resolve(), about["run_id"], about["planner_limit_s"]
-    calls = (joblib.delayed(_run_at)(here, unit, target, run_id, limit_s) for unit in missing)
+    run = _run_in_worker if jobs > 1 else _run_at
+    calls = (joblib.delayed(run)(here, unit, target, run_id, limit_s) for unit in missing)
     finished = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
     for _ in missing:
         with warnings.catch_warnings():
@@ -232,6 +234,11 @@ def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs:
                     "command again, if need be with fewer `jobs`."
                 ) from error
         yield
+
+
+def _run_in_worker(*given: Any) -> None:
+    end_with_parent()
+    _run_at(*given)
 
 
 def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: float) -> None:

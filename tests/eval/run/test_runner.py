@@ -145,6 +145,35 @@ def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp
     assert said == [f"{len(kept)} of 14 units were there already"]
 
 
+def test_workers_end_with_a_command_that_was_killed(dataset_path: Path, tmp_path: Path) -> None:
+    (tmp_path / "begun").mkdir()
+    asleep = {"part": "tests.eval.parts:Asleep", "options": {"folder": str(tmp_path / "begun")}}
+    suite = quick(dataset_path, planners=(asleep,), risks=("mean", "cvar"), scenarios=("std",))
+    code = (
+        "from pathlib import Path; from benchnav.eval.suite import Suite\n"
+        "from benchnav.eval.run.runner import run_suite\n"
+        f"for _ in run_suite({suite!r}, Path({str(tmp_path / 'run')!r}), jobs=2): pass"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], start_new_session=True)
+    while len(list((tmp_path / "begun").iterdir())) < 2:
+        time.sleep(0.05)
+        assert process.poll() is None
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 30
+    while is_alive(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not is_alive(process.pid)
+
+
+def is_alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
 def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_path: Path) -> None:
     suite, said = quick(dataset_path), []
     first = finish(suite, tmp_path / "run")
