@@ -133,23 +133,101 @@ def test_a_large_dataset_is_a_folder(datagen: Call, monkeypatch: pytest.MonkeyPa
     assert TerrainDataset("datasets/tiny-v1-seed1").map_count("train") == 3
 
 
-def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+def write_ground(name: str, values: np.ndarray) -> None:
     rasterio = pytest.importorskip("rasterio")
+    bands, height, width = values.shape
     north_up = rasterio.transform.from_origin(400_000, 4_000_000, 0.5, 0.5)
     with rasterio.open(
-        "site.tif", "w", driver="GTiff", height=40, width=70, count=1, dtype="float32", crs="EPSG:32654",
-        transform=north_up, nodata=-9999,
+        name, "w", driver="GTiff", height=height, width=width, count=bands, dtype=values.dtype, crs="EPSG:32654",
+        transform=north_up, nodata=-9999 if values.dtype == np.float32 else None,
     ) as raster:  # fmt: skip
-        ground = np.linspace(0, 2, 70 * 40, dtype=np.float32).reshape(40, 70)
-        ground[20, 60] = -9999
-        raster.write(ground, 1)
+        raster.write(values)
+
+
+def test_real_ground_is_imported(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    ground = np.linspace(0, 2, 70 * 40, dtype=np.float32).reshape(1, 40, 70)
+    ground[0, 20, 60] = -9999
+    write_ground("site.tif", ground)
     assert datagen("import-dem", "site.tif", "--out", "site.h5", "--recipe", "tiny-v1") == 0
-    assert "left out: 1 with missing cells" in capsys.readouterr().out
-    assert TerrainDataset("site.h5").splits["test/real"]["maps"] == 1
+    assert "left out of test/real: 1 missing elevation" in capsys.readouterr().out
+    made = TerrainDataset("site.h5")
+    assert made.splits["test/real"]["maps"] == 1
+    assert made.id == "site"
     assert datagen("show", "site.h5") == 0
     assert "1 of site.tif" in capsys.readouterr().out
     assert datagen("validate", "site.h5") == 0
     assert datagen("import-dem", "nope.tif", "--out", "x.h5") == 2
+    assert "`dem` as a raster that GDAL can read, got nope.tif" in capsys.readouterr().err
+
+
+def test_an_import_passes_every_setting_on(datagen: Call, capsys) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(0)
+    write_ground("site.tif", rng.random((1, 20, 240), np.float32))
+    write_ground("cover.tif", np.full((1, 20, 240), 40, np.uint8))
+    write_ground("photo.tif", np.full((3, 20, 240), 77, np.uint8))
+    write_ground("lambda.tif", np.full((1, 20, 240), 0.25, np.float32))
+    changes = (
+        "height=16",
+        "width=16",
+        "start_m=[1,1]",
+        "goal_m=[6,6]",
+        "class_periods_m=[4,2]",
+        "scenarios.hg.crater_count=[0,0]",
+    )
+    common = ("import-dem", "site.tif", *changes, "--recipe", "tiny-v1", "--scenario", "hs")
+    splits = ("--splits", "train:0.7,valid:0.1,test/site:0.2", "--stride", "4")
+    real = ("--photo", "photo.tif", "--traversability", "lambda.tif")
+    assert datagen(*common, *splits, *real, "--out", "out") == 2
+    assert "--random-classes" in capsys.readouterr().err
+    named = ("--classes", "cover.tif", "--class-ids", "{40: gravel, 9: null}")
+    assert datagen(*common, *splits, *real, *named, "--out", "out", "--solvable") == 0
+    assert "left out between splits: 6" in capsys.readouterr().out
+    made = TerrainDataset("out")
+    assert made.path.is_dir()
+    assert made.id == "out"
+    sources = {name: entry["parts"][0]["source"] for name, entry in made.splits.items()}
+    tried = {name: len(s["kept"]) + s["left_out"]["not_solvable"] for name, s in sources.items()}
+    assert tried == {"train": 16, "valid": 2, "test/site": 5}
+    assert sources["train"]["left_out"]["not_solvable"] > 0
+    assert {entry["scenario"] for entry in made.splits.values()} == {"hs"}
+    assert sources["train"]["stride_m"] == [4.0, 4.0]
+    assert sources["train"]["classes"]["ids"] == {"9": None, "40": "gravel"}
+    maps = made.read("train")
+    assert maps["rgb"].shape[1:] == (3, 16, 16)
+    assert (maps["rgb"] == 77).all()
+    assert (maps["traversability"] == 0.25).all()
+    assert np.isfinite(maps["reference_time_s"]).all()
+    assert datagen(*common, *splits, "--out", "out") == 2
+    assert datagen(*common, *real, "--random-classes", "--out", "out", "--overwrite", "--id", "mine") == 0
+    made = TerrainDataset("out")
+    assert (made.id, list(made.splits)) == ("mine", ["test/real"])
+    assert datagen(*common, "id=named", "--out", "d.h5") == 0
+    assert TerrainDataset("d.h5").id == "named"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--split", "test/hills"), "It is now `--splits NAME`"),
+        (("--splits", "train:0.7"), "sum to 1"),
+        (("--stride", "0.3"), "`stride` as a multiple"),
+        (("nonsense",), "Expected an override such as"),
+        (("--photo", "photo.tif"), "--random-classes"),
+        (("--class-ids", "{1: gravel}"), "Expected `classes` with `class_ids`"),
+    ],
+)
+def test_an_import_that_cannot_be_ends_in_one_line(
+    datagen: Call,
+    words: tuple[str, ...],
+    said: str,
+    capsys,  # type: ignore[no-untyped-def]
+) -> None:
+    write_ground("site.tif", np.zeros((1, 40, 40), np.float32))
+    assert datagen("import-dem", "site.tif", *words, "--out", "x.h5", "--recipe", "tiny-v1") == 2
+    message = capsys.readouterr().err
+    assert said in message
+    assert message.count("\n") == 1
+    assert not Path("x.h5").exists()
 
 
 def test_overrides_and_seeds_name_what_they_make(datagen: Call) -> None:

@@ -1,162 +1,191 @@
-"""GeoTIFFs: opened, refused where they do not lie north up in a known place, and read by windows.
+"""Rasters by any name that GDAL opens, laid on the cells of the maps by GDAL's warper and read by windows.
 
-rasterio is an extra of this package, imported when a raster is opened. Every refusal ends in a
-command that mends the raster; `rio` comes with rasterio. Letters in shapes: K bands, h×w cells.
+rasterio is an extra of this package, imported when a raster is opened. A raster's rows run southward; what
+is read here runs northward, with y. Letters in shapes: K bands, H×W cells.
 """
 
 import json
 import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchnav.errors import ConfigError, DatasetError
 
-SLACK = 1e-3  # of a cell that an extent may fall short by
 _MOST_STRETCH = 0.02  # of a projection; within a UTM zone it is at most 0.001
+_TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class Lattice:
+    """The cells of all maps together.
+
+    Args:
+        crs: projected, in metres.
+        west_m: their western edge.
+        south_m: their southern edge.
+        cells: how many, northward and eastward.
+        resolution_m: width of a cell.
+    """
+
+    crs: Any
+    west_m: float
+    south_m: float
+    cells: Sequence[int]
+    resolution_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Raster:
-    """An open GeoTIFF, north up, with a CRS: what the user calls it, where it is, rasterio's reader."""
+    """An open raster: what the user calls it, its name, rasterio's reader."""
 
     argument: str
-    path: Path
+    name: str
     file: Any
 
-    @property
-    def cell_m(self) -> tuple[float, float]:
-        """Width and height of a cell."""
-        return self.file.transform.a, -self.file.transform.e
+    def place(self) -> tuple[Any, Any, tuple[float, float]]:
+        """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.
 
-    def read(self, bands: list[int], rows: slice, columns: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Reads a window: values, shape [K, h, w], and which cells are missing, bool, shape [h, w]."""
-        window = ((rows.start, rows.stop), (columns.start, columns.stop))
-        with _naming(self.argument, self.path):
-            values = self.file.read(bands, window=window)
-            missing = self.file.dataset_mask(window=window) == 0
-        return values, missing | ~np.isfinite(values).all(axis=0)
+        The CRS is its own where a metre of that is one on the ground, else that of its UTM zone.
+
+        Raises:
+            DatasetError: it has neither.
+        """
+        own, bounds = _horizontal(self.file.crs), self.file.bounds
+        x, y = (bounds.left + bounds.right) / 2, (bounds.bottom + bounds.top) / 2
+        utm = _utm_of(own, x, y)
+        crs = own if own.is_projected and own.linear_units_factor[1] == 1 else utm
+        if crs is not None and utm is not None:
+            eastings, northings = _transformed(crs, utm, [x, x + 1000, x], [y, y, y + 1000])
+            sides = np.hypot(eastings[1:] - eastings[0], northings[1:] - northings[0])
+            crs = utm if abs(sides / 1000 - 1).max() > _MOST_STRETCH else crs
+        if crs is None:
+            raise DatasetError(
+                f"Expected `{self.argument}` in a projected CRS in metres, or on the Earth, got {own.to_string()} "
+                f"in {self.name}. Reproject it: rio warp --dst-crs CRS {self.name} warped.tif"
+            )
+        with self.warped(crs) as warped:
+            return crs, warped.bounds, (warped.res[1], warped.res[0])
+
+    def warped(self, crs: Any, **settings: Any) -> Any:
+        """The raster in another CRS; where it has no values, that shows, if need be by one more band."""
+        kinds = {flag.name for flags in self.file.mask_flag_enums for flag in flags}
+        if kinds == {"all_valid"} and np.dtype(self.file.dtypes[0]).kind == "f":
+            settings |= {"src_nodata": np.nan, "nodata": np.nan}
+        elif not kinds & {"nodata", "alpha"}:
+            settings |= {"add_alpha": True}
+        with _naming(self.argument, self.name):
+            return load_rasterio().vrt.WarpedVRT(
+                self.file, src_crs=_horizontal(self.file.crs), crs=crs, tolerance=_TOLERANCE, **settings
+            )
+
+    @contextmanager
+    def laid(self, lattice: Lattice, bands: list[int], how: str) -> Iterator["Layer"]:
+        """Lays bands of it on a lattice, resampled in one of GDAL's ways."""
+        rasterio, (height, width), step = load_rasterio(), lattice.cells, lattice.resolution_m
+        north_west = lattice.west_m - step, lattice.south_m + (height + 1) * step
+        with self.warped(
+            lattice.crs,
+            transform=rasterio.transform.from_origin(*north_west, step, step),
+            height=height + 2,
+            width=width + 2,
+            resampling=rasterio.enums.Resampling[how],
+            # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
+            dtype="float64" if len(bands) == 1 else self.file.dtypes[0],
+        ) as warped:
+            yield Layer(raster=self, lattice=lattice, bands=bands, warped=warped)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """A raster as resampled to a lattice that is framed by one cell."""
+
+    raster: Raster
+    lattice: Lattice
+    bands: list[int]
+    warped: Any
+
+    def read(self, rows: range, columns: range) -> np.ndarray:
+        """Reads cells of the lattice and one cell around them.
+
+        Args:
+            rows: counted northward.
+            columns: counted eastward.
+
+        Returns:
+            Values, NaN where there are none, float64, shape [K, len(rows) + 2, len(columns) + 2].
+        """
+        top = self.lattice.cells[0] - rows.stop
+        window = ((top, top + len(rows) + 2), (columns.start, columns.stop + 2))
+        with _naming(self.raster.argument, self.raster.name):
+            values = self.warped.read(self.bands, window=window).astype(np.float64)
+            if self.warped.count > self.raster.file.count:
+                missing = self.warped.read(self.warped.count, window=window) == 0
+            else:
+                missing = self.warped.dataset_mask(window=window) == 0
+        values[:, missing | ~np.isfinite(values).all(axis=0)] = np.nan
+        scales, offsets = (
+            np.array(numbers) for numbers in (self.raster.file.scales, self.raster.file.offsets)
+        )
+        which = np.array(self.bands) - 1
+        return (values * scales[which, None, None] + offsets[which, None, None])[:, ::-1]
 
 
 @contextmanager
-def opened(argument: str, path: Path, ground: Raster | None = None) -> Iterator[Raster]:
-    """Opens a GeoTIFF and checks where it lies: by itself, or that it covers the ground.
+def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Raster]:
+    """Opens a raster.
+
+    Args:
+        argument: what the user calls it.
+        name: where it is.
+        kinds: dtypes of its first bands; none for one band of any.
 
     Raises:
-        DatasetError: it is none, or does not lie north up in a known place, or not where it should.
+        DatasetError: it cannot be read, holds other bands, or does not say where it lies.
     """
-    if not path.is_file():
-        raise DatasetError(
-            f"Expected `{argument}` as a GeoTIFF file, got {path}, which is not there. Check the path."
-        )
-    with ExitStack() as stack:
-        with _naming(argument, path), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a missing place, which is an error below
-            raster = Raster(argument, path, stack.enter_context(load_rasterio().open(path, driver="GTiff")))
-        _check_place(raster)
-        if ground is None:
-            _check_projection(raster)
-        else:
-            _check_covers(raster, ground)
-        yield raster
-
-
-def _check_place(raster: Raster) -> None:
-    file, path = raster.file, raster.path
-    if file.crs is None:
-        raise DatasetError(
-            f"Expected `{raster.argument}` with a coordinate reference system (CRS), got {path} without one. "
-            f"If you know it, declare it: rio edit-info --crs EPSG:CODE {path}"
-        )
-    if file.transform.is_identity:
-        raise DatasetError(
-            f"Expected `{raster.argument}` with a geotransform, which says where it lies and how large its cells "
-            f"are, got {path} without one. If you know it: rio edit-info --transform "
-            f"'[CELL, 0, WEST, 0, -CELL, NORTH]' {path}"
-        )
-    a, b, _, d, e, _ = tuple(file.transform)[:6]
-    if b or d or a <= 0 or e >= 0:
-        raise DatasetError(
-            f"Expected `{raster.argument}` north up, got {path} rotated or mirrored. Resample it: "
-            + _warp(raster, crs_name(file.crs))
-        )
-
-
-def _check_projection(ground: Raster) -> None:
-    file, path = ground.file, ground.path
-    utm = _utm_of(ground)
-    remedy = f"Reproject it: {_warp(ground, utm or 'EPSG:CODE')}"
-    unit = file.crs.linear_units_factor if file.crs.is_projected else (file.crs.units_factor[0], 0)
-    if unit[1] != 1:
-        raise DatasetError(
-            f"Expected `dem` in a projected CRS in metres, got {crs_name(file.crs)} in units of {unit[0]} in "
-            f"{path}. {remedy}"
-        )
-    if utm:
-        x, y = _centre(ground)
-        eastings, northings = _transformed(file.crs, utm, [x, x + 1000, x], [y, y, y + 1000])
-        sides = np.hypot(eastings[1:] - eastings[0], northings[1:] - northings[0])
-        if abs(sides / 1000 - 1).max() > _MOST_STRETCH:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a missing place, which is an error below
+        with _naming(argument, name):
+            file = load_rasterio().open(name)
+    with file:
+        if file.crs is None:
             raise DatasetError(
-                f"Expected `dem` in a CRS whose metres are metres on the ground, got {crs_name(file.crs)} in {path}, "
-                f"where 1000 of them are {sides.min():.0f} m. {remedy}"
+                f"Expected `{argument}` with a coordinate reference system (CRS), got {name} without one. "
+                f"If you know it, declare it: rio edit-info --crs EPSG:CODE {name}"
             )
+        if file.transform.is_identity:
+            raise DatasetError(
+                f"Expected `{argument}` with a geotransform, which says where it lies and how large its cells "
+                f"are, got {name} without one. If you know it: rio edit-info --transform "
+                f"'[CELL, 0, WEST, 0, -CELL, NORTH]' {name}"
+            )
+        if not kinds and file.count != 1:
+            raise DatasetError(
+                f"Expected one band in `{argument}`, got {file.count} in {name}. "
+                f"Take one out: rio stack --bidx 1 {name} one-band.tif"
+            )
+        if file.dtypes[: len(kinds)] != kinds:
+            raise DatasetError(
+                f"Expected `{argument}` with first bands {', '.join(kinds)}, got {', '.join(file.dtypes)} in {name}. "
+                "Convert it: gdal_translate -expand rgb for a palette, rio convert --dtype uint8 --scale-ratio RATIO "
+                "for deeper numbers."
+            )
+        yield Raster(argument=argument, name=name, file=file)
 
 
-def _check_covers(raster: Raster, ground: Raster) -> None:
-    crs, wanted = _horizontal(raster.file.crs), _horizontal(ground.file.crs)
-    if crs != wanted:
-        raise DatasetError(
-            f"Expected `{raster.argument}` in the CRS of `dem`, {crs_name(wanted)}, got {crs_name(crs)} in "
-            f"{raster.path}. Reproject it: {_warp(raster, crs_name(wanted))}"
-        )
-    inner, outer, slack = ground.file.bounds, raster.file.bounds, SLACK * max(raster.cell_m)
-    gaps = [
-        outer.left - inner.left,
-        outer.bottom - inner.bottom,
-        inner.right - outer.right,
-        inner.top - outer.top,
-    ]
-    if max(gaps) > slack:
-        extents = [
-            f"x {b.left:.12g} to {b.right:.12g}, y {b.bottom:.12g} to {b.top:.12g}" for b in (inner, outer)
-        ]
-        raise DatasetError(
-            f"Expected `{raster.argument}` to cover `dem`, {extents[0]}, got {extents[1]} in {raster.path}. "
-            f"Cut the ground to it: rio clip --like {raster.path} {ground.path} cut.tif"
-        )
-
-
-def _warp(raster: Raster, crs: str) -> str:
-    """A command that lays a raster north up in a CRS, with what it leaves bare declared as missing."""
-    command = f"rio warp --dst-crs {crs} --resampling {'cubic' if raster.argument == 'dem' else 'nearest'}"
-    if raster.file.nodata is None:
-        kind = np.dtype(raster.file.dtypes[0])
-        bare = np.iinfo(kind).max if kind.kind == "u" else -9999
-        command += f" --src-nodata {bare} --dst-nodata {bare}"
-    return f"{command} {raster.path} warped.tif"
-
-
-def _utm_of(raster: Raster) -> str | None:
-    """Names the CRS of the UTM zone (or polar cap) that a raster's middle lies in; None off the Earth."""
-    x, y = _centre(raster)
-    (longitude,), (latitude,) = _transformed(raster.file.crs, "EPSG:4326", [x], [y])
+def _utm_of(crs: Any, x: float, y: float) -> Any:
+    """The CRS of the UTM zone (or polar cap) that a place lies in; None off the Earth."""
+    (longitude,), (latitude,) = _transformed(crs, "EPSG:4326", [x], [y])
     if not (np.isfinite(longitude) and np.isfinite(latitude)):
         return None
     zone = 61 if latitude > 84 or latitude < -80 else min(int((longitude + 180) // 6) + 1, 60)
-    return f"EPSG:{(326 if latitude >= 0 else 327) * 100 + zone}"
+    return type(crs).from_epsg((326 if latitude >= 0 else 327) * 100 + zone)
 
 
-def _centre(raster: Raster) -> tuple[float, float]:
-    bounds = raster.file.bounds
-    return (bounds.left + bounds.right) / 2, (bounds.bottom + bounds.top) / 2
-
-
-def _transformed(crs: Any, to: str, x: list[float], y: list[float]) -> tuple[np.ndarray, np.ndarray]:
+def _transformed(crs: Any, to: Any, x: list[float], y: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """Moves places from one CRS to another; NaN where there is no way, as from another planet."""
     try:
         moved = load_rasterio().warp.transform(crs, to, x, y)
@@ -171,20 +200,15 @@ def _horizontal(crs: Any) -> Any:
     return type(crs).from_user_input(json.dumps(whole["components"][0])) if "components" in whole else crs
 
 
-def crs_name(crs: Any) -> str:
-    """The code, or the whole text, of the horizontal part of a CRS."""
-    return _horizontal(crs).to_string()
-
-
 @contextmanager
-def _naming(argument: str, path: Path) -> Iterator[None]:
+def _naming(argument: str, name: str) -> Iterator[None]:
+    """Says which raster could not be read, and why."""
     try:
         yield
     except load_rasterio().errors.RasterioError as error:
         reason = " ".join(str(error.__cause__ or error).split())
         raise DatasetError(
-            f"Expected `{argument}` as a GeoTIFF, got {path}, which cannot be read as one: {reason} "
-            f"Get the file anew, or convert another format: rio convert --format GTiff {path} converted.tif"
+            f"Expected `{argument}` as a raster that GDAL can read, got {name}: {reason}"
         ) from error
 
 
@@ -195,10 +219,13 @@ def load_rasterio() -> Any:
         ConfigError: it is not installed.
     """
     try:
+        import rasterio.enums
         import rasterio.errors
+        import rasterio.transform
+        import rasterio.vrt
         import rasterio.warp
     except ImportError as error:
         raise ConfigError(
-            f"Expected rasterio, which reads GeoTIFFs, got: {error}. Install it: pip install 'benchnav[geo]'"
+            f"Expected rasterio, which reads rasters, got: {error}. Install it: pip install 'benchnav[geo]'"
         ) from error
     return rasterio

@@ -121,7 +121,7 @@ def _missing(
             shutil.rmtree(folder, ignore_errors=True)
         check_target(path, overwrite)
     else:
-        _check_folder(path)
+        check_folder(path)
     folder.mkdir(parents=True, exist_ok=True)
     known = {shard.name: shard for shard in shards}
     every = sorted(folder.glob("*.h5"))
@@ -150,8 +150,12 @@ def _missing(
     return missing
 
 
-def _check_folder(path: Path) -> None:
-    """Refuses a folder that holds anything but shards and their manifest, which no option may remove."""
+def check_folder(path: Path) -> None:
+    """Refuses a folder that holds anything but shards and their manifest, which no option may remove.
+
+    Raises:
+        DatasetError: it does, or `path` is a file.
+    """
     if path.exists() and not path.is_dir():
         raise DatasetError(f"Expected `out` to be a folder or a file .h5, got the file {path}.")
     for file in sorted(path.iterdir()) if path.exists() else ():

@@ -1,6 +1,7 @@
 """Datasets of many shards: a folder of files, and a manifest that says which maps lie in which."""
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,3 +54,19 @@ def write_manifest(folder: Path, contents: Contents) -> None:
     manifest = manifest_of(contents.id, contents.recipes, splits)
     manifest |= {"format_version": FORMAT_VERSION, "shards": shards}
     write_text(folder / FOLDER_MANIFEST, schema.seal(json.loads(json.dumps(manifest))))
+
+
+def take_place(partial: Path, out: Path) -> None:
+    """Moves a whole folder to where it is to be, in the place of one that is there.
+
+    Args:
+        partial: the folder, beside `out`.
+        out: where it is to be.
+    """
+    if not out.exists():
+        partial.rename(out)
+        return
+    dropped = out.with_name(f".{out.name}.dropped")
+    out.rename(dropped)
+    partial.rename(out)
+    shutil.rmtree(dropped)

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchnav.datagen import schema
 from benchnav.datagen.files.create import join
-from benchnav.datagen.files.folder import Contents, write_manifest
+from benchnav.datagen.files.folder import Contents, take_place, write_manifest
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.files.writer import check_target, is_one_file, named_errors
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
@@ -85,13 +85,7 @@ def _copy(out: Path, contents: Contents) -> None:
                     copies[path] = Path(shutil.copy2(path, partial / name))
         copied = {split: [copies[path] for path in own] for split, own in contents.files.items()}
         write_manifest(partial, replace(contents, files=copied))
-        if out.exists():
-            dropped = out.with_name(f".{out.name}.dropped")
-            out.rename(dropped)
-            partial.rename(out)
-            shutil.rmtree(dropped)
-        else:
-            partial.rename(out)
+        take_place(partial, out)
 
 
 def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:

@@ -14,7 +14,7 @@ from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.noise import fractal_perlin
-from benchnav.datagen.synth.slope import horn_gradient, inclination_deg
+from benchnav.datagen.synth.slope import framed, framed_gradient, inclination_deg
 from benchnav.errors import ConfigError
 
 MOST_ATTEMPTS = 200
@@ -115,7 +115,7 @@ def complete(
     split: str,
     indices: np.ndarray,
     class_id: np.ndarray,
-    elevation_m: np.ndarray,
+    framed_m: np.ndarray,
     attempt: int = 0,
 ) -> Maps:
     """Derives all else from classes and elevation: slope, colour under a random light, λ.
@@ -126,7 +126,8 @@ def complete(
         split: name of the maps' split, for their random streams.
         indices: which maps of the split, shape [B].
         class_id: shape [B, H, W].
-        elevation_m: shape [B, H, W]; it is quantised first, and everything follows what is stored.
+        framed_m: elevation, with one cell of the ground beyond, NaN where that is not known, shape
+            [B, H + 2, W + 2]; it is quantised first, and everything follows what is stored.
         attempt: how many draws of these maps were rejected before.
 
     Returns:
@@ -136,8 +137,8 @@ def complete(
     def key(purpose: str) -> int:
         return rng.stream_key(recipe.seed, split, purpose, attempt)
 
-    height = quantise(elevation_m, 13)
-    gradient = horn_gradient(height, recipe.resolution_m)
+    ground = quantise(framed_m, 13)
+    gradient = framed_gradient(ground, recipe.resolution_m)
     slope = quantise(inclination_deg(*gradient), 10)
     direction = rng.uniform(key("light"), indices, (2,))
     light = appearance.light_direction(
@@ -149,7 +150,7 @@ def complete(
     return {
         "rgb": appearance.paint(class_id, colours, brightness),
         "class_id": class_id,
-        "elevation_m": height,
+        "elevation_m": ground[:, 1:-1, 1:-1],
         "slope_deg": slope,
         "traversability": quantise(_realised(recipe, key("traversability"), indices, class_id, slope), 16),
         "environment": environment_of(recipe, indices),
@@ -184,7 +185,7 @@ def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> M
     scenario = recipe.scenarios[recipe.splits[split].scenario]
     class_id = class_map(recipe, split, indices, attempt)
     height = _elevation(recipe, scenario, split, indices, attempt)
-    return complete(recipe, scenario, split, indices, class_id, height, attempt)
+    return complete(recipe, scenario, split, indices, class_id, framed(height), attempt)
 
 
 def _elevation(

@@ -18,7 +18,21 @@ def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndar
     Returns:
         Two arrays of shape [B, H, W], metres a metre.
     """
-    z = _continue_linearly(elevation_m)
+    return framed_gradient(framed(elevation_m), resolution_m)
+
+
+def framed_gradient(framed_m: np.ndarray, resolution_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates ∂z/∂x and ∂z/∂y as `horn_gradient` does, with the ground one cell beyond the map.
+
+    Args:
+        framed_m: elevation, shape [B, H + 2, W + 2]; NaN beyond the map where it is not known, so that
+            the surface is continued linearly.
+        resolution_m: cell width.
+
+    Returns:
+        Two arrays of shape [B, H, W], metres a metre.
+    """
+    z = _continue_linearly(framed_m)
     pairs_y, pairs_x = z[:, 1:] + z[:, :-1], z[:, :, 1:] + z[:, :, :-1]
     smooth_y, smooth_x = pairs_y[:, 1:] + pairs_y[:, :-1], pairs_x[:, :, 1:] + pairs_x[:, :, :-1]
     along_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
@@ -48,13 +62,21 @@ def inclination_deg(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
     return angle
 
 
-def _continue_linearly(elevation_m: np.ndarray) -> np.ndarray:
-    """Frames maps with one cell of the plane through the two cells next to it."""
+def framed(elevation_m: np.ndarray) -> np.ndarray:
+    """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H + 2, W + 2]."""
     batch, height, width = elevation_m.shape
-    z = np.empty((batch, height + 2, width + 2))
+    z = np.full((batch, height + 2, width + 2), np.nan)
     z[:, 1:-1, 1:-1] = elevation_m
-    z[:, 1:-1, 0] = 2 * z[:, 1:-1, 1] - z[:, 1:-1, 2]
-    z[:, 1:-1, -1] = 2 * z[:, 1:-1, -2] - z[:, 1:-1, -3]
-    z[:, 0] = 2 * z[:, 1] - z[:, 2]
-    z[:, -1] = 2 * z[:, -2] - z[:, -3]
+    return z
+
+
+def _continue_linearly(framed_m: np.ndarray) -> np.ndarray:
+    """Where the frame is not known, takes the plane through the two cells next to it."""
+    z = framed_m.copy()
+    for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
+        column = z[:, :, edge]
+        column[...] = np.where(np.isnan(column), 2 * z[:, :, next_to] - z[:, :, beyond], column)
+    for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
+        row = z[:, edge]
+        row[...] = np.where(np.isnan(row), 2 * z[:, next_to] - z[:, beyond], row)
     return z

@@ -62,3 +62,20 @@ def test_a_crater_has_rim_and_bowl() -> None:
     assert np.argmax(z[40, 40:]) == 10
     assert (np.diff(z[40, 50:]) < 0).all()
     assert abs(z[40, 80]) < 0.01
+
+
+def test_the_slope_at_an_edge_follows_the_ground_beyond_where_it_is_known() -> None:
+    ground = np.random.default_rng(0).normal(size=(2, 14, 18))
+    whole = np.stack(slope.horn_gradient(ground, 0.5))
+    window = ground[:, 2:10, 4:12].copy()
+    np.testing.assert_array_equal(slope.framed_gradient(window, 0.5), whole[:, :, 3:9, 5:11])
+    # What is not known is continued linearly, cell by cell, and nothing else changes.
+    window[0, 3, 0] = np.nan
+    filled = window.copy()
+    filled[0, 3, 0] = 2 * window[0, 3, 1] - window[0, 3, 2]
+    np.testing.assert_array_equal(slope.framed_gradient(window, 0.5), slope.framed_gradient(filled, 0.5))
+    assert np.isnan(window[0, 3, 0])
+    # At the corner of the ground the map sees what the whole ground does.
+    corner = np.full((2, 8, 8), np.nan)
+    corner[:, 1:, 1:] = ground[:, :7, :7]
+    np.testing.assert_array_equal(slope.framed_gradient(corner, 0.5), whole[:, :, :6, :6])

@@ -1,0 +1,261 @@
+"""What rasters say of the ground, map by map.
+
+Elevation is the raster's own at its own resolution. Where its cells are at most half as wide as the maps',
+it is averaged, so that bumps too small for the maps do not fold into slopes of theirs; else it is
+interpolated by cubic convolution. Colours and traversability are averaged; a cell takes the class that
+covers most of it. Letters in shapes: B maps, K bands, H×W cells of a map.
+"""
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchnav.datagen.dem.raster import Lattice, Layer, Raster, opened
+from benchnav.datagen.dem.tiling import Run, Tiling, cut
+from benchnav.datagen.recipe.recipe import Recipe
+from benchnav.datagen.synth.generate import Maps
+from benchnav.errors import ConfigError, DatasetError
+
+_SLACK = 1e-3  # of a cell that an extent may fall short by
+_KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
+_MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
+_METRES = ("m", "metre", "meter", "metres", "meters")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rasters:
+    """Rasters by any name that rasterio opens. Where one does not cover the ground, maps are left out.
+
+    Args:
+        dem: elevations in metres, one band.
+        classes: terrain classes, one band. Empty: the recipe lays classes out at random.
+        class_ids: class names by value of `classes`, None for no label. None: values are indices into the
+            class table.
+        photo: red, green and blue, uint8. Empty: the classes are painted.
+        traversability: measured λ in [0, 1], one band; a cell without any is stored as not observed. Empty:
+            λ is drawn by the class table.
+        random_classes: join a photo or measured λ to classes laid out at random.
+    """
+
+    dem: str
+    classes: str = ""
+    class_ids: Mapping[int, str | None] | None = None
+    photo: str = ""
+    traversability: str = ""
+    random_classes: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses what does not go together."""
+        if self.class_ids is not None and not self.classes:
+            raise ConfigError(
+                "Expected `classes` with `class_ids`, got none. Pass the raster they belong to."
+            )
+        if self.classes and self.random_classes:
+            raise ConfigError("Expected either `classes` or `random_classes`, got both.")
+        real = [name for name in ("photo", "traversability") if getattr(self, name)]
+        if real and not self.classes and not self.random_classes:
+            raise ConfigError(
+                f"Expected `classes` with `{real[0]}`, got none: what is real would be joined to classes laid out "
+                "at random. Pass --classes RASTER, or --random-classes if that is what you want."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """Rasters laid on the cells of all maps.
+
+    Args:
+        tiling: how the ground is cut into maps.
+        layers: by field; under `FIELD min` and `FIELD max` what is averaged there.
+        known: which rows and columns of the lattice, framed by a cell, lie wholly on the elevation model.
+        indices: of classes, by value of their raster; NaN for no label.
+        source: what the manifest says of the rasters.
+    """
+
+    tiling: Tiling
+    layers: Mapping[str, Layer]
+    known: Sequence[np.ndarray]
+    indices: Mapping[int, float]
+    source: Mapping[str, Any]
+
+    def read(self, run: Run) -> tuple[np.ndarray, Maps]:
+        """Reads some maps.
+
+        Returns:
+            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by field what other
+            rasters say, shape [B, K, H, W]; NaN where there is nothing.
+
+        Raises:
+            DatasetError: a raster cannot be read, or holds what it should not.
+        """
+        framed = {name: self._cut(layer, run) for name, layer in self.layers.items()}
+        ground = framed["elevation_m"][:, 0]
+        for place in range(len(ground)):
+            low, high = self._range("elevation_m", {name: maps[place] for name, maps in framed.items()})
+            if high - low > _MOST_RELIEF_M:
+                expected = f"elevations of `dem` within {_MOST_RELIEF_M:g} m on a map"
+                raise self._out_of_range("elevation_m", expected, low, high, low if low < -1000 else high)
+        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
+        ground[:, ~self.known[0][run.row * north :][: height + 2]] = np.nan
+        for place, column in enumerate(run.columns):
+            ground[place][:, ~self.known[1][column * east :][: width + 2]] = np.nan
+        if "traversability" in framed:
+            low, high = self._range("traversability", framed)
+            if low < 0 or high > 1:
+                expected = "values of `traversability` in [0, 1]"
+                raise self._out_of_range("traversability", expected, low, high, low if low < 0 else high)
+        given = {name: maps[:, :, 1:-1, 1:-1] for name, maps in framed.items() if " " not in name}
+        if "class_id" in given:
+            given["class_id"] = self._classes(given["class_id"])
+        return ground, given
+
+    def _cut(self, layer: Layer, run: Run) -> np.ndarray:
+        """Cuts maps out of a layer, each framed by a cell, shape [B, K, H + 2, W + 2]."""
+        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
+        south, west = run.row * north, run.columns.start * east
+        stop = west + (len(run.columns) - 1) * east + width
+        strip = layer.read(range(south, south + height), range(west, stop))
+        return np.stack([strip[:, :, i * east : i * east + width + 2] for i in range(len(run.columns))])
+
+    def _range(self, name: str, maps: Maps) -> tuple[float, float]:
+        """The least and the greatest value, of what is averaged too."""
+        low, high = (maps.get(f"{name} {end}", maps[name]) for end in ("min", "max"))
+        least = np.min(low, initial=np.inf, where=~np.isnan(low))
+        return float(least), float(np.max(high, initial=-np.inf, where=~np.isnan(high)))
+
+    def _out_of_range(self, name: str, expected: str, low: float, high: float, odd: float) -> DatasetError:
+        raster = self.layers[name].raster.name
+        return DatasetError(
+            f"Expected {expected}, got {low:g} to {high:g} in {raster}. If {odd:.9g} stands for missing, "
+            f"declare it: rio edit-info --nodata {odd:.9g} {raster}"
+        )
+
+    def _classes(self, values: np.ndarray) -> np.ndarray:
+        indices, unknown = np.full_like(values, np.nan), ~np.isnan(values)
+        for value, index in self.indices.items():
+            indices[values == value] = index
+            unknown &= values != value
+        if unknown.any():
+            name, strange = self.layers["class_id"].raster.name, np.unique(values[unknown])
+            few = ", ".join(f"{value:g}" for value in strange[:10]) + (", …" if len(strange) > 10 else "")
+            raise DatasetError(
+                f"Expected values of `classes` in {sorted(self.indices)}, got [{few}] too in {name}. Name each by "
+                "`class_ids`, null for no label; or, if one stands for missing, declare it: "
+                f"rio edit-info --nodata VALUE {name}"
+            )
+        return indices
+
+
+def survey(
+    stack: ExitStack, rasters: Rasters, recipe: Recipe, shares: Mapping[str, float], stride_m: float | None
+) -> Survey:
+    """Opens rasters and lays them on the cells of all maps.
+
+    Args:
+        stack: closes them.
+        rasters: which.
+        recipe: size and resolution of the maps, class table.
+        shares: of the maps, by split.
+        stride_m: from one map to the next; None for maps side by side.
+
+    Raises:
+        ConfigError: a setting does not fit the recipe.
+        DatasetError: a raster does not fit, or the ground is too small.
+    """
+    names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
+    named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
+    unknown = sorted({name for name in named.values() if name is not None} - set(names))
+    if unknown:
+        raise ConfigError(f"Expected `class_ids` to name classes of the recipe, {names}, got {unknown}.")
+    dem = stack.enter_context(opened("dem", rasters.dem))
+    unit = dem.file.units[0] or "m"
+    if unit.lower() not in _METRES:
+        raise DatasetError(
+            f"Expected elevations of `dem` in metres, got {unit!r} in {dem.name}. Convert them (gdal_calc.py, "
+            f"× 0.3048 for feet), then declare the unit: rio edit-info --bidx 1 --units metre {dem.name}"
+        )
+    crs, bounds, cell_m = dem.place()
+    how, reach_m = "cubic", _KERNEL_CELLS * max(*cell_m, step)
+    if np.allclose(cell_m, step, rtol=1e-9) and bounds == dem.file.bounds:
+        how, reach_m = "nearest", 0.0
+    elif max(cell_m) <= step / 2 * (1 + 1e-9):
+        how, reach_m = "average", 0.0
+    size_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
+    rows, columns = np.floor(size_m / step + _SLACK).astype(int).tolist()
+    if rows < recipe.height or columns < recipe.width:
+        wide, high = recipe.grid.extent_m
+        raise DatasetError(
+            f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem.name} of "
+            f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
+        )
+    tiling = cut((rows, columns), recipe.grid.shape, _stride(recipe, stride_m), shares)
+    # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
+    offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
+    south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
+    lattice = Lattice(crs=crs, west_m=west_m, south_m=south_m, cells=tiling.cells, resolution_m=step)
+    layers: dict[str, Layer] = {}
+
+    def lay(field: str, raster: Raster, how: str, bands: Sequence[int] = (1,)) -> None:
+        layers[field] = stack.enter_context(raster.laid(lattice, list(bands), how))
+        if how == "average" and field != "rgb":
+            for end in ("min", "max"):
+                layers[f"{field} {end}"] = stack.enter_context(raster.laid(lattice, list(bands), end))
+
+    lay("elevation_m", dem, how)
+    if rasters.classes:
+        lay("class_id", stack.enter_context(opened("classes", rasters.classes)), "mode")
+    if rasters.photo:
+        photo = stack.enter_context(opened("photo", rasters.photo, ("uint8",) * 3))
+        lay("rgb", photo, "average", (1, 2, 3))
+    if rasters.traversability:
+        measured = stack.enter_context(opened("traversability", rasters.traversability))
+        lay("traversability", measured, "average")
+    origins = {name: provenance(layer.raster.name) for name, layer in layers.items() if " " not in name}
+    ids = {str(value): name for value, name in sorted(named.items())}
+    source = {
+        "kind": "dem",
+        **origins["elevation_m"],
+        "crs": crs.to_string(),
+        "resolution_m": [cell_m[1], cell_m[0]],
+        "origin_m": [west_m, south_m],
+        "tiles": list(tiling.tiles),
+        "stride_m": [tiling.stride[1] * step, tiling.stride[0] * step],
+        "classes": {**origins["class_id"], "ids": ids} if rasters.classes else None,
+        "photo": origins.get("rgb"),
+        "traversability": origins.get("traversability"),
+    }
+    edges_m = [
+        offset + step * np.arange(-1, count + 2) for offset, count in zip(offset_m, tiling.cells, strict=True)
+    ]
+    known = [
+        (edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step)
+        for edges, size in zip(edges_m, size_m, strict=True)
+    ]
+    indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
+    return Survey(tiling=tiling, layers=layers, known=known, indices=indices, source=source)
+
+
+def _stride(recipe: Recipe, stride_m: float | None) -> tuple[int, int]:
+    """Cells from one map to the next, northward and eastward."""
+    if stride_m is None:
+        return recipe.grid.shape
+    cells = stride_m / recipe.resolution_m
+    if not (cells > 0.5 and abs(cells - round(cells)) < 1e-6):
+        raise ConfigError(
+            f"Expected `stride` as a multiple of the maps' resolution, {recipe.resolution_m:g} m, got {stride_m:g}."
+        )
+    return round(cells), round(cells)
+
+
+def provenance(name: str) -> dict[str, str | None]:
+    """The name of a raster and, of a file, its SHA-256; of an address without what may be secret."""
+    if Path(name).is_file():
+        with open(name, "rb") as file:
+            return {"file": Path(name).name, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+    return {"file": re.sub("//[^/@]*@", "//", name).partition("?")[0], "sha256": None}

@@ -1,0 +1,125 @@
+"""How ground is cut into maps, and which of them belong to which split.
+
+Maps are cut from the ground's south-west corner on, a stride apart, and are numbered row by row, northward,
+each row eastward. Splits take strips across the longer side of the ground, one each, in the order given.
+Between two strips lies ground of at least a map's width that no map shows, so that maps of different splits
+neither overlap nor touch.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import NamedTuple
+
+from benchnav.errors import ConfigError, DatasetError
+
+
+class Run(NamedTuple):
+    """Neighbouring maps of one split: their row of maps, and which of the row."""
+
+    split: str
+    row: int
+    columns: range
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiling:
+    """Rows and columns of maps.
+
+    Args:
+        shape: cells of a map, (H, W).
+        stride: cells from one map to the next, northward and eastward.
+        tiles: rows and columns of maps.
+        strips: by split the rows of maps that it takes, or the columns where there are as many or more.
+    """
+
+    shape: tuple[int, int]
+    stride: tuple[int, int]
+    tiles: tuple[int, int]
+    strips: Mapping[str, range]
+
+    @property
+    def cells(self) -> list[int]:
+        """Cells of all maps together, northward and eastward."""
+        sides = zip(self.tiles, self.stride, self.shape, strict=True)
+        return [(tiles - 1) * stride + size for tiles, stride, size in sides]
+
+    @property
+    def maps(self) -> int:
+        """Number of maps of all splits."""
+        return sum(len(strip) for strip in self.strips.values()) * min(self.tiles)
+
+    @property
+    def between(self) -> int:
+        """Number of maps that would lie between the splits, which belong to none."""
+        return self.tiles[0] * self.tiles[1] - self.maps
+
+    def runs(self, most: int) -> Iterator[Run]:
+        """Goes through all maps, row by row, at most so many at a time."""
+        rows, columns = self.tiles
+        for row in range(rows):
+            for split, strip in self.strips.items():
+                own = strip if rows <= columns else range(columns if row in strip else 0)
+                for first in range(own.start, own.stop, most):
+                    yield Run(split, row, range(first, min(first + most, own.stop)))
+
+
+def cut(
+    cells: tuple[int, int], shape: tuple[int, int], stride: tuple[int, int], shares: Mapping[str, float]
+) -> Tiling:
+    """Cuts ground into maps and splits.
+
+    Args:
+        cells: of the ground, northward and eastward, of at least one map.
+        shape: cells of a map, (H, W).
+        stride: cells from one map to the next, northward and eastward.
+        shares: of the maps, by split.
+
+    Raises:
+        DatasetError: the ground is too small for so many splits.
+    """
+    rows, columns = ((cells[i] - shape[i]) // stride[i] + 1 for i in (0, 1))
+    side, lines = (0, rows) if rows > columns else (1, columns)
+    gap = math.ceil(2 * shape[side] / stride[side]) - 1
+    usable = lines - gap * (len(shares) - 1)
+    if usable < len(shares):
+        raise DatasetError(
+            f"Expected ground for {len(shares)} splits with a map's width between them, got {lines} maps along its "
+            "longer side. Take fewer splits, smaller maps or larger ground."
+        )
+    ends = [0]
+    for place, total in enumerate(accumulate(shares.values()), start=1):
+        # Every split gets a strip, however small its share.
+        ends.append(min(max(round(total * usable), ends[-1] + 1), usable - len(shares) + place))
+    strips = {
+        split: range(ends[place] + place * gap, ends[place + 1] + place * gap)
+        for place, split in enumerate(shares)
+    }
+    return Tiling(shape=shape, stride=stride, tiles=(rows, columns), strips=strips)
+
+
+def read_shares(text: str) -> dict[str, float]:
+    """Reads splits and their shares of the maps, such as `train:0.7,valid:0.1,test/site:0.2`.
+
+    Raises:
+        ConfigError: it is not of that form, or the shares do not sum to 1.
+    """
+    shares: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, share = part.strip().partition(":")
+        try:
+            value = float(share or 1)
+        except ValueError:
+            value = math.nan
+        if not name or name in shares or not 0 < value <= 1:
+            raise ConfigError(
+                "Expected `splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and each share above "
+                f"0, got {part.strip()!r} in {text!r}."
+            )
+        shares[name] = value
+    if not math.isclose(sum(shares.values()), 1, abs_tol=1e-6):
+        raise ConfigError(
+            f"Expected the shares of `splits` to sum to 1, got {sum(shares.values()):g} in {text!r}."
+        )
+    return shares
