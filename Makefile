@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
-.PHONY: help demo test test-slow bench lint clean
+.PHONY: help demo test test-slow bench lint wheel clean
 
 help:
 	@echo "make demo   set up, run a small suite of the shipped model on the shipped maps, write report and playback"
@@ -14,6 +14,7 @@ help:
 	@echo "make test-slow  those that take minutes: whole suites with the shipped model"
 	@echo "make bench  speed, side by side with peers"
 	@echo "make lint   ruff and mypy"
+	@echo "make wheel  the package with the shipped maps and models, in dist/"
 
 # The stamp depends on what is installed, so a second run installs nothing.
 $(STAMP): pyproject.toml constraints.txt
@@ -42,6 +43,12 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# What an earlier build has left in build/ would go into the wheel.
+wheel: $(STAMP)
+	rm -rf build dist
+	$(BIN)/python -m pip wheel . --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir dist
+	@ls -lh dist
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-import benchnav
 from benchnav import registry
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
@@ -27,6 +26,7 @@ from benchnav.models.checkpoint import (
     load_checkpoint,
     refuse_unfinished,
 )
+from benchnav.shipped import shipped_folder
 from benchnav.terrain import Observation, Terrain
 
 if TYPE_CHECKING:
@@ -130,8 +130,8 @@ def load_model(source: Source) -> AnyModel:
     """Finds a model by checkpoint or as a part of the registry; it predicts on the observation's device.
 
     Args:
-        source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or in this
-            checkout; or a part, such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
+        source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or
+            among those shipped; or a part, such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
             options where it is a mapping.
 
     Raises:
@@ -176,7 +176,7 @@ def open_checkpoint(checkpoint: Checkpoint) -> Model:
 
 
 def find_checkpoint(source: str | Path) -> Path:
-    """Finds the folder of a checkpoint by path, or by name in `checkpoints/` here and in this checkout.
+    """Finds the folder of a checkpoint by path, or by name in `checkpoints/` here or among the shipped ones.
 
     Raises:
         CheckpointError: the training of the checkpoint was interrupted.
@@ -199,7 +199,7 @@ def find_checkpoint(source: str | Path) -> Path:
 
 
 def list_checkpoints() -> list[Path]:
-    """Folders of the checkpoints in `checkpoints/` here and in this checkout; of one name the first."""
+    """Folders of the checkpoints in `checkpoints/` here and of those shipped; of one name the first."""
     found: dict[str, Path] = {}
     for folder in _checkpoint_folders():
         for path in sorted(config.parent for config in folder.glob(f"*/{CONFIG}")):
@@ -303,7 +303,7 @@ def _as_part(source: Source) -> registry.Part | Path:
 
 
 def _checkpoint_folders() -> tuple[Path, Path]:
-    return Path("checkpoints"), Path(benchnav.__file__).parents[1] / "checkpoints"
+    return Path("checkpoints"), shipped_folder("checkpoints")
 
 
 def _near_path(path: Path) -> str:

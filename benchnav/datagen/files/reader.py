@@ -15,7 +15,6 @@ import h5py
 import numpy as np
 import torch
 
-import benchnav
 from benchnav.datagen import schema
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import TerrainClass, twins
@@ -23,6 +22,7 @@ from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import Maps
 from benchnav.errors import DatasetError
 from benchnav.mixture import TraversabilityMixture
+from benchnav.shipped import shipped_folder
 from benchnav.terrain import Grid, Terrain
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
@@ -323,8 +323,8 @@ def _mixture(parameters: latent.Parameters, classes: tuple[TerrainClass, ...]) -
 
 
 def dataset_folders() -> list[Path]:
-    """Where datasets are looked for by id: `datasets/` here and in this checkout."""
-    here, shipped = Path("datasets"), Path(benchnav.__file__).parents[1] / "datasets"
+    """Where datasets are looked for by id: `datasets/` here, and the shipped ones."""
+    here, shipped = Path("datasets"), shipped_folder("datasets")
     return [here] if here.resolve() == shipped.resolve() else [here, shipped]
 
 

@@ -1,0 +1,108 @@
+"""A wheel holds the package with the shipped maps and models, and runs where there is no repository."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from benchnav import shipped
+
+ROOT = Path(__file__).parents[1]
+MOST_BYTES = 60e6
+
+
+def shipped_files() -> tuple[str, ...]:
+    """The list in setup.py, which is not run."""
+    pytest.importorskip("setuptools")
+    spec = importlib.util.spec_from_file_location("setup_of_benchnav", ROOT / "setup.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.SHIPPED
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel built of a copy of the repository, in which a user has made maps and a model."""
+    pytest.importorskip("setuptools", minversion="77")
+    work = tmp_path_factory.mktemp("wheel")
+    copy, out = work / "copy", work / "out"
+    hidden = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "benchnav", copy / "benchnav", ignore=hidden)
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", *shipped_files()):
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, copy / name)
+    for own in ("datasets/mine-test.h5", "checkpoints/mine/config.json", "checkpoints/paper-v1/notes.json"):
+        (copy / own).parent.mkdir(exist_ok=True)
+        (copy / own).write_text("{}")
+    out.mkdir()
+    build = f"from setuptools import build_meta; print(build_meta.build_wheel({str(out)!r}))"
+    subprocess.run([sys.executable, "-c", build], cwd=copy, check=True, capture_output=True)
+    (built,) = out.glob("*.whl")
+    return built
+
+
+def test_the_wheel_holds_the_package_and_what_is_shipped_and_nothing_else(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+        inside = {f"benchnav/_shipped/{name}" for name in shipped_files()}
+        same = [
+            archive.read(f"benchnav/_shipped/{name}") == (ROOT / name).read_bytes()
+            for name in shipped_files()
+        ]
+    package = {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "benchnav").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert names == package | inside
+    assert all(same)
+    assert wheel.stat().st_size < MOST_BYTES
+
+
+def test_what_is_shipped_is_what_git_has() -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("no git checkout")
+    listed = subprocess.run(
+        ["git", "ls-files", "datasets", "checkpoints"], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert sorted(shipped_files()) == sorted(listed.stdout.split())
+
+
+def test_out_of_the_wheel_the_shipped_maps_and_models_are_found(wheel: Path, tmp_path: Path) -> None:
+    site, here = tmp_path / "site", tmp_path / "here"
+    here.mkdir()
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+    # A package that has the name of a folder of ours must not be taken for it.
+    (site / "datasets").mkdir()
+    look = """
+import benchnav
+from benchnav.datagen.files.reader import TerrainDataset, dataset_folders, find_dataset
+from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
+print(benchnav.__file__, *dataset_folders())
+print(*(TerrainDataset(find_dataset(name)).path for name in ("paper-v1", "stakes-v1")))
+print(*sorted(path.name for path in list_checkpoints()), find_checkpoint("stakes-v1"))
+print(type(load_model("stakes-v1")).__name__)
+"""
+    told = subprocess.run(
+        [sys.executable, "-P", "-c", look], cwd=here, check=True, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(site)},
+    ).stdout.split()  # fmt: skip
+    inside = site / "benchnav" / "_shipped"
+    assert told == [
+        *(str(site / "benchnav" / "__init__.py"), "datasets", str(inside / "datasets")),
+        *(str(inside / "datasets" / f"{name}-test.h5") for name in ("paper-v1", "stakes-v1")),
+        *("paper-v1", "stakes-v1", str(inside / "checkpoints" / "stakes-v1"), "FusedModel"),
+    ]
+
+
+def test_in_a_checkout_they_are_beside_the_package() -> None:
+    assert shipped.shipped_folder("datasets") == ROOT / "datasets"
+    assert shipped.shipped_folder("checkpoints") == ROOT / "checkpoints"
