@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "datagen/recipe": ("datagen.recipe", "datagen.schema"),
     "datagen/synth": ("datagen.synth", "datagen.recipe", "datagen.schema"),
     "datagen/files": ("datagen.files", *SYNTHESIS),
+    "datagen/export": ("datagen.export", "datagen.files", *SYNTHESIS),
     "datagen/dem": ("datagen.dem", "datagen.files", *SYNTHESIS),
     "models": ("models", "datagen"),
     "models/slope_gp": ("models.slope_gp", "models.config", "datagen"),

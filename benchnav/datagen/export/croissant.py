@@ -1,0 +1,284 @@
+"""What an exported dataset is, for programs: Croissant 1.0 metadata (JSON-LD); and its card, for hubs and people.
+
+Source: Croissant Format Specification 1.0, http://mlcommons.org/croissant/1.0.
+"""
+
+import datetime
+import hashlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from benchnav.datagen import schema
+from benchnav.datagen.export.parquet import FOLDER, MAP
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import ConfigError
+
+METADATA = "croissant.json"
+CARD = "README.md"
+AUTHORS = "The BenchNav authors"
+
+PAPER = """@misc{endo2024benchnav,
+  title = {{BenchNav}: Simulation Platform for Benchmarking Off-road Navigation Algorithms with Probabilistic
+           Traversability},
+  author = {Endo, Masafumi and Honda, Kohei and Ishigami, Genya},
+  year = {2024},
+  eprint = {2405.13318},
+  archivePrefix = {arXiv},
+}"""
+
+# The context that readers of version 1.0 look for, whether or not a term is used.
+_OWN_TERMS = (
+    *("citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format", "includes"),
+    *("isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
+    *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
+    "equivalentProperty",
+)
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "sc": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "dct": "http://purl.org/dc/terms/",
+    "conformsTo": "dct:conformsTo",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    **{term: f"cr:{term}" for term in _OWN_TERMS},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Publication:
+    """What a dataset does not know of itself.
+
+    Args:
+        license: name in the SPDX list, such as CC-BY-4.0, or a URL.
+        creator: who made it.
+        url: where it is to be found; empty where it is nowhere yet.
+        date: of publication, YYYY-MM-DD.
+    """
+
+    license: str = "MIT"
+    creator: str = AUTHORS
+    url: str = ""
+    date: str = ""
+
+    def __post_init__(self) -> None:
+        """Checks what programs read."""
+        if not re.fullmatch(r"https?://\S+|[A-Za-z0-9][A-Za-z0-9.+-]*", self.license):
+            raise ConfigError(
+                f"Expected `license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {self.license!r}."
+            )
+        if not self.creator.strip():
+            raise ConfigError("Expected `creator` to be a name, got an empty one.")
+        if self.url and not re.fullmatch(r"https?://\S+", self.url):
+            raise ConfigError(f"Expected `url` to begin with https://, got {self.url!r}.")
+        try:
+            datetime.date.fromisoformat(self.date or "2024-05-21")
+        except ValueError as error:
+            raise ConfigError(f"Expected `date` as YYYY-MM-DD, got {self.date!r}.") from error
+
+    @property
+    def license_url(self) -> str:
+        """Where the licence is to be read."""
+        is_url = self.license.startswith("http")
+        return self.license if is_url else f"https://spdx.org/licenses/{self.license}.html"
+
+
+def describe(dataset: TerrainDataset, splits: Sequence[str]) -> str:
+    """One sentence or two on what the maps are and where they come from."""
+    grid, maps = dataset.grid, sum(dataset.map_count(split) for split in splits)
+    generator = dataset.manifest["generator"]
+    parts = [part for split in splits for part in dataset.splits[split]["parts"]]
+    recipes = [dataset.manifest["recipes"][part["recipe"]] for part in parts if "recipe" in part]
+    origins = sorted({f"recipe {recipe['id']}, seed {recipe['seed']}" for recipe in recipes})
+    origins += sorted({f"file {part['source']['file']}" for part in parts if "source" in part})
+    return (
+        f"{maps} maps of off-road terrain, {grid.height} × {grid.width} cells of {grid.resolution_m:g} m: colour "
+        "image, terrain class, elevation, slope, and traversability in [0, 1], of which higher is better; with start, "
+        f"goal and reference time. Written by {generator['package']} {generator['version']} from {'; '.join(origins)}."
+    )
+
+
+def metadata(
+    dataset: TerrainDataset,
+    names: Mapping[str, str],
+    fields: Sequence[str],
+    publication: Publication,
+    folder: Path,
+) -> dict[str, Any]:
+    """Makes the metadata of files that are written.
+
+    Args:
+        dataset: what was exported.
+        names: of its splits, as files are called, by their names in the dataset.
+        fields: which fields were exported.
+        publication: licence, creator, place and date.
+        folder: where the files are.
+    """
+    files = {name: sorted((folder / FOLDER).glob(f"{name}-*-of-*.parquet")) for name in names.values()}
+    content = hashlib.sha256(",".join(dataset.splits[split]["digest"] for split in names).encode())
+    found = re.search(r"-v(\d+)", dataset.id)
+    return {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.0",
+        "name": dataset.id,
+        "description": describe(dataset, list(names)),
+        "license": publication.license_url,
+        "creator": {"@type": "sc:Organization", "name": publication.creator},
+        "url": publication.url or f"urn:sha256:{content.hexdigest()}",
+        "datePublished": publication.date,
+        **({"version": f"{found[1]}.0.0"} if found else {}),
+        "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
+        "citeAs": PAPER,
+        "distribution": [item for name, own in files.items() for item in _distribution(name, own, folder)],
+        "recordSet": [
+            _classes(dataset),
+            *(_maps(dataset, split, name, fields, len(files[name])) for split, name in names.items()),
+        ],
+    }
+
+
+def _distribution(name: str, files: Sequence[Path], folder: Path) -> Iterator[dict[str, Any]]:
+    for path in files:
+        with open(path, "rb") as opened:
+            digest = hashlib.file_digest(opened, "sha256").hexdigest()
+        yield {
+            "@type": "cr:FileObject",
+            "@id": path.name,
+            "name": path.name,
+            "contentUrl": path.relative_to(folder).as_posix(),
+            "contentSize": f"{path.stat().st_size} B",
+            "encodingFormat": "application/x-parquet",
+            "sha256": digest,
+        }
+    if len(files) > 1:
+        yield {
+            "@type": "cr:FileSet",
+            "@id": f"{name}-files",
+            "name": f"{name}-files",
+            "encodingFormat": "application/x-parquet",
+            "includes": f"{FOLDER}/{name}-*-of-*.parquet",
+        }
+
+
+def _maps(
+    dataset: TerrainDataset, split: str, name: str, fields: Sequence[str], files: int
+) -> dict[str, Any]:
+    """The rows of a split, and what its columns are."""
+    file = f"{name}-00000-of-00001.parquet"
+    source = {"fileObject": {"@id": file}} if files == 1 else {"fileSet": {"@id": f"{name}-files"}}
+
+    def column(of: str, kind: str, description: str, repeated: bool = False) -> dict[str, Any]:
+        return {
+            "@type": "cr:Field",
+            "@id": f"{name}/{of}",
+            "name": of,
+            "description": description,
+            "dataType": kind,
+            **({"repeated": True} if repeated else {}),
+            "source": {**source, "extract": {"column": of}},
+        }
+
+    about = dataset.splits[split]
+    columns = [column(MAP, "sc:Integer", "number of the map in its split")]
+    for of in fields:
+        field = schema.FIELDS[of]
+        shape = field.entry_shape(*dataset.grid.shape)
+        words = [field.meaning] + ([f"in {field.unit}"] if field.unit != "1" else [])
+        words += [f"nested lists of shape {list(shape)}"] if shape else []
+        kind = "sc:Float" if "f" in field.dtype else "sc:Integer"
+        columns.append(column(of, kind, "; ".join(words), bool(shape)))
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": f"Split {split}: {about['maps']} maps of scenario {about['scenario']}.",
+        "key": {"@id": f"{name}/{MAP}"},
+        "field": columns,
+    }
+
+
+def _classes(dataset: TerrainDataset) -> dict[str, Any]:
+    """The class table, whose numbers give the latent traversability of a cell."""
+    kinds = {
+        **{"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"},
+        **dict.fromkeys(("scale", "exponent", "offset", "noise"), "sc:Float"),
+        **dict.fromkeys(("soft_weight", "soft_mean", "soft_std"), "sc:Float"),
+    }
+    rows = []
+    for number, item in enumerate(dataset.recipe.classes):
+        soft = item.soft
+        row = {
+            "id": number,
+            "name": item.name,
+            "colour": "#" + "".join(f"{value:02x}" for value in item.colour),
+        }
+        row |= {key: getattr(item, key) for key in ("scale", "exponent", "offset", "noise")}
+        row |= {f"soft_{key}": getattr(soft, key) if soft else 0.0 for key in ("weight", "mean", "std")}
+        rows.append({f"classes/{key}": value for key, value in row.items()})
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "classes",
+        "name": "classes",
+        "description": (
+            "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "
+            "offset), clipped to [0, 1], and standard deviation noise; with probability soft_weight it is normal with "
+            "soft_mean and soft_std instead. It is clipped to [0, 1]."
+        ),
+        "key": {"@id": "classes/id"},
+        "field": [
+            {"@type": "cr:Field", "@id": f"classes/{key}", "name": key, "dataType": kind}
+            for key, kind in kinds.items()
+        ],
+        "data": rows,
+    }
+
+
+def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publication) -> str:
+    """Writes the card of the exported dataset: Markdown, with what hubs read at its head.
+
+    Args:
+        dataset: what was exported.
+        names: of its splits, as files are called, by their names in the dataset.
+        publication: licence, creator, place and date.
+    """
+    is_url = publication.license.startswith("http")
+    head = {
+        "pretty_name": f"BenchNav {dataset.id}",
+        "license": "other" if is_url else publication.license.lower(),
+        **({"license_link": publication.license} if is_url else {}),
+        "tags": ["robotics", "off-road-navigation", "traversability", "terrain"],
+        "configs": [
+            {
+                "config_name": "default",
+                "data_files": [
+                    {"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"} for name in names.values()
+                ],
+            }
+        ],
+    }
+    rows = [
+        f"| `{name}` | `{split}` | {dataset.map_count(split)} | `{dataset.splits[split]['digest']}` |"
+        for split, name in names.items()
+    ]
+    return "\n".join(
+        [
+            f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---\n",
+            f"# BenchNav {dataset.id}\n",
+            f"{describe(dataset, list(names))}\n",
+            f"A row is a map; arrays are nested lists. `{METADATA}` describes the columns and holds the SHA-256 of",
+            "each file. The metadata of each Parquet file holds the recipes that make the maps again.\n",
+            "| split here | split of the dataset | maps | digest of the dataset's maps |\n|---|---|---|---|",
+            *rows,
+            f"\nLicence: [{publication.license}]({publication.license_url}).\n",
+            f"```bibtex\n{PAPER}\n```\n",
+        ]
+    )

@@ -1,0 +1,95 @@
+"""Exports a dataset to a folder of Parquet files with Croissant metadata, whole or not at all."""
+
+import datetime
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from benchnav.datagen import schema
+from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
+from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.writer import named_errors
+from benchnav.errors import DatasetError
+from benchnav.files import sole_writer
+
+
+def export(
+    dataset: TerrainDataset,
+    out: Path,
+    publication: Publication,
+    splits: Sequence[str] | None = None,
+    fields: Sequence[str] | None = None,
+    maps_a_file: int = 0,
+    overwrite: bool = False,
+) -> Iterator[tuple[int, int]]:
+    """Exports a dataset, yielding (maps done, maps in all) as it goes; to be iterated to the end.
+
+    Args:
+        dataset: what to export.
+        out: the folder, which takes its name when it is whole.
+        publication: licence, creator, place and date; without a date that of today.
+        splits: which splits, in the dataset's order; None for all.
+        fields: which fields, in the order of `schema.FIELDS`; None for all.
+        maps_a_file: most maps of a file; 0 for as many as make a file of a few hundred MB at most.
+        overwrite: replace an exported dataset that is there.
+
+    Raises:
+        DatasetError: no such split or field, the dataset is damaged, or `out` is there or cannot be written.
+    """
+    names = split_names(_chosen("splits", splits, list(dataset.splits)))
+    columns = _chosen("fields", fields, list(schema.FIELDS))
+    if maps_a_file < 0:
+        raise DatasetError(f"Expected `maps_per_file` ≥ 0, got {maps_a_file}.")
+    if not publication.date:
+        today = datetime.datetime.now(datetime.UTC).date()
+        publication = replace(publication, date=today.isoformat())
+    _check_target(out, overwrite)
+    out = out.resolve()
+    done, total = 0, sum(dataset.map_count(split) for split in names)
+    partial, dropped = (out.with_name(f".{out.name}.{what}") for what in ("partial", "dropped"))
+    with named_errors(out), sole_writer(out, str(out)), ExitStack() as stack:
+        _check_target(out, overwrite)  # it may have come while another run held it
+        for left in (partial, dropped):  # by a run that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        stack.callback(shutil.rmtree, partial, ignore_errors=True)
+        (partial / FOLDER).mkdir(parents=True)
+        yield done, total
+        for split, name in names.items():
+            for maps in write_split(partial / FOLDER, name, dataset, split, columns, maps_a_file):
+                done += maps
+                yield done, total
+        about = metadata(dataset, names, columns, publication, partial)
+        (partial / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+        (partial / CARD).write_text(card(dataset, names, publication))
+        if out.exists():
+            out.rename(dropped)
+        partial.rename(out)
+        shutil.rmtree(dropped, ignore_errors=True)
+
+
+def _chosen(what: str, asked: Sequence[str] | None, known: list[str]) -> list[str]:
+    if asked is None:
+        return known
+    unknown = [name for name in asked if name not in known]
+    if unknown or not asked:
+        raise DatasetError(f"Expected `{what}` among {known}, got {unknown or 'none'}.")
+    return [name for name in known if name in asked]
+
+
+def _check_target(out: Path, overwrite: bool) -> None:
+    """Refuses what is there, unless it is an exported dataset that is to be replaced."""
+    if not out.exists() and not out.is_symlink():
+        return
+    if not (out / METADATA).is_file():
+        raise DatasetError(
+            f"Expected `out` to be a new folder, got {out}, which is there and is no exported dataset. "
+            "Choose another `out`."
+        )
+    if not overwrite:
+        raise DatasetError(
+            f"Expected `out` to be a new folder, but {out} exists. Pass --overwrite to replace it."
+        )
