@@ -3,15 +3,17 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+LOWEST := .venv-lowest
 # A worker takes up to 2 GB.
 JOBS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
-.PHONY: help demo test test-slow bench lint wheel clean
+.PHONY: help demo test test-slow test-lowest bench lint wheel clean
 
 help:
 	@echo "make demo   set up, run a small suite of the shipped model on the shipped maps, write report and playback"
 	@echo "make test   set up, run the tests"
 	@echo "make test-slow  those that take minutes: whole suites with the shipped model"
+	@echo "make test-lowest  the tests with the lowest versions that pyproject.toml allows, set up in $(LOWEST)"
 	@echo "make bench  speed, side by side with peers"
 	@echo "make lint   ruff and mypy"
 	@echo "make wheel  the package with the shipped maps and models, in dist/"
@@ -34,6 +36,16 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS) -m slow
 
+# Python 3.11 is the lowest that is allowed, and the lowest versions have no builds for the newest.
+test-lowest:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null || { \
+	  echo "benchnav: expected Python 3.11, got \"$$($(PYTHON) --version 2>&1)\" from $(PYTHON); run make test-lowest PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@echo "benchnav: setting up $(LOWEST) (several minutes and about 7 GB)"
+	$(PYTHON) -m venv --clear $(LOWEST)
+	$(PYTHON) tools/lowest.py > $(LOWEST)/constraints.txt
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --constraint $(LOWEST)/constraints.txt --editable '.[dask,geo,test]'
+	$(LOWEST)/bin/python -m pytest -n $(JOBS) --dist loadfile
+
 bench: $(STAMP)
 	$(BIN)/python benchmarks/datasets.py
 	$(BIN)/python benchmarks/gps.py
@@ -51,4 +63,4 @@ wheel: $(STAMP)
 	@ls -lh dist
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
