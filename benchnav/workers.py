@@ -9,9 +9,13 @@ _LOOK_S = 0.5
 
 
 @cache
-def end_with_parent() -> None:
-    """Ends this process when its parent is gone, which a kill tells no worker; once a process is enough."""
-    parent = os.getppid()
+def end_with(parent: int) -> None:
+    """Ends this process when its parent is gone, which a kill tells no worker; once a process is enough.
+
+    Args:
+        parent: number of the process that started this one. It is given, since a worker that is still on its way up
+            when its parent is killed would take the process that adopts it for its parent.
+    """
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -1,5 +1,5 @@
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import h5py
@@ -13,6 +13,7 @@ from benchnav.datagen.files.shard import Shard
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
 from benchnav.errors import ConfigError
+from benchnav.share import Share
 
 Call = Callable[..., int]
 
@@ -122,6 +123,26 @@ def test_shards_made_apart_are_one_dataset(datagen: Call, capsys) -> None:  # ty
     assert f"remove {shard.name} in big and give the command again" in capsys.readouterr().out
     assert datagen("create", "tiny-v1", *SMALL, "--out", "big") == 0
     assert datagen("validate", "big") == 0
+
+
+def test_options_of_create_reach_it(datagen: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def watched(recipe: Recipe, path: Path, *how: object) -> Iterator[tuple[int, int]]:
+        seen.append(how)
+        raise ConfigError("seen")
+
+    monkeypatch.setattr(create, "create", watched)
+    plain = ("create", "tiny-v1", "--out", "d")
+    for options in (
+        (), ("--jobs", "3"), ("--backend", "dask", "--scheduler", "tcp://a:1"), ("--shard", "2/3"), ("--overwrite",),
+    ):  # fmt: skip
+        assert datagen(*plain, *options) == 2
+    none = (1, "", None, False)
+    assert seen == [
+        none, (3, "", None, False), (1, "tcp://a:1", None, False), (1, "", Share(index=2, of=3), False),
+        (1, "", None, True),
+    ]  # fmt: skip
 
 
 def test_a_large_dataset_is_a_folder(datagen: Call, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,11 +18,10 @@ import numpy as np
 from benchnav.datagen.dem.raster import load_rasterio
 from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
-from benchnav.datagen.files.create import check_folder, join
+from benchnav.datagen.files.create import check_place, join
 from benchnav.datagen.files.folder import Contents, take_place, write_manifest
-from benchnav.datagen.files.reader import FOLDER_MANIFEST
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard
-from benchnav.datagen.files.writer import check_target, is_one_file, named_errors, pack
+from benchnav.datagen.files.writer import is_one_file, named_errors, pack
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, quantise
 from benchnav.datagen.synth.generate import Maps, class_map, complete, reference_time_s
@@ -73,7 +72,7 @@ def import_dem(
         ConfigError: rasterio is not installed, or a setting does not fit the recipe.
         DatasetError: a raster does not fit, a split is left without maps, or `out` exists or cannot be written.
     """
-    _check_target(out, overwrite)
+    check_place(out, overwrite)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
     recipe = replace(recipe, id=dataset_id, splits=splits)
@@ -105,7 +104,7 @@ def import_dem(
                 splits={name: part.entry() for name, part in parts.items()},
                 files={name: part.files for name, part in parts.items()},
             )
-            _check_target(out, overwrite)
+            check_place(out, overwrite)
             if is_one_file(out):
                 join(out, contents)
             else:
@@ -198,17 +197,6 @@ def _make(
     left_out["not_solvable"] += int((~solved).sum())
     stored = {name: maps[name][solved].astype(kind.dtype) for name, kind in FIELDS.items()}
     return stored, numbers[solved], lowest_m[solved]
-
-
-def _check_target(out: Path, overwrite: bool) -> None:
-    """Refuses a target that is there, unless it is a dataset of this kind that may be replaced."""
-    if is_one_file(out):
-        return check_target(out, overwrite)
-    check_folder(out)
-    if (out / FOLDER_MANIFEST).exists() and not overwrite:
-        raise DatasetError(
-            f"Expected `out` to be a new folder, but {out} exists. Pass --overwrite to replace it."
-        )
 
 
 def _check_parts(rasters: Rasters, parts: Mapping[str, _Part]) -> None:

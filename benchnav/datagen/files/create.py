@@ -5,6 +5,7 @@ of many files is made where it is to be, and is finished when its manifest is wr
 """
 
 import multiprocessing
+import os
 import re
 import shutil
 import signal
@@ -18,19 +19,20 @@ import joblib
 
 import benchnav
 from benchnav.cluster import connected, parallel, told_when_lost
-from benchnav.datagen.files.folder import Contents, write_manifest
-from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
+from benchnav.datagen.files.folder import Contents, take_place, whole, write_manifest
+from benchnav.datagen.files.reader import FOLDER_MANIFEST, is_dataset, open_file, read_manifest
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make
 from benchnav.datagen.files.writer import check_target, is_one_file, named_errors, writing
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import ConfigError, DatasetError
 from benchnav.files import replacing, sole_writer
 from benchnav.share import Share
-from benchnav.workers import end_with_parent
+from benchnav.workers import end_with
 
 _Made = tuple[Shard, bytes]
 
-_SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
+# Shards, and what is half-written of them or of the manifest.
+_OURS = re.compile(r".+-\d{8}-\d{8}\.h5|\..+\.partial")
 
 
 def create(
@@ -67,8 +69,14 @@ def create(
     if is_file and share is not None:
         raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
     with named_errors(path), _held(path, share):
-        folder = path.parent / f".{path.name}.partial" if is_file else path
-        missing = _missing(recipe, path, folder, shards, own, overwrite)
+        folder = _workplace(path, share, overwrite)
+        missing = _missing(recipe, folder, shards, own, may_replace=overwrite or folder != path)
+        if folder == path and (path / FOLDER_MANIFEST).exists():
+            if not missing:
+                raise DatasetError(
+                    f"Expected `out` to be a new folder, but {path} exists. Pass --overwrite to replace it."
+                )
+            (path / FOLDER_MANIFEST).unlink()  # until what was lost is there again
         total = sum(shard.maps for shard in own)
         done = total - sum(shard.maps for shard in missing)
         yield done, total
@@ -78,12 +86,19 @@ def create(
                     partial.write_bytes(content)
                 done += shard.maps
                 yield done, total
-        contents = _contents(recipe, folder, shards)
+        if not all((folder / shard.name).exists() for shard in shards):
+            return  # the other shares are made elsewhere
+        files = {
+            name: [folder / shard.name for shard in shards if shard.split == name] for name in recipe.splits
+        }
+        contents = whole(recipe, files)
         if is_file:
             join(path, contents)
             shutil.rmtree(folder)
-        elif all((folder / shard.name).exists() for shard in shards):
-            write_manifest(folder, contents)
+            return
+        write_manifest(folder, contents)
+        if folder != path:
+            take_place(folder, path)
 
 
 def join(path: Path, contents: Contents) -> None:
@@ -107,47 +122,69 @@ def _held(path: Path, share: Share | None) -> Any:
     return sole_writer(path.with_name(name), str(path))
 
 
-def _missing(
-    recipe: Recipe, path: Path, folder: Path, shards: Sequence[Shard], own: Sequence[Shard], overwrite: bool
-) -> list[Shard]:
-    """Which shards are to be made; those of another recipe, cut or version are removed where they may be.
+def _workplace(path: Path, share: Share | None, overwrite: bool) -> Path:
+    """Where shards are made: where they are to be, or beside a file or a finished folder that they replace.
 
     Raises:
         DatasetError: what is there may not be replaced.
     """
-    is_file = folder != path
-    if is_file:
+    beside = path.with_name(f".{path.name}.partial")
+    if is_one_file(path):
         if path.exists() and not overwrite:
-            shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(beside, ignore_errors=True)
         check_target(path, overwrite)
-    else:
-        check_folder(path)
+        return beside
+    check_folder(path)
+    if not overwrite or not (path / FOLDER_MANIFEST).exists():
+        return path
+    if share is not None:
+        raise DatasetError(
+            f"Expected no finished dataset to replace by a shard, got {path}. Remove it first."
+        )
+    return beside
+
+
+def _missing(
+    recipe: Recipe, folder: Path, shards: Sequence[Shard], own: Sequence[Shard], may_replace: bool
+) -> list[Shard]:
+    """Which shards are to be made; those of another recipe, cut or version are removed where they may be.
+
+    Raises:
+        DatasetError: there are such, and they may not be.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     known = {shard.name: shard for shard in shards}
     every = sorted(folder.glob("*.h5"))
     there = [file for file in every if file.name in known and is_there(file, recipe, known[file.name])]
     foreign = [file for file in every if file not in there]
-    if foreign and not is_file and not overwrite:
+    if foreign and not may_replace:
         raise DatasetError(
             f"Expected `out` to be new or to hold shards of this recipe and version, but {foreign[0]} is another. "
             "Choose another `out`, or pass --overwrite."
         )
-    missing = [shard for shard in own if folder / shard.name not in there]
-    manifest = folder / FOLDER_MANIFEST
-    if manifest.exists():
-        if not missing and not overwrite:
-            raise DatasetError(
-                f"Expected `out` to be a new folder, but {path} exists. Pass --overwrite to replace it."
-            )
-        missing = list(own) if overwrite else missing
-        manifest.unlink()
     # What is half-written of this share is of a killed run.
     half = [
         file for file in folder.glob(".*.partial") if any(f".{shard.name}." in file.name for shard in own)
     ]
     for file in (*foreign, *half):
         file.unlink()
-    return missing
+    return [shard for shard in own if folder / shard.name not in there]
+
+
+def check_place(path: Path, overwrite: bool) -> None:
+    """Refuses a target of what is made elsewhere: one that is there, unless it is a dataset to be replaced.
+
+    Raises:
+        DatasetError: it is there and `overwrite` is false, or it holds anything but a dataset.
+    """
+    if is_one_file(path):
+        check_target(path, overwrite)
+        return
+    check_folder(path)
+    if path.exists() and any(path.iterdir()) and not overwrite:
+        raise DatasetError(
+            f"Expected `out` to be a new folder, but {path} exists. Pass --overwrite to replace it."
+        )
 
 
 def check_folder(path: Path) -> None:
@@ -158,9 +195,10 @@ def check_folder(path: Path) -> None:
     """
     if path.exists() and not path.is_dir():
         raise DatasetError(f"Expected `out` to be a folder or a file .h5, got the file {path}.")
+    shards = read_manifest(path)["shards"] if is_dataset(path) else {}
+    known = {FOLDER_MANIFEST, *(shard["file"] for own in shards.values() for shard in own)}
     for file in sorted(path.iterdir()) if path.exists() else ():
-        is_ours = file.name == FOLDER_MANIFEST or _SHARD.fullmatch(file.name) or file.name.startswith(".")
-        if not is_ours:
+        if file.name not in known and not _OURS.fullmatch(file.name):
             raise DatasetError(
                 f"Expected `out` to be a new folder or one of shards, but {path} holds {file.name}."
             )
@@ -179,7 +217,9 @@ def _runner(
     if jobs == 1:
         yield lambda shards: (_make(recipe, shard) for shard in shards)
         return
-    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_start_worker)
+    executor = ProcessPoolExecutor(
+        jobs, multiprocessing.get_context("spawn"), initializer=_start_worker, initargs=(os.getpid(),)
+    )
     try:
         yield lambda shards: (
             done.result() for done in as_completed(executor.submit(_make, recipe, shard) for shard in shards)
@@ -192,10 +232,10 @@ def _make(recipe: Recipe, shard: Shard) -> _Made:
     return shard, make(recipe, shard)
 
 
-def _start_worker() -> None:
+def _start_worker(parent: int) -> None:
     # An interrupt is for the parent to act on; and a parent that is killed takes its workers along.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    end_with(parent)
 
 
 def _check_workers(client: Any) -> None:
@@ -212,19 +252,6 @@ def _check_workers(client: Any) -> None:
 
 def _version() -> str:
     return benchnav.__version__
-
-
-def _contents(recipe: Recipe, folder: Path, shards: Sequence[Shard]) -> Contents:
-    splits = {
-        name: {
-            "scenario": spec.scenario,
-            "maps": spec.maps,
-            "parts": [{"maps": spec.maps, "recipe": 0, "split": name, "first": 0}],
-        }
-        for name, spec in recipe.splits.items()
-    }
-    files = {name: [folder / shard.name for shard in shards if shard.split == name] for name in recipe.splits}
-    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
 
 
 @contextmanager

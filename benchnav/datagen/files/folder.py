@@ -1,6 +1,5 @@
 """Datasets of many shards: a folder of files, and a manifest that says which maps lie in which."""
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +32,19 @@ class Contents:
     files: Mapping[str, Sequence[Path]]
 
 
+def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
+    """All maps of a recipe, by split the files that hold them."""
+    splits = {
+        name: {
+            "scenario": spec.scenario,
+            "maps": spec.maps,
+            "parts": [{"maps": spec.maps, "recipe": 0, "split": name, "first": 0}],
+        }
+        for name, spec in recipe.splits.items()
+    }
+    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
+
+
 def write_manifest(folder: Path, contents: Contents) -> None:
     """Makes a dataset of files that lie in a folder.
 
@@ -53,7 +65,7 @@ def write_manifest(folder: Path, contents: Contents) -> None:
         splits[name] = {**entry, "digest": digest.hexdigest()}
     manifest = manifest_of(contents.id, contents.recipes, splits)
     manifest |= {"format_version": FORMAT_VERSION, "shards": shards}
-    write_text(folder / FOLDER_MANIFEST, schema.seal(json.loads(json.dumps(manifest))))
+    write_text(folder / FOLDER_MANIFEST, schema.seal(manifest))
 
 
 def take_place(partial: Path, out: Path) -> None:

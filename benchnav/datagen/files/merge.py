@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from benchnav.datagen import schema
-from benchnav.datagen.files.create import join
-from benchnav.datagen.files.folder import Contents, take_place, write_manifest
+from benchnav.datagen.files.create import check_place, join
+from benchnav.datagen.files.folder import Contents, take_place, whole, write_manifest
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
-from benchnav.datagen.files.writer import check_target, is_one_file, named_errors
+from benchnav.datagen.files.writer import is_one_file, named_errors
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
 from benchnav.errors import ConfigError, DatasetError
@@ -45,19 +45,14 @@ def merge(
     Raises:
         DatasetError: the datasets are unlike, with every reason; one is damaged; shares are missing; or `out` exists.
     """
-    whole = [path for path in paths if is_dataset(path) or not path.is_dir()]
-    if whole and len(whole) < len(paths):
+    finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
+    if finished and len(finished) < len(paths):
         raise DatasetError("Expected either datasets or shares of one dataset, got both.")
-    contents = _of_datasets(whole, dataset_id or out.stem) if whole else _of_shares(paths)
+    contents = _of_datasets(finished, dataset_id or out.stem) if finished else _of_shares(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
     is_file = is_one_file(out)
     with named_errors(out), sole_writer(out, str(out)):
-        if is_file:
-            check_target(out, overwrite)
-        elif out.exists() and not overwrite:
-            raise DatasetError(
-                f"Expected `out` to be a new folder, but {out} exists. Pass --overwrite to replace it."
-            )
+        check_place(out, overwrite)
         for split, files in contents.files.items():
             for path in files:
                 for count in _check(TerrainDataset(path), split):
@@ -128,7 +123,6 @@ def _of_shares(folders: Sequence[Path]) -> Contents:
                     f"Expected shares of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
                 )
     recipe = recipe_from_dict(first["recipes"][0], f"in {shards[0].path}")
-    splits: dict[str, Any] = {}
     files: dict[str, list[Path]] = {}
     lacking = []
     for name, spec in recipe.splits.items():
@@ -141,11 +135,9 @@ def _of_shares(folders: Sequence[Path]) -> Contents:
             place = begin + own[begin].splits[name]["maps"]
         if place != spec.maps:
             lacking.append(f"maps {place}–{spec.maps - 1} of {name}")
-        part = {"maps": spec.maps, "recipe": 0, "split": name, "first": 0}
-        splits[name] = {"scenario": spec.scenario, "maps": spec.maps, "parts": [part]}
     if lacking:
         raise DatasetError(f"Expected all shares of {recipe.id}, got none with {'; '.join(lacking)}.")
-    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
+    return whole(recipe, files)
 
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ from benchnav.eval.unit import Extent, Unit, in_table_order, units
 from benchnav.files import sole_writer, write_text
 from benchnav.planning.world.outcome import Outcome
 from benchnav.share import Share
-from benchnav.workers import end_with_parent
+from benchnav.workers import end_with
 
 Trials = dict[str, tuple[Trial, Extent]]
 
@@ -219,7 +220,7 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
 def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs: int) -> Iterator[None]:
     # Workers may be older than this call, so that they are told where names of files begin.
     here, target, run_id, limit_s = Path.cwd(), folder.resolve(), about["run_id"], about["planner_limit_s"]
-    run = _run_in_worker if jobs > 1 else _run_at
+    run = partial(_run_in_worker, os.getpid()) if jobs > 1 else _run_at
     calls = (joblib.delayed(run)(here, unit, target, run_id, limit_s) for unit in missing)
     finished = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
     for _ in missing:
@@ -236,8 +237,8 @@ def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs:
         yield
 
 
-def _run_in_worker(*given: Any) -> None:
-    end_with_parent()
+def _run_in_worker(parent: int, *given: Any) -> None:
+    end_with(parent)
     _run_at(*given)
 
 

@@ -263,3 +263,32 @@ def test_the_name_tells_a_file_from_a_folder(tmp_path: Path, name: str) -> None:
     path = make(tmp_path / name)
     assert path.is_file() == (name in ("d.h5", "d.hdf5"))
     assert TerrainDataset(path).map_count("train") == 8
+
+
+def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(tmp_path: Path) -> None:
+    path, other = make(tmp_path / "d"), replace(tiny_recipe(), seed=3)
+    before = digests(path)
+    steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
+    assert [next(steps)[0] for _ in range(3)] == [0, 3, 6]
+    steps.close()
+    assert digests(path) == before
+    assert find_faults(path) == []
+    steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
+    assert next(steps)[0] == 6  # goes on
+    for _ in steps:
+        pass
+    assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", other)) != before
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["d", "o.h5"]
+    with pytest.raises(DatasetError, match="Remove it first"):
+        make(path, share=Share(index=1, of=2), overwrite=True)
+    assert find_faults(path) == []
+
+
+@pytest.mark.parametrize("name", ["notes.txt", ".git", "maps.h5"])
+def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / name).write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(DatasetError, match="holds"):
+            make(tmp_path / "d", overwrite=overwrite)
+    assert (tmp_path / "d" / name).read_text() == "mine"

@@ -126,3 +126,26 @@ def test_what_a_killed_run_made_of_the_same_name_is_kept(tmp_path: Path) -> None
     parts = [tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name)) for name in ("train", "valid")]
     run(parts, tmp_path / "m.h5")
     assert kept <= set((tmp_path / ".m.h5.partial").glob("*.h5"))
+
+
+def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None:
+    recipe = tiny_recipe()
+    parts = [tiny_dataset(tmp_path / f"{name}.h5", only(recipe, name)) for name in ("train", "valid")]
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(DatasetError, match=r"holds notes\.txt"):
+            next(merge(parts, out, "both", overwrite))
+    assert (out / "notes.txt").read_text() == "mine"
+    (out / "notes.txt").unlink()
+    both = run(parts, out)
+    assert both.digest == run(parts, tmp_path / "both.h5").digest
+    # Its files have the names that they came with.
+    assert sorted(item.name for item in out.iterdir()) == ["manifest.json", "train.h5", "valid.h5"]
+    with pytest.raises(DatasetError, match="exists"):
+        run(parts, out)
+    for _ in merge(parts[::-1], out, "again", True):
+        pass
+    assert (TerrainDataset(out).id, list(TerrainDataset(out).splits)) == ("again", ["valid", "train"])
+    assert find_faults(out) == []

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from benchnav.datagen import schema
+from benchnav.datagen.files import reader
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset, terrain_of
 from benchnav.datagen.recipe import classes
 from benchnav.datagen.synth.generate import generate
@@ -92,3 +93,28 @@ def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
     for place, share in enumerate((1 / twins, 1 - 1 / twins)):
         own = [k for k, group in enumerate(seen.group) if group == place]
         torch.testing.assert_close(seen.weights[:, own].sum(1), share)
+
+
+class Tight:
+    """An array of which one map at a time can be read, as where memory is short."""
+
+    def __init__(self, values: np.ndarray, damaged: int = -1) -> None:
+        self.values, self.damaged = values, damaged
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, which: object) -> np.ndarray:
+        found = self.values[which]
+        if len(found) > 1 or self.damaged in found:
+            raise OSError("no room")
+        return found
+
+
+@pytest.mark.parametrize("which", [slice(None), np.array([1, 4])])
+def test_want_of_memory_is_not_taken_for_damage(which: slice | np.ndarray) -> None:
+    values = np.arange(6)
+    np.testing.assert_array_equal(reader._values(Tight(values), which), values[which])
+    with pytest.raises(OSError, match="no room"):
+        reader._values(Tight(values, damaged=4), which)
+    assert not issubclass(MemoryError, reader.READ_ERRORS)
