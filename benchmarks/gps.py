@@ -38,7 +38,7 @@ from benchnav.models.quality.scores import coverage, crps, pit, tail_rate
 from benchnav.models.slope_gp.cells import Cells, read_cells
 from benchnav.models.slope_gp.sums import SlopeSums, sum_cells, sum_split
 from benchnav.models.slope_gp.table import SlopeTable
-from benchnav.models.training.train import fit_gps
+from benchnav.models.training.gps import fit_gps
 from benchnav.terrain import Terrain
 
 REPEATS = 5

@@ -172,6 +172,16 @@ class TraversabilityMixture:
             self.weights[members], self.means[members], self.stds[members], self.group
         )
 
+    def at(self, cells: Tensor) -> "TraversabilityMixture":
+        """Keeps some cells as a map of one row, [K, 1, N].
+
+        Args:
+            cells: which of them, bool, shape [B, H, W].
+        """
+        parameters = (self.weights, self.means, self.stds)
+        weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
+        return TraversabilityMixture(weights, means, stds, self.group)
+
     def to(self, device: torch.device | str) -> "TraversabilityMixture":
         """The mixture on a device."""
         weights, means, stds = (values.to(device) for values in (self.weights, self.means, self.stds))

@@ -11,10 +11,13 @@ Source: Salmon et al. (2011), "Parallel random numbers: as easy as 1, 2, 3" (Phi
 
 import hashlib
 import json
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from scipy.special import ndtri
+
+if TYPE_CHECKING:
+    import torch
 
 Name = str | int
 
@@ -74,10 +77,12 @@ def permutation(key: int, indices: np.ndarray, n: int) -> np.ndarray:
     return np.argsort(uniform(key, indices, (n,)), axis=1, kind="stable")
 
 
-def generator(key: int, device: torch.device | str = "cpu") -> torch.Generator:
+def generator(key: int, device: "torch.device | str" = "cpu") -> "torch.Generator":
     """Makes a PyTorch generator for the stream `key` on `device`, for bulk draws of planners.
 
     PyTorch's generator on the CPU keeps the low 32 bits of a seed: hash a key for every draw, as
     `stream_key` does, rather than count on from one.
     """
+    import torch
+
     return torch.Generator(device=device).manual_seed(key % 2**63)

@@ -7,13 +7,14 @@ import torch
 
 from benchnav.datagen.files.create import create
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Robot, Unicycle
 from benchnav.planning.world.places import Places
-from benchnav.terrain import Grid, Observation, Terrain
+from benchnav.terrain import Observation, Terrain
 
 GRID = Grid(16, 16, 0.5)
 

@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchnav.errors import ConfigError
-from benchnav.terrain import Grid, Observation
+from benchnav.grid import Grid
+from benchnav.terrain import Observation
 from tests import factories
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.cai.ground import DIRT, VEGETATION
 from benchnav import rng
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 GRID = Grid(9, 9, 1.0)
 BORDER_CELLS = 1

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from benchnav.command import INTERRUPTED, Command, run
+from benchnav.datagen.dem.command import import_dem
+from benchnav.datagen.export.command import export
 
 if TYPE_CHECKING:
     from benchnav.datagen.files.check import Fault
@@ -50,6 +52,7 @@ def create(
     from benchnav.command import show_progress
     from benchnav.datagen.difficulty import explain, table
     from benchnav.datagen.files.create import create as create_dataset
+    from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.reader import TerrainDataset, is_dataset
     from benchnav.datagen.recipe.recipe import load_recipe
     from benchnav.errors import ConfigError
@@ -88,7 +91,7 @@ def create(
         print("same folder, nothing more: the last of them finishes it")
         return
     made = TerrainDataset(path)
-    _report(made)
+    say_written(made)
     console = Console(highlight=False)
     console.print(table(made))
     for line in explain(made):
@@ -197,143 +200,14 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
         overwrite: Replace what is there.
     """
     from benchnav.command import show_progress
+    from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.merge import merge as merge_datasets
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
     path = Path(out).expanduser()
     sources = [Path(file) if Path(file).is_dir() else find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
-    _report(TerrainDataset(path))
-
-
-def import_dem(
-    dem: str,
-    overrides: list[str],
-    out: str,
-    id: str = "",
-    recipe: str = "paper-v1",
-    splits: str = "test/real",
-    stride: float | None = None,
-    scenario: str = "std",
-    classes: str = "",
-    class_ids: dict[int, str | None] | None = None,
-    random_classes: bool = False,
-    photo: str = "",
-    traversability: str = "",
-    solvable: bool = False,
-    overwrite: bool = False,
-) -> None:
-    """Make a dataset from a real elevation model; needs the extra benchnav[geo].
-
-    Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip:// archives, mosaics (.vrt).
-
-    Args:
-        dem: Raster of elevations in metres, in any coordinate reference system.
-        overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
-        out: File .h5 to write, or else a folder of many files.
-        id: Id of the dataset; the name of the output when not given.
-        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
-        splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
-        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
-        scenario: Which of the recipe's scenarios lights the maps.
-        classes: Raster of terrain classes; laid out at random when not given.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
-        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
-        photo: Raster of red, green and blue; painted by the class when not given.
-        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
-        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
-        overwrite: Replace what is there.
-    """
-    from benchnav.command import show_progress
-    from benchnav.datagen.dem.importer import import_dem as import_maps
-    from benchnav.datagen.dem.survey import Rasters
-    from benchnav.datagen.dem.tiling import read_shares
-    from benchnav.datagen.files.reader import TerrainDataset
-    from benchnav.datagen.recipe.recipe import load_recipe
-
-    path = Path(out).expanduser()
-    rasters = Rasters(
-        dem=dem,
-        classes=classes,
-        class_ids=class_ids,
-        random_classes=random_classes,
-        photo=photo,
-        traversability=traversability,
-    )
-    name = id or path.stem
-    chosen = load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
-    steps = import_maps(
-        rasters,
-        path,
-        chosen,
-        dataset_id=chosen.id if overrides and not id else name,
-        shares=read_shares(splits),
-        scenario=scenario,
-        stride_m=stride,
-        solvable=solvable,
-        overwrite=overwrite,
-    )
-    show_progress(steps, "maps")
-    made = TerrainDataset(path)
-    _report(made)
-    for split, entry in made.splits.items():
-        left_out = entry["parts"][0]["source"]["left_out"]
-        between = left_out.pop("between_splits")
-        reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
-        print(f"  left out of {split}: {reasons}")
-    if between:
-        print(f"  left out between splits: {between}")
-
-
-def export(
-    file: str,
-    out: str,
-    splits: list[str] | None = None,
-    fields: list[str] | None = None,
-    maps_per_file: int = 0,
-    license: str = "",
-    creator: str = "",
-    url: str = "",
-    date: str = "",
-    overwrite: bool = False,
-) -> None:
-    """Export a dataset to Parquet files with Croissant metadata, which other tools read without this package.
-
-    Args:
-        file: Path or id of a dataset.
-        out: Folder to write.
-        splits: Only these splits, for example [test/std,test/hg].
-        fields: Only these fields, for example [rgb,class_id].
-        maps_per_file: Most maps of a file; 0 makes files of a few hundred MB at most.
-        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; MIT when not given. Imported maps need one.
-        creator: Who made the maps; the BenchNav authors when not given. Imported maps need one.
-        url: Where the dataset will be found.
-        date: Date of publication, YYYY-MM-DD; today when not given.
-        overwrite: Replace an exported dataset that is there.
-    """
-    from rich.filesize import decimal
-
-    from benchnav.command import show_progress
-    from benchnav.datagen.export.croissant import AUTHORS, Publication
-    from benchnav.datagen.export.export import export as export_dataset
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.errors import ConfigError
-
-    dataset = TerrainDataset(find_dataset(file))
-    chosen = dataset.splits if splits is None else [name for name in splits if name in dataset.splits]
-    imported = any("source" in part for name in chosen for part in dataset.splits[name]["parts"])
-    if imported and not (license and creator):
-        raise ConfigError(
-            f"Expected `license` and `creator` of {dataset.id}, whose maps were imported, got none. Pass those of "
-            "the elevation model, its classes and photo."
-        )
-    publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
-    path = Path(out).expanduser()
-    steps = export_dataset(dataset, path, publication, splits, fields, maps_per_file, overwrite)
-    show_progress(steps, "maps")
-    files = sorted(path.rglob("*.parquet"))
-    size = decimal(sum(item.stat().st_size for item in files))
-    print(f"wrote {path} ({size} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)")
+    say_written(TerrainDataset(path))
 
 
 def preview(
@@ -384,16 +258,6 @@ def _tell_kept(steps: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
         print(f"{done} of {total} maps were there already", file=sys.stderr)
     yield done, total
     yield from steps
-
-
-def _report(dataset: "TerrainDataset") -> None:
-    from rich.filesize import decimal
-
-    files = {piece.path for split in dataset.splits for piece in dataset.pieces(split)}
-    size = decimal(sum(path.stat().st_size for path in files))
-    print(f"wrote {dataset.path} ({size}{f' in {len(files)} files' if len(files) > 1 else ''})")
-    for name, split in dataset.splits.items():
-        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
 
 
 def main() -> None:

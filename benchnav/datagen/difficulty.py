@@ -15,7 +15,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import Maps
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADS = (

@@ -28,7 +28,7 @@ from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
 from benchnav.errors import ConfigError
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 TITLES = {
     "rgb": "RGB",

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.datagen.files.reader import terrain_of
+from benchnav.datagen.files.terrain import terrain_of
 from benchnav.datagen.recipe.recipe import Split, load_recipe
 from benchnav.datagen.synth.generate import generate
 from benchnav.errors import BenchnavError, ConfigError

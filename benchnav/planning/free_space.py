@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
-from benchnav.terrain import Grid
 
 # Of a step, and of a metre, on ground that is not free; the paper's penalty a step. Higher than what any
 # way over free ground costs.

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PRICE, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
-from benchnav.terrain import Grid, Observation
+from benchnav.terrain import Observation
 
 T = TypeVar("T")
 

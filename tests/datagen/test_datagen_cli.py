@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -518,3 +520,21 @@ def test_an_override_names_an_item_of_a_list_by_its_name() -> None:
     for wrong in ("classes.dune.noise=1", "classes.3.noise=1", "occupancy.first=1"):
         with pytest.raises(ConfigError, match="something in the recipe"):
             load_recipe("stakes-v1", ["id=deep", wrong])
+
+
+def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> None:
+    code = (
+        "import sys; from benchnav.datagen.cli import main\n"
+        "try: main()\nexcept SystemExit as ended: assert not ended.code, ended.code\n"
+        "print('torch' in sys.modules)"
+    )
+    for words in (
+        ["create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5"],
+        ["list"],
+        ["show", "d.h5"],
+        ["validate", "d.h5"],
+    ):
+        ran = subprocess.run(
+            [sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=tmp_path, check=True
+        )
+        assert ran.stdout.splitlines()[-1] == "False", words

@@ -10,7 +10,7 @@ from rich.console import Console
 from benchnav.datagen import difficulty
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 from tests.datagen.small import SOFT, small_stakes, terrain_class
 from tests.factories import tiny_dataset
 

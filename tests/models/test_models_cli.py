@@ -14,10 +14,11 @@ from benchnav.models.cli import main
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
-from benchnav.models.training import train, train_mdn
+from benchnav.models.training import classifiers
+from benchnav.models.training import mdn as mdn_training
+from benchnav.models.training.classifiers import measure_classifier
 from benchnav.models.training.data import read_maps
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
-from benchnav.models.training.train import measure_classifier
 from tests.models.support import make_dataset
 
 QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
@@ -304,7 +305,7 @@ def test_how_maps_are_read_reaches_the_training(
         seen.append((in_memory, workers))
         raise KeyboardInterrupt
 
-    module = train_mdn if kind == "mdn" else train
+    module = mdn_training if kind == "mdn" else classifiers
     monkeypatch.setattr(module, "MapData", opened)
     quick = QUICK_GP if kind == "all" else []
     for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):

@@ -3,10 +3,10 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PRICE, FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import GoalDistance
-from benchnav.terrain import Grid
 from tests import factories
 
 

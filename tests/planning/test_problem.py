@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
-from benchnav.terrain import Grid, Observation
+from benchnav.terrain import Observation
 from tests import factories
 
 BATCH, HEIGHT, WIDTH = 3, 12, 20

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
+from rich.filesize import decimal
 from rich.markup import escape
 from rich.table import Table
 
@@ -106,3 +107,12 @@ def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
         return f"{part['maps']} of {part['source']['file']}"
     recipe = described["recipes"][part["recipe"]]
     return f"{part['maps']} of {recipe['id']} {part['split']}, seed {recipe['seed']}"
+
+
+def say_written(dataset: TerrainDataset) -> None:
+    """Prints where a new dataset is, its size, its splits and their digests."""
+    files = {piece.path for split in dataset.splits for piece in dataset.pieces(split)}
+    size = decimal(sum(path.stat().st_size for path in files))
+    print(f"wrote {dataset.path} ({size}{f' in {len(files)} files' if len(files) > 1 else ''})")
+    for name, split in dataset.splits.items():
+        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")

@@ -1,29 +1,29 @@
 """Reading datasets of formats 1.0 to 1.2: a file (HDF5), or a folder of such files with one manifest.
 
-Readers open files at each call, so they may be passed to other processes. Letters in shapes: B maps.
+Readers open files at each call, so they may be passed to other processes. PyTorch is imported where Terrain is
+asked for. Letters in shapes: B maps.
 """
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-import torch
 
 from benchnav.datagen import schema
-from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import TerrainClass, twins
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import Maps
 from benchnav.errors import DatasetError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.grid import Grid
 from benchnav.shipped import shipped_folder
-from benchnav.terrain import Grid, Terrain
+
+if TYPE_CHECKING:
+    from benchnav.terrain import Terrain
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
@@ -146,8 +146,10 @@ class TerrainDataset:
             indices = range(first, min(first + size, count))
             yield indices, self.read(split, indices, names)
 
-    def terrain_chunks(self, split: str, cells: int = CHUNK_CELLS) -> Iterator[Terrain]:
+    def terrain_chunks(self, split: str, cells: int = CHUNK_CELLS) -> "Iterator[Terrain]":
         """Reads a split as Terrain, some maps at a time, as `chunks` does."""
+        from benchnav.datagen.files.terrain import terrain_of
+
         for _, maps in self.chunks(split, schema.MAP_FIELDS, cells):
             yield terrain_of(maps, self.recipe)
 
@@ -186,8 +188,10 @@ class TerrainDataset:
                     raise damage(piece.path, split, name, error) from error
             return read
 
-    def terrain(self, split: str, indices: Sequence[int] | None = None) -> Terrain:
+    def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
+        from benchnav.datagen.files.terrain import terrain_of
+
         return terrain_of(self.read(split, indices, schema.MAP_FIELDS), self.recipe)
 
     def map_count(self, split: str) -> int:
@@ -282,44 +286,6 @@ def _joined(parts: Sequence[Maps]) -> Maps:
     if len(parts) == 1:
         return parts[0]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
-    """Makes Terrain of stored arrays, float32 on the CPU.
-
-    Args:
-        maps: the fields of `schema.MAP_FIELDS`, each of shape [B, *entry shape].
-        recipe: by which they were made.
-    """
-    slope = maps["slope_deg"].astype(np.float64)
-    alike = max(len(own) for own in twins(recipe.classes)) > 1
-    return Terrain(
-        rgb=torch.from_numpy(maps["rgb"]),
-        class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
-        elevation_m=torch.from_numpy(maps["elevation_m"]),
-        slope_deg=torch.from_numpy(maps["slope_deg"]),
-        truth=_mixture(latent.truth(maps["class_id"], slope, recipe.classes), recipe.classes),
-        traversability=torch.from_numpy(maps["traversability"]),
-        grid=recipe.grid,
-        look_alikes=partial(_look_alikes, recipe.classes) if alike and recipe.synthesis > 1 else None,
-    )
-
-
-def _look_alikes(
-    classes: tuple[TerrainClass, ...], class_id: torch.Tensor, slope_deg: torch.Tensor
-) -> TraversabilityMixture:
-    slope = slope_deg.cpu().numpy().astype(np.float64)
-    parameters = latent.look_alikes(class_id.cpu().numpy(), slope, classes)
-    assert parameters is not None, "asked of a table in which no two classes look alike"
-    return _mixture(parameters, classes).to(class_id.device)
-
-
-def _mixture(parameters: latent.Parameters, classes: tuple[TerrainClass, ...]) -> TraversabilityMixture:
-    """In float32; the components of a class, one or with its soft spots two, stand next to one another."""
-    weights, means, stds = (torch.from_numpy(values.astype(np.float32)) for values in parameters)
-    per_class = 2 if any(item.soft for item in classes) else 1
-    group = tuple(k // per_class for k in range(weights.shape[1]))
-    return TraversabilityMixture(weights, means, stds, group)
 
 
 def dataset_folders() -> list[Path]:

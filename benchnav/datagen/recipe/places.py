@@ -10,7 +10,7 @@ import numpy as np
 
 from benchnav import rng
 from benchnav.errors import ConfigError
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 _STEPS_A_M = 1024
 _CANDIDATES = 256

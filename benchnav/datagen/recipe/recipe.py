@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import yaml
 
 from benchnav.datagen.recipe.classes import TerrainClass, twins
@@ -21,7 +20,7 @@ from benchnav.datagen.recipe.plain_data import parse, plain
 from benchnav.datagen.recipe.rules import check_recipe
 from benchnav.datagen.recipe.scenario import PRESETS, RECIPES, Scenario, load_presets, resolve
 from benchnav.errors import ConfigError
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 REFERENCE_M = 32.0  # side of the square that relief and crater counts of synthesis 2 are for
 
@@ -103,8 +102,10 @@ class Recipe:
 
     def cells_of(self, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
-        row, column = self.grid.cell_of(*torch.from_numpy(positions_m.astype(np.float32)).T)
-        return row.numpy(), column.numpy()
+        column, row = (
+            np.floor(positions_m.astype(np.float32) / np.float32(self.resolution_m)).astype(np.int64).T
+        )
+        return row.clip(0, self.height - 1), column.clip(0, self.width - 1)
 
     @cached_property
     def units(self) -> tuple[AlikeClasses, ...]:

@@ -38,7 +38,6 @@ from benchnav.models.quality.scores import (
 )
 from benchnav.models.quality.twins import TwinQuality, TwinTally
 from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
-from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.terrain import Terrain
 
 
@@ -226,35 +225,6 @@ def measure(
     )
 
 
-def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, float]:
-    """Measures the GPs apart from the classifier, each cell read with its true class.
-
-    Args:
-        table: the GPs over slope.
-        chunks: the maps, at least one, a few at a time.
-
-    Returns:
-        `latent_rmse` to f_c(ψ), `noise_error` (largest relative error of a class's σ_c that occurs) and
-        `nll` of λ as realised.
-    """
-    squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
-    for terrain in chunks:
-        table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
-        own = table.own(terrain.class_id, terrain.slope_deg)
-        squares += float((own.means[:, 0] - terrain.truth.means[:, 0]).double().square().sum())
-        cells += terrain.class_id.numel()
-        observed = terrain.traversability[known].unsqueeze(0)
-        surprise -= float(_choose(own, known).log_prob(observed).double().sum())
-        seen += int(known.sum())
-        ratio = table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0]
-        noise_error = max(noise_error, float((ratio - 1).abs().max()))
-    return {
-        "latent_rmse": (squares / cells) ** 0.5,
-        "noise_error": noise_error,
-        "nll": surprise / max(1, seen),
-    }
-
-
 class _ClassTally:
     """Counts of a model's class probabilities over maps."""
 
@@ -323,13 +293,6 @@ class _ClassTally:
         )
 
 
-def _choose(mixture: TraversabilityMixture, cells: Tensor) -> TraversabilityMixture:
-    """The chosen ones (bool, shape [B, H, W]) of a mixture's cells, as a map of one row: [K, 1, N]."""
-    parameters = (mixture.weights, mixture.means, mixture.stds)
-    weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
-    return TraversabilityMixture(weights, means, stds, mixture.group)
-
-
 def _score_cells(
     mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
@@ -338,8 +301,8 @@ def _score_cells(
     Cells whose λ was not observed are left out.
     """
     known = ~terrain.traversability.isnan()
-    mixture, observed = _choose(mixture, known), terrain.traversability[known].unsqueeze(0)
-    truth = _choose(terrain.truth, known).mean()
+    mixture, observed = mixture.at(known), terrain.traversability[known].unsqueeze(0)
+    truth = terrain.truth.at(known).mean()
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
     sums = [

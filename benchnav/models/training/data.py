@@ -199,6 +199,7 @@ class MapData(lightning.LightningDataModule):
         self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
         if len(self.train) < 2:
             raise DatasetError(f"Expected at least 2 training maps in {dataset.path}, got {len(self.train)}.")
+        self.digest = training_digest(dataset)
 
     def colour_statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
@@ -229,6 +230,11 @@ class MapData(lightning.LightningDataModule):
             maps, batch_size=None, sampler=sampler, generator=torch.Generator(),
             num_workers=self.workers, persistent_workers=self.workers > 0,
         )  # fmt: skip
+
+
+def training_digest(dataset: TerrainDataset) -> str:
+    """Content digest of what of a dataset is trained on."""
+    return ",".join(f"{name}:{dataset.splits[name]['digest']}" for name in (TRAIN, VALID))
 
 
 def read_maps(

@@ -12,32 +12,31 @@ import logging
 import os
 import pickle
 import signal
-import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lightning
-import pandas as pd
 import torch
-from lightning.fabric.plugins.io import TorchCheckpointIO
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from rich.console import Console
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
-from torch import Tensor
 
 from benchnav.errors import CheckpointError, ConfigError
-from benchnav.files import replacing, sole_writer, write_text
+from benchnav.files import sole_writer, write_text
+from benchnav.models.checkpoint import as_stored
+from benchnav.models.config import ClassifierConfig, MDNConfig
+from benchnav.models.training.callbacks import History, KeepBest, Progress, WholeFiles, measured
+from benchnav.models.training.data import MapData, MapDataset
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 ACCELERATORS = ("auto", "cpu", "cuda", "gpu")
+
+Network = TypeVar("Network", bound=lightning.LightningModule)
 
 _OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "barebones", "fast_dev_run"}
 _OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps"}
@@ -90,129 +89,6 @@ class FitOptions:
             )
 
 
-class KeepBest(Callback):
-    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end."""
-
-    def __init__(self) -> None:
-        """Starts with none."""
-        self.loss = float("inf")
-        self.metrics: dict[str, float] = {}
-        self.weights: dict[str, Tensor] = {}
-
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Copies the weights when they are the best so far."""
-        measured = {name: value for name, value in _measured(trainer).items() if name.startswith("valid_")}
-        if measured["valid_loss"] < self.loss:
-            self.loss, self.metrics = measured["valid_loss"], {**measured, "epoch": trainer.current_epoch + 1}
-            self.weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
-
-    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Puts the best weights back."""
-        if not self.weights:
-            raise ConfigError(
-                "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
-            )
-        module.load_state_dict(self.weights)
-        # The trainer's own metrics are what comes back from processes that it has started.
-        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in self.metrics.items()})
-
-    def state_dict(self) -> dict[str, Any]:
-        """Gives what `load_state_dict` takes."""
-        return {"loss": self.loss, "metrics": self.metrics, "weights": self.weights}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from an earlier state."""
-        self.loss, self.metrics, self.weights = state["loss"], state["metrics"], state["weights"]
-
-
-class History(Callback):
-    """Writes what was measured to a table, a row an epoch.
-
-    Args:
-        path: the table, CSV.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Starts with no rows."""
-        self.path, self.rows = path, list[dict[str, float]]()
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Adds a row."""
-        rate = float(trainer.optimizers[0].param_groups[0]["lr"])
-        row = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "learning_rate": rate}
-        self.rows.append({**row, **_measured(trainer)})
-        if trainer.is_global_zero:
-            write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Gives what `load_state_dict` takes."""
-        return {"rows": self.rows}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from an earlier state."""
-        self.rows = list(state["rows"])
-
-
-class Progress(Callback):
-    """Shows how far training is: a bar in a terminal, a line an epoch elsewhere.
-
-    Args:
-        what: what is trained.
-    """
-
-    def __init__(self, what: str) -> None:
-        """Shows nothing yet."""
-        self.what = what
-        self.bar: Bar | None = None
-
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Shows the bar where there is a terminal."""
-        console = Console(stderr=True)
-        if console.is_terminal and trainer.is_global_zero:
-            columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-            self.bar = Bar(TextColumn("{task.description}"), *columns, console=console)
-            total = int(trainer.estimated_stepping_batches)
-            self.task = self.bar.add_task(self.what, total=total, completed=trainer.global_step)
-            self.bar.start()
-
-    def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
-        """Moves the bar."""
-        if self.bar:
-            self.bar.update(self.task, completed=trainer.global_step)
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Says what the epoch brought."""
-        epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-        measured = {name: value for name, value in _measured(trainer).items() if name.startswith("valid_")}
-        shown = measured or _measured(trainer)
-        values = [f"{name.removeprefix('valid_')} {value:.4f}" for name, value in shown.items()]
-        if self.bar:
-            self.bar.update(self.task, description=f"{epoch}, {values[0]}")
-        elif trainer.is_global_zero:
-            print(", ".join([epoch, *values]), file=sys.stderr, flush=True)
-
-    def teardown(self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str) -> None:
-        """Ends the bar, also when training was interrupted."""
-        if self.bar:
-            self.bar.stop()
-
-
-class WholeFiles(TorchCheckpointIO):
-    """Writes a Lightning checkpoint whole or not at all, also where temporary files are on another disk."""
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Writes it beside its name, then renames it."""
-        with replacing(Path(path), durable=False) as partial:
-            torch.save(checkpoint, partial)
-
-
 def fit(
     module: lightning.LightningModule,
     part: str,
@@ -251,7 +127,7 @@ def fit(
         if folder is None:
             lightning_trainer = _trainer(callbacks, logger=False, enable_checkpointing=False, **chosen)
             _run(lightning_trainer, module, data, None)
-            return _measured(lightning_trainer)
+            return measured(lightning_trainer)
         with sole_writer(folder, f"{folder}") if is_first_process() else nullcontext():
             folder.mkdir(parents=True, exist_ok=True)
             state = _prepare(folder, options.resume, {**settings, "precision": chosen["precision"]})
@@ -265,7 +141,55 @@ def fit(
                 **chosen,
             )
             _run(lightning_trainer, module, data, state)
-            return _measured(lightning_trainer)
+            return measured(lightning_trainer)
+
+
+def fit_network(
+    network: Network,
+    part: str,
+    config: ClassifierConfig | MDNConfig,
+    data: MapData,
+    seed: int,
+    options: FitOptions,
+    half_precision: bool,
+    measure: Callable[[Network, MapDataset], dict[str, float]],
+) -> dict[str, float]:
+    """Trains a network in place until the split `valid` no longer gains, and leaves it on the CPU.
+
+    Args:
+        network: what to train.
+        part: name of the part of a model that it is.
+        config: its settings.
+        data: the maps.
+        seed: root seed of weights, order and augmentation.
+        options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
+        half_precision: whether its kernels will be kept as float16, to which they are rounded before it is measured.
+        measure: measures it on maps, as training does.
+
+    Returns:
+        What was measured on `valid` in the best epoch, whose weights it has.
+    """
+    stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
+    metrics = fit(
+        network,
+        part,
+        options,
+        {"config": asdict(config), "data": data.digest, "seed": seed},
+        [KeepBest(), stopping],
+        {"datamodule": data},
+        max_epochs=config.max_epochs,
+    )
+    network.cpu().eval()
+    if half_precision:
+        network.load_state_dict(as_stored(network.state_dict(), half_precision))
+        metrics = {**metrics, **measure(network, data.valid)}
+    return metrics
+
+
+def say(line: str) -> None:
+    """Prints a line once, also where several processes train together."""
+    if is_first_process():
+        print(line)
 
 
 def is_first_process() -> bool:
@@ -360,10 +284,6 @@ def _trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
         MisconfigurationException,
     ) as error:
         raise ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {error}") from error
-
-
-def _measured(trainer: lightning.Trainer) -> dict[str, float]:
-    return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
 @contextmanager

@@ -22,12 +22,12 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, stage_cost
 from benchnav.planning.robots import Robot
-from benchnav.terrain import Grid
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10

@@ -14,9 +14,10 @@ from torch import Tensor
 from benchnav import rng
 from benchnav.copula import LONGEST_CORRELATION, correlated_normal
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import World
-from benchnav.terrain import Grid, Terrain
+from benchnav.terrain import Terrain
 
 MOST_ATTEMPTS = 100
 

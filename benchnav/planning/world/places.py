@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import label
 from torch import Tensor
 
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 
 @dataclass(frozen=True, kw_only=True)

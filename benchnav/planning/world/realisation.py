@@ -14,11 +14,12 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.world.frozen import draw_frozen
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.world import World
-from benchnav.terrain import Grid, Terrain
+from benchnav.terrain import Terrain
 
 
 class Realisation:

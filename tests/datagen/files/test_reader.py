@@ -8,7 +8,8 @@ import torch
 
 from benchnav.datagen import schema
 from benchnav.datagen.files import reader
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset, terrain_of
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.files.terrain import terrain_of
 from benchnav.datagen.recipe import classes
 from benchnav.datagen.synth.generate import generate
 from benchnav.errors import DatasetError

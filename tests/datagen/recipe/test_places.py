@@ -11,7 +11,7 @@ from benchnav.datagen.recipe.places import PlacesRule, check_places, draw_places
 from benchnav.datagen.recipe.recipe import Split, load_recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import generate
 from benchnav.errors import ConfigError
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 from tests.datagen.small import small_stakes
 
 KEY = rng.stream_key(0, "places")

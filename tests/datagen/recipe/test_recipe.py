@@ -1,7 +1,11 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
 from benchnav.datagen.recipe.scenario import Scenario, blend
@@ -61,3 +65,18 @@ def test_bad_recipes_give_one_line_that_names_the_key(change: dict, expected: st
 def test_a_recipe_that_is_not_there_lists_those_that_are() -> None:
     with pytest.raises(ConfigError, match=r"paper-v1.*no-such"):
         load_recipe("no-such")
+
+
+@given(
+    st.lists(st.tuples(st.floats(-5, 40, width=32), st.floats(-5, 40, width=32)), min_size=1, max_size=9),
+    st.sampled_from([0.25, 0.3, 0.5, 0.7]),
+)
+def test_positions_lie_in_the_cells_that_a_robot_finds_itself_in(
+    places: list[tuple[float, float]], resolution: float
+) -> None:
+    size = ["height=64", "width=48", f"resolution_m={resolution}"]
+    recipe = load_recipe("tiny-v1", ["id=mine", *size, "goal_m=[8,8]"])
+    positions = np.array(places)
+    wanted = recipe.grid.cell_of(*torch.from_numpy(positions.astype(np.float32)).T)
+    for found, cells in zip(recipe.cells_of(positions), wanted, strict=True):
+        np.testing.assert_array_equal(found, cells.numpy())

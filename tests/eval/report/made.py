@@ -11,7 +11,7 @@ from benchnav.eval.report.recorded.drawn_plan import drawn_plan
 from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.stats.best import against_best, told_the_truth
 from benchnav.eval.stats.summary import LABELS, summarise
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 PAPER = {
     "world": {"noise": "resampled", "time_budget_s": 100.0},

@@ -8,8 +8,8 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.training.classifiers import fit_classifier
 from benchnav.models.training.fit import FitOptions, KeepBest
-from benchnav.models.training.train import fit_classifier
 
 CPU = FitOptions(trainer={"precision": "32-true", "accelerator": "cpu"})
 MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])

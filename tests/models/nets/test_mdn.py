@@ -14,6 +14,7 @@ from torch import Tensor
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import CheckpointError, ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint
 from benchnav.models.cli import main
@@ -26,11 +27,13 @@ from benchnav.models.nets.mdn import (
     censored_nll,
 )
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
-from benchnav.models.training import train_mdn
+from benchnav.models.training import fit as fit_module
+from benchnav.models.training import mdn as mdn_training
+from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, KeepBest
-from benchnav.models.training.train_mdn import fit_mdn, measure_network
-from benchnav.terrain import Grid, Observation, Terrain
+from benchnav.models.training.fit import FitOptions
+from benchnav.models.training.mdn import fit_mdn, measure_network
+from benchnav.terrain import Observation, Terrain
 from tests.factories import normal
 from tests.models.support import make_terrain
 
@@ -329,7 +332,7 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     whole, metrics = fit_mdn(SMALL, dataset, 3, FitOptions(trainer=CPU))
     assert set(metrics) == {"train_loss", "valid_loss", "valid_rmse", "epoch"}
     with monkeypatch.context() as patch:
-        patch.setattr(train_mdn, "KeepBest", KillInTheThirdEpoch)
+        patch.setattr(fit_module, "KeepBest", KillInTheThirdEpoch)
         with pytest.raises(Killed):
             fit_mdn(SMALL, dataset, 3, FitOptions(folder=tmp_path, trainer=CPU))
     torch.manual_seed(99)  # what the global generator holds must not matter
@@ -367,7 +370,7 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
             super().__init__(*arguments, **named)
             jitters.append(self.jitter)
 
-    monkeypatch.setattr(train_mdn, "MapData", Watched)
+    monkeypatch.setattr(mdn_training, "MapData", Watched)
     network, _ = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU))
     assert jitters == [SMALL.jitter]
     slopes = torch.from_numpy(dataset.read("train", fields=["slope_deg"])["slope_deg"])

@@ -19,7 +19,7 @@ from benchnav.models.slope_gp.gp import LatentGPs
 from benchnav.models.slope_gp.likelihood import expected_log_prob
 from benchnav.models.slope_gp.sums import SlopeSums
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
-from benchnav.models.training.train import fit_gps
+from benchnav.models.training.gps import fit_gps
 from tests.models.support import NOISE, latent, linear_table, make_cells, make_sums
 
 STEEPEST = 25.0

@@ -11,7 +11,7 @@ from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import cell_nll, hold_out
 from benchnav.models.slope_gp.slip_logs import read_slip_logs
 from benchnav.models.slope_gp.sums import SlopeSums
-from benchnav.models.training.train import fit_gps
+from benchnav.models.training.gps import fit_gps
 from tests.models.support import make_cells
 
 GOOD = "class,slope_deg,traversability,note\nsand,3.5,0.9,x\nrock,10,1,y\nsand,,0.5,\nsand,4,NaN,\nNA,0,0,\n"

@@ -20,11 +20,11 @@ from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.training import fit as fit_module
-from benchnav.models.training import train as training
+from benchnav.models.training.callbacks import KeepBest
+from benchnav.models.training.classifiers import fit_classifier
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
+from benchnav.models.training.fit import FitOptions, default_precision, fit
 from benchnav.models.training.temperature import fit_temperature, sample_logits
-from benchnav.models.training.train import fit_classifier
 
 CPU = {"precision": "32-true", "accelerator": "cpu"}
 SMALL = ClassifierConfig(encoder="mobilenet_v2", max_epochs=4, batch_size=4, jitter=0.2)
@@ -62,7 +62,7 @@ def whole(
 @pytest.fixture
 def cut(dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of a training that was killed in its third epoch."""
-    monkeypatch.setattr(training, "KeepBest", KillIn)
+    monkeypatch.setattr(fit_module, "KeepBest", KillIn)
     with pytest.raises(Killed):
         train(dataset, tmp_path)
     monkeypatch.undo()

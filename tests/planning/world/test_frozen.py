@@ -9,11 +9,12 @@ from scipy import stats
 
 from benchnav import rng
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.world.frozen import draw_frozen
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import Immobile, World
-from benchnav.terrain import Grid, Terrain
+from benchnav.terrain import Terrain
 from tests import factories
 
 KEY = rng.stream_key(0, "luck")

@@ -12,7 +12,7 @@ import numpy as np
 from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
 from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 START, GOAL = (230, 30, 30), (255, 0, 255)
 

@@ -16,7 +16,7 @@ from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, join_plans, spli
 from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S, Snapshot
 from benchnav.eval.report.recorded.version2 import DAMAGE, is_snapshot, read_snapshot
 from benchnav.files import replacing
-from benchnav.terrain import Grid
+from benchnav.grid import Grid
 
 _ARRAYS = (
     *("rgb", "elevation_m", "true_mean", "predicted", "free", "soft", "holding"),

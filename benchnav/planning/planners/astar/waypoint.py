@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchnav.grid import Grid
 from benchnav.planning.free_space import PRICE
 from benchnav.planning.problem import Problem
-from benchnav.terrain import Grid
 
 # A straight line may cost this much more than the path that it shortens.
 _SHORT_CUT = 1.1

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.check.boundary import NOT_FINITE, find_fault, find_layer_faults
@@ -21,7 +22,7 @@ from benchnav.planning.planners.check.side_effects import NOTHING, same, watch
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Robot
-from benchnav.terrain import Grid, Observation
+from benchnav.terrain import Observation
 
 SHAPES = ((24, 24), (20, 33))
 TOLERANCE = 1e-3

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from benchnav import gridgraph
+from benchnav.grid import Grid
 from benchnav.planning.free_space import PRICE
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.terrain import Grid
 from tests import factories
 
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchnav.grid import Grid
 from benchnav.planning.free_space import PRICE
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs, line_costs
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
-from benchnav.terrain import Grid
 from tests import factories
 from tests.planning.planners.driving import generator
 

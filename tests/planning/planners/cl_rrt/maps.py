@@ -5,11 +5,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchnav.grid import Grid
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Robot
-from benchnav.terrain import Grid
 from tests import factories
 
 GRID = Grid(32, 32, 0.5)

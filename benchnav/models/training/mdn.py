@@ -3,16 +3,14 @@
 from dataclasses import asdict
 
 import torch
-from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.mixture import TraversabilityMixture
-from benchnav.models.checkpoint import as_stored
+from benchnav.models.checkpoint import Part
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MDN, MixtureDensityNetwork, censored_nll
-from benchnav.models.training.data import MapData, MapDataset
-from benchnav.models.training.fit import FitOptions, KeepBest, fit
-from benchnav.models.training.train import training_digest
+from benchnav.models.training.data import MapData, MapDataset, training_digest
+from benchnav.models.training.fit import FitOptions, fit_network, say
 
 _DEFAULT = FitOptions()
 
@@ -46,20 +44,7 @@ def fit_mdn(
     cells = len(data.train) * data.train.shape[0] * data.train.shape[1]
     scale = (torch.as_tensor(squares) / cells).sqrt().clamp(min=1).float()
     network = MixtureDensityNetwork(config, *data.colour_statistics(), scale, seed)
-    stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
-    metrics = fit(
-        network,
-        MDN,
-        options,
-        {"config": asdict(config), "data": training_digest(dataset), "seed": seed},
-        [KeepBest(), stopping],
-        {"datamodule": data},
-        max_epochs=config.max_epochs,
-    )
-    network.cpu().eval()
-    if half_precision:
-        network.load_state_dict(as_stored(network.state_dict(), half_precision))
-        metrics = {**metrics, **measure_network(network, data.valid)}
+    metrics = fit_network(network, MDN, config, data, seed, options, half_precision, measure_network)
     return network, metrics
 
 
@@ -82,3 +67,23 @@ def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[st
             squares += float(gap.double().square().sum())
             cells += count
     return {"valid_loss": loss / max(1, cells), "valid_rmse": (squares / max(1, cells)) ** 0.5}
+
+
+def train_mdn_part(
+    config: MDNConfig, dataset: TerrainDataset, seed: int, options: FitOptions, half_precision: bool
+) -> Part:
+    """Trains a network and gives it as a part of a checkpoint."""
+    network, metrics = fit_mdn(config, dataset, seed, options, half_precision)
+    say(
+        f"mdn: best epoch {metrics['epoch']:.0f}, validation NLL {metrics['valid_loss']:.4f}, "
+        f"RMSE {metrics['valid_rmse']:.4f}"
+    )
+    return Part(
+        config=asdict(config),
+        tensors=dict(network.state_dict()),
+        seed=seed,
+        metrics=metrics,
+        data_id=dataset.id,
+        data_digest=training_digest(dataset),
+        half_precision=half_precision,
+    )

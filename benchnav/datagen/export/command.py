@@ -1,0 +1,57 @@
+"""The command `export`: a dataset for other tools.
+
+This module imports nothing heavy, so that the command's help is quick.
+"""
+
+from pathlib import Path
+
+
+def export(
+    file: str,
+    out: str,
+    splits: list[str] | None = None,
+    fields: list[str] | None = None,
+    maps_per_file: int = 0,
+    license: str = "",
+    creator: str = "",
+    url: str = "",
+    date: str = "",
+    overwrite: bool = False,
+) -> None:
+    """Export a dataset to Parquet files with Croissant metadata, which other tools read without this package.
+
+    Args:
+        file: Path or id of a dataset.
+        out: Folder to write.
+        splits: Only these splits, for example [test/std,test/hg].
+        fields: Only these fields, for example [rgb,class_id].
+        maps_per_file: Most maps of a file; 0 makes files of a few hundred MB at most.
+        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; MIT when not given. Imported maps need one.
+        creator: Who made the maps; the BenchNav authors when not given. Imported maps need one.
+        url: Where the dataset will be found.
+        date: Date of publication, YYYY-MM-DD; today when not given.
+        overwrite: Replace an exported dataset that is there.
+    """
+    from rich.filesize import decimal
+
+    from benchnav.command import show_progress
+    from benchnav.datagen.export.croissant import AUTHORS, Publication
+    from benchnav.datagen.export.export import export as export_dataset
+    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+    from benchnav.errors import ConfigError
+
+    dataset = TerrainDataset(find_dataset(file))
+    chosen = dataset.splits if splits is None else [name for name in splits if name in dataset.splits]
+    imported = any("source" in part for name in chosen for part in dataset.splits[name]["parts"])
+    if imported and not (license and creator):
+        raise ConfigError(
+            f"Expected `license` and `creator` of {dataset.id}, whose maps were imported, got none. Pass those of "
+            "the elevation model, its classes and photo."
+        )
+    publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
+    path = Path(out).expanduser()
+    steps = export_dataset(dataset, path, publication, splits, fields, maps_per_file, overwrite)
+    show_progress(steps, "maps")
+    files = sorted(path.rglob("*.parquet"))
+    size = decimal(sum(item.stat().st_size for item in files))
+    print(f"wrote {path} ({size} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)")

@@ -1,0 +1,51 @@
+"""Stored maps as Terrain, with the true distribution of λ in each cell. Letters in shapes: B maps."""
+
+from functools import partial
+
+import numpy as np
+import torch
+
+from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.classes import TerrainClass, twins
+from benchnav.datagen.recipe.recipe import Recipe
+from benchnav.datagen.synth.generate import Maps
+from benchnav.mixture import TraversabilityMixture
+from benchnav.terrain import Terrain
+
+
+def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
+    """Makes Terrain of stored arrays, float32 on the CPU.
+
+    Args:
+        maps: the fields of `schema.MAP_FIELDS`, each of shape [B, *entry shape].
+        recipe: by which they were made.
+    """
+    slope = maps["slope_deg"].astype(np.float64)
+    alike = max(len(own) for own in twins(recipe.classes)) > 1
+    return Terrain(
+        rgb=torch.from_numpy(maps["rgb"]),
+        class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
+        elevation_m=torch.from_numpy(maps["elevation_m"]),
+        slope_deg=torch.from_numpy(maps["slope_deg"]),
+        truth=_mixture(latent.truth(maps["class_id"], slope, recipe.classes), recipe.classes),
+        traversability=torch.from_numpy(maps["traversability"]),
+        grid=recipe.grid,
+        look_alikes=partial(_look_alikes, recipe.classes) if alike and recipe.synthesis > 1 else None,
+    )
+
+
+def _look_alikes(
+    classes: tuple[TerrainClass, ...], class_id: torch.Tensor, slope_deg: torch.Tensor
+) -> TraversabilityMixture:
+    slope = slope_deg.cpu().numpy().astype(np.float64)
+    parameters = latent.look_alikes(class_id.cpu().numpy(), slope, classes)
+    assert parameters is not None, "asked of a table in which no two classes look alike"
+    return _mixture(parameters, classes).to(class_id.device)
+
+
+def _mixture(parameters: latent.Parameters, classes: tuple[TerrainClass, ...]) -> TraversabilityMixture:
+    """In float32; the components of a class, one or with its soft spots two, stand next to one another."""
+    weights, means, stds = (torch.from_numpy(values.astype(np.float32)) for values in parameters)
+    per_class = 2 if any(item.soft for item in classes) else 1
+    group = tuple(k // per_class for k in range(weights.shape[1]))
+    return TraversabilityMixture(weights, means, stds, group)

@@ -1,0 +1,35 @@
+"""How well class-wise GPs know the ground, apart from any classifier."""
+
+from collections.abc import Iterable
+
+from benchnav.models.slope_gp.table import SlopeTable
+from benchnav.terrain import Terrain
+
+
+def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, float]:
+    """Measures the GPs apart from the classifier, each cell read with its true class.
+
+    Args:
+        table: the GPs over slope.
+        chunks: the maps, at least one, a few at a time.
+
+    Returns:
+        `latent_rmse` to f_c(ψ), `noise_error` (largest relative error of a class's σ_c that occurs) and
+        `nll` of λ as realised.
+    """
+    squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
+    for terrain in chunks:
+        table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
+        own = table.own(terrain.class_id, terrain.slope_deg)
+        squares += float((own.means[:, 0] - terrain.truth.means[:, 0]).double().square().sum())
+        cells += terrain.class_id.numel()
+        observed = terrain.traversability[known].unsqueeze(0)
+        surprise -= float(own.at(known).log_prob(observed).double().sum())
+        seen += int(known.sum())
+        ratio = table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0]
+        noise_error = max(noise_error, float((ratio - 1).abs().max()))
+    return {
+        "latent_rmse": (squares / cells) ** 0.5,
+        "noise_error": noise_error,
+        "nll": surprise / max(1, seen),
+    }

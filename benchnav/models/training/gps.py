@@ -1,0 +1,149 @@
+"""Training the class-wise GPs of a fused model, on maps or on a robot's slip logs."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
+from benchnav.models.config import LatentGPConfig
+from benchnav.models.slope_gp.cells import cell_nll, hold_out
+from benchnav.models.slope_gp.gp import LatentGPs, load_batches
+from benchnav.models.slope_gp.measure import measure_latent
+from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
+from benchnav.models.slope_gp.sums import SlopeSums, sum_split
+from benchnav.models.training.data import TRAIN, VALID, training_digest
+from benchnav.models.training.fit import FitOptions, fit, say
+from benchnav.models.training.target import open_target
+
+_DEFAULT = FitOptions()
+_HELD_OUT = 0.1  # of slip logs
+_FEW_ROWS = 10  # of a class in slip logs
+
+
+def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFAULT) -> LatentGPs:
+    """Trains the class-wise GPs on sums over cells, in float64 on one device; nothing is drawn.
+
+    Args:
+        config: what to train.
+        sums: of the cells of all classes, from maps or from a robot's logs.
+        options: how to train; of the trainer's settings the accelerator alone counts.
+
+    Returns:
+        The GPs, on the CPU.
+    """
+    censored = config.likelihood == "censored"
+    soft, bins = None, sums.bins(censored)
+    if config.second_component and censored:
+        soft, share = find_soft_modes(sums)
+        bins = main_bins(sums, soft, share) if soft else bins
+    model = LatentGPs(config, len(sums.count), sums.steepest_deg, soft)
+    accelerator = {name: value for name, value in options.trainer.items() if name == "accelerator"}
+    fit(
+        model,
+        GP,
+        FitOptions(trainer=accelerator),
+        {},
+        [],
+        {"train_dataloaders": load_batches(config, bins)},
+        max_epochs=config.epochs,
+        precision="64-true",
+    )
+    return model.cpu().eval()
+
+
+def train_gps_on_maps(
+    config: LatentGPConfig, dataset: TerrainDataset, seed: int, options: FitOptions
+) -> Part:
+    """Trains the GPs on the split `train` and gives them as a part of a checkpoint."""
+
+    model = fit_gps(config, sum_split(dataset, TRAIN), options)
+    _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
+    measured = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID))
+    metrics = {f"valid_{name}": value for name, value in measured.items()}
+    say(
+        f"gp: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
+        f"noise {metrics['valid_noise_error']:.1%}, NLL {metrics['valid_nll']:.4f}"
+    )
+    return Part(
+        config={**asdict(config), "steepest_deg": model.steepest_deg},
+        tensors=model.to_tensors(),
+        seed=seed,
+        metrics=metrics,
+        data_id=dataset.id,
+        data_digest=training_digest(dataset),
+    )
+
+
+def train_gps_on_logs(
+    data: str, out: str, config: LatentGPConfig, seed: int, options: FitOptions, overwrite: bool
+) -> None:
+    """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
+    logs = read_slip_logs(data)
+    there = load_checkpoint(out) if (Path(out) / CONFIG).is_file() else None
+    names = there.class_names if there else logs.class_names
+    cells = logs.cells(names)
+    sums = SlopeSums.of(cells, len(names))
+    target = open_target(
+        Path(out), Checkpoint(class_names=names), [GP], f"file:{logs.digest}", options, overwrite
+    )
+    counts = dict(zip(names, sums.count.tolist(), strict=True))
+    _warn_of_rows(data, counts, out if there and GP in there.parts else "")
+    metrics = {}
+    if max(counts.values()) >= 1 / _HELD_OUT:
+        kept, held = hold_out(cells, _HELD_OUT, seed)
+        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options)
+        metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
+        say(f"gp: NLL of {len(held)} rows held out {metrics['held_out_nll']:.4f}; now with all rows")
+    model = fit_gps(config, sums, options)
+    _say_soft_modes(model, names)
+    seen = ", ".join(f"{name} {count}" for name, count in counts.items())
+    say(f"gp: rows learned from: {seen}")
+    part = Part(
+        config={**asdict(config), "steepest_deg": model.steepest_deg},
+        tensors=model.to_tensors(),
+        seed=seed,
+        metrics=metrics,
+        data_id=Path(data).name,
+        data_digest=f"file:{logs.digest}",
+    )
+    target.add(GP, part)
+
+
+def _warn_of_rows(data: str, counts: Mapping[str, int], replaced: str) -> None:
+    """Names the classes that a file of slip logs says little or nothing of.
+
+    Args:
+        data: the file.
+        counts: rows by class.
+        replaced: the checkpoint whose GPs the new ones replace; empty where there are none.
+    """
+    if missing := [name for name, count in counts.items() if not count]:
+        lost = f", and what {replaced} had learned of them is dropped" if replaced else ""
+        _warn(
+            f"{data} has no rows of {len(missing)} of {len(counts)} classes ({', '.join(missing)}); their GPs become "
+            f"the prior, which is vague{lost}"
+        )
+    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
+        _warn(
+            f"{data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what is predicted of them "
+            "is little more than the prior"
+        )
+
+
+def _warn(line: str) -> None:
+    print(f"benchnav-train: warning: {line}", file=sys.stderr)
+
+
+def _say_soft_modes(model: LatentGPs, class_names: Sequence[str]) -> None:
+    """Names the classes that were found to have a second mode."""
+    if model.soft is None:
+        return
+    numbers = (values.tolist() for values in (model.soft.weight, model.soft.mean, model.soft.std))
+    modes = zip(class_names, *numbers, strict=True)
+    listed = [
+        f"{name} {weight:.1%} of N({mean:.3f}, {std:.3f})" for name, weight, mean, std in modes if weight
+    ]
+    say(f"gp: soft spots of {', '.join(listed)}")
