@@ -100,11 +100,15 @@ def place_craters(
     radii = np.exp(low + (high - low) * draws[..., 2])
     kept = np.zeros_like(radii)
     for i in range(tries):
+        wanted = (kept > 0).sum(axis=1) < count
+        if not wanted.any():
+            break
         gap = np.hypot(*np.moveaxis(centres[:, :i] - centres[:, i : i + 1], -1, 0))
         apart = ((kept[:, :i] == 0) | (gap > kept[:, :i] + radii[:, i : i + 1])).all(axis=1)
-        wanted = (kept[:, :i] > 0).sum(axis=1) < count
         kept[:, i] = np.where(apart & wanted, radii[:, i], 0)
-    return centres, kept
+    # Those that were placed first, in their order.
+    order = np.argsort(kept == 0, axis=1, kind="stable")[:, : (kept > 0).sum(axis=1).max(initial=0)]
+    return np.take_along_axis(centres, order[..., None], axis=1), np.take_along_axis(kept, order, axis=1)
 
 
 def crater_elevation(
@@ -131,8 +135,6 @@ def crater_elevation(
     added = np.zeros((len(radii_m), *shape))
     for i in range(radii_m.shape[1]):
         radius = radii_m[:, i, None, None]
-        if not radius.any():
-            continue
         centre_x, centre_y = (centres_m[:, i, k, None, None] for k in (0, 1))
         distance = np.hypot(x[None, None, :] - centre_x, y[None, :, None] - centre_y)
         ratio = distance / np.where(radius > 0, radius, 1)
