@@ -46,8 +46,9 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
     recording = drivers[0].recording
     edges = [driver.entity("/map/closed") for driver in drivers]
     own = edges if len(drivers) == 1 else []
+    colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
     views = {
-        "Colour, soft ground hatched": ["/map/colour", "/map/soft/**", _ALL, _PLACES],
+        colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
         "Mean λ in truth": ["/map/true_mean", *own, _ALL, _PLACES],
     }
     if recording.field is not None:

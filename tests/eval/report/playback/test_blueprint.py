@@ -1,5 +1,7 @@
 from dataclasses import replace
 
+import numpy as np
+
 from benchnav.eval.report.playback.blueprint import arrange, map_views
 from benchnav.eval.report.playback.rerun_file import drivers_of
 from tests.eval.report import made
@@ -29,7 +31,15 @@ def test_each_planner_is_seen_on_what_it_was_given() -> None:
         "/map/risk/trials/mean", "/map/overlay/trials/mean/**", "/map/places/**"
     ]  # fmt: skip
     assert views["λ̂ given to cvar:0.9, free: mean λ above 0.1"][0] == "/map/risk/trials/cvar\\:0.9"
-    assert views["Colour, soft ground hatched"] == ["/map/colour", "/map/soft/**", *OVERLAY]
+    assert views["Colour"] == ["/map/colour", "/map/soft/**", *OVERLAY]
+
+
+def test_hatching_is_named_where_there_is_some() -> None:
+    hard = made.recording(10)
+    soft = replace(hard, soft=np.ones_like(hard.soft))
+    assert [next(iter(map_views(drivers_of([one])))) for one in (hard, soft)] == [
+        "Colour", "Colour, soft ground hatched"
+    ]  # fmt: skip
 
 
 def test_the_blueprint_has_all_of_them() -> None:
