@@ -14,7 +14,6 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import ndtri
 
 if TYPE_CHECKING:
     import torch
@@ -68,6 +67,8 @@ def uniform(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.nd
 
 def normal(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
     """Draws standard normals by inversion, float64, shape [B, *shape]."""
+    from scipy.special import ndtri
+
     drawn = uniform(key, indices, shape)
     return ndtri(drawn, out=drawn)
 

@@ -105,12 +105,12 @@ def list_datasets(folder: str = "") -> None:
         folder: Where to look for files; where ids are looked up when not given.
     """
     from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset, dataset_folders
-    from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
+    from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
     from benchnav.errors import DatasetError
 
     print("recipes:")
     for name in shipped_recipes():
-        sizes = ", ".join(f"{split} {spec.maps}" for split, spec in load_recipe(name).splits.items())
+        sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
         print(f"  {name:12} {sizes}")
     if folder and not Path(folder).is_dir():
         raise DatasetError(f"Expected `folder` to be one, got {folder!r}.")

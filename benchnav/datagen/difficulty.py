@@ -14,7 +14,7 @@ from rich.table import Table
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.synth.generate import Maps
+from benchnav.datagen.schema import Maps
 from benchnav.grid import Grid
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")

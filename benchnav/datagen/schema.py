@@ -20,6 +20,8 @@ MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
 
+Maps = dict[str, np.ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
+
 
 @dataclass(frozen=True)
 class Field:

@@ -23,8 +23,8 @@ from benchnav.datagen.files.folder import Contents, take_place, write_manifest
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard
 from benchnav.datagen.files.writer import is_one_file, named_errors, pack
 from benchnav.datagen.recipe.recipe import Recipe, Split
-from benchnav.datagen.schema import FIELDS, quantise
-from benchnav.datagen.synth.generate import Maps, class_map, complete, reference_time_s
+from benchnav.datagen.schema import FIELDS, Maps, quantise
+from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 from benchnav.errors import DatasetError
 from benchnav.files import sole_writer
 

@@ -19,7 +19,7 @@ import numpy as np
 from benchnav.datagen.dem.raster import Lattice, Layer, Raster, opened
 from benchnav.datagen.dem.tiling import Run, Tiling, cut
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.synth.generate import Maps
+from benchnav.datagen.schema import Maps
 from benchnav.errors import ConfigError, DatasetError
 
 _SLACK = 1e-3  # of a cell that an extent may fall short by

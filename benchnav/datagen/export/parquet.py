@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.synth.generate import Maps
+from benchnav.datagen.schema import Maps
 from benchnav.errors import DatasetError
 
 MAP = "map"

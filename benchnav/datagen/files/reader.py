@@ -17,7 +17,7 @@ import numpy as np
 
 from benchnav.datagen import schema
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
-from benchnav.datagen.synth.generate import Maps
+from benchnav.datagen.schema import Maps
 from benchnav.errors import DatasetError
 from benchnav.grid import Grid
 from benchnav.shipped import shipped_folder

@@ -8,7 +8,7 @@ import torch
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import TerrainClass, twins
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.synth.generate import Maps
+from benchnav.datagen.schema import Maps
 from benchnav.mixture import TraversabilityMixture
 from benchnav.terrain import Terrain
 

@@ -8,7 +8,6 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 """
 
 import numpy as np
-from scipy.special import ndtr
 
 from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, twins
 
@@ -93,7 +92,7 @@ def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
     The integral of 1 − Φ from 0 to 1; `TraversabilityMixture.mean` says the same for mixtures of tensors.
     """
     below = (np.array([[1.0], [0.0]]) - mean.ravel()) / std.ravel()
-    integral = below * ndtr(below) + np.exp(-0.5 * below * below) / np.sqrt(2 * np.pi)
+    integral = below * _probability(below) + np.exp(-0.5 * below * below) / np.sqrt(2 * np.pi)
     return 1 - std * (integral[0] - integral[1]).reshape(mean.shape)
 
 
@@ -117,7 +116,7 @@ def quantile_of(parameters: Parameters, normal: np.ndarray) -> np.ndarray:
     mixed = weights.max(axis=1) < 1
     if mixed.any():
         own = tuple(np.moveaxis(values, 1, 0)[:, mixed] for values in parameters)
-        value[mixed] = _bisected_quantile(own, ndtr(normal[mixed]))
+        value[mixed] = _bisected_quantile(own, _probability(normal[mixed]))
     return value
 
 
@@ -126,10 +125,17 @@ def _bisected_quantile(parameters: tuple[np.ndarray, ...], rank: np.ndarray) -> 
     weights, means, stds = parameters
 
     def below(value: np.ndarray | float) -> np.ndarray:
-        return (weights * ndtr((value - means) / stds)).sum(axis=0)
+        return (weights * _probability((value - means) / stds)).sum(axis=0)
 
     low, width = np.zeros_like(rank), 1.0
     for _ in range(_BISECTIONS):
         width /= 2
         low = np.where(below(low + width) < rank, low + width, low)
     return np.where(below(0.0) >= rank, 0.0, np.where(below(1.0) <= rank, 1.0, low + width / 2))
+
+
+def _probability(z: np.ndarray) -> np.ndarray:
+    """Φ(z)."""
+    from scipy.special import ndtr  # imported here: a dataset is listed and shown without
+
+    return ndtr(z)

@@ -3,6 +3,7 @@
 import re
 import sys
 from copy import deepcopy
+from functools import cache
 from typing import Any
 
 from benchnav.errors import ConfigError
@@ -19,16 +20,24 @@ def parse(kind: type, data: Any) -> Any:
     Raises:
         ConfigError: a key is unknown or missing, or a value is not of its type; one line.
     """
-    from jsonargparse import ArgumentError, ArgumentParser
+    from jsonargparse import ArgumentError
 
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument("--value", type=kind, required=True)
+    parser = _parser(kind)
     try:
         return parser.instantiate_classes(parser.parse_object({"value": deepcopy(data)})).value
     except (ArgumentError, TypeError, ValueError) as error:
         # "value" is the parser's name for the whole, not a key that the user wrote.
         message = re.sub(r"\bvalue\.", "", " ".join(str(error).split())).replace("Group 'value'", "It")
         raise ConfigError(_about_unknown_key(kind, message) or message) from error
+
+
+@cache
+def _parser(kind: type) -> Any:
+    from jsonargparse import ArgumentParser
+
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_argument("--value", type=kind, required=True)
+    return parser
 
 
 def plain(value: Any) -> Any:

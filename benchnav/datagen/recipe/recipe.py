@@ -226,6 +226,12 @@ def shipped_recipes() -> list[str]:
     return sorted(path.stem for path in RECIPES.glob("*.yaml") if path != PRESETS)
 
 
+def shipped_sizes(recipe: str) -> dict[str, int]:
+    """Maps by split of a shipped recipe, read without all that is to be checked of it."""
+    splits = yaml.safe_load((RECIPES / f"{recipe}.yaml").read_text())["splits"]
+    return {split: entry["maps"] for split, entry in splits.items()}
+
+
 def _with_class_table(data: Any) -> Any:
     """Puts the shipped class table in the place of `default`, or of none."""
     if not isinstance(data, dict) or data.get("classes", "default") != "default":

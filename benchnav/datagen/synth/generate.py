@@ -11,7 +11,7 @@ from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
 from benchnav.datagen.recipe.scenario import Scenario
-from benchnav.datagen.schema import FIELDS, quantise
+from benchnav.datagen.schema import FIELDS, Maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.noise import fractal_perlin
 from benchnav.datagen.synth.slope import framed, framed_gradient, inclination_deg
@@ -20,8 +20,6 @@ from benchnav.errors import ConfigError
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
 _PIECE_CELLS = 2**20
-
-Maps = dict[str, np.ndarray]
 
 
 def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes, shipped_sizes
 from benchnav.datagen.recipe.scenario import Scenario, blend
 from benchnav.errors import ConfigError
 
@@ -67,6 +67,7 @@ def test_a_recipe_that_is_not_there_lists_those_that_are() -> None:
         load_recipe("no-such")
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.floats(-5, 40, width=32), st.floats(-5, 40, width=32)), min_size=1, max_size=9),
     st.sampled_from([0.25, 0.3, 0.5, 0.7]),
@@ -80,3 +81,8 @@ def test_positions_lie_in_the_cells_that_a_robot_finds_itself_in(
     wanted = recipe.grid.cell_of(*torch.from_numpy(positions.astype(np.float32)).T)
     for found, cells in zip(recipe.cells_of(positions), wanted, strict=True):
         np.testing.assert_array_equal(found, cells.numpy())
+
+
+@pytest.mark.parametrize("name", shipped_recipes())
+def test_sizes_are_those_of_the_whole_recipe(name: str) -> None:
+    assert shipped_sizes(name) == {split: spec.maps for split, spec in load_recipe(name).splits.items()}
