@@ -1,4 +1,4 @@
-"""The errors BenchNav raises on purpose; commands print them as one line and exit with status 2.
+"""The errors BenchNav raises on purpose; `benchnav.command` prints them as one line, with exit status 2.
 
 A message names the argument, what was expected, what came, and what to do.
 """
