@@ -4,8 +4,8 @@ A measure is a function of a `TraversabilityMixture` with parameters of shape [B
 [0, 1] of shape [B, H, W]; its further keyword parameters are its options. A setting is written
 `name` or `name:level`: `cvar:0.9`, `var:0.95`, `expected-time:0.05`, `mean`. Risk means the lower tail of λ;
 a higher level of CVaR or VaR is more cautious. The integrals are the mixture's own (`benchnav.mixture`), the names are
-given in `pyproject.toml`, and `benchnav.registry` reads what is written. Source: paper II and III-B; `expected_time` and `chance` go
-beyond it.
+given in `pyproject.toml`, and `benchnav.registry` reads what is written.
+Source: paper II and III-B; `expected_time` and `chance` go beyond it.
 """
 
 from collections.abc import Callable
