@@ -38,8 +38,13 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text)
 
 
+def real_place(path: Path) -> Path:
+    """The place that a name stands for: where a link points to; the folder that `.` is, by its own name."""
+    return path.resolve() if path.is_symlink() or path.name in ("", "..") else path
+
+
 @contextmanager
-def sole_writer(path: Path, what: str) -> Iterator[None]:
+def sole_writer(path: Path, what: str, shared: bool = False) -> Iterator[None]:
     """Holds a file or folder for one process, whether or not it exists yet; a kill frees it.
 
     The lock is a file beside it, so `path` may be moved, replaced or removed while it is held.
@@ -47,6 +52,7 @@ def sole_writer(path: Path, what: str) -> Iterator[None]:
     Args:
         path: what is held; its folder is made, and removed at the end where nothing came into it.
         what: what is written there, for the message.
+        shared: hold it together with others who share it, and keep out those who do not.
 
     Raises:
         BenchnavError: another process, or another part of this one, holds it.
@@ -55,24 +61,26 @@ def sole_writer(path: Path, what: str) -> Iterator[None]:
     made = [folder for folder in path.parents if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.with_name(f".{path.name}.lock")
-    descriptor = _take(lock, what)
+    descriptor = _take(lock, what, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
     try:
         yield
     finally:
-        # Removed while it is still held: whoever opened it meanwhile sees that its name is gone.
-        lock.unlink(missing_ok=True)
+        with suppress(BlockingIOError):  # others share it still
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Removed while it is still held: whoever opened it meanwhile sees that its name is gone.
+            lock.unlink(missing_ok=True)
         os.close(descriptor)
         with suppress(OSError):  # one is not empty, or was removed by others
             for folder in made:
                 folder.rmdir()
 
 
-def _take(lock: Path, what: str) -> int:
+def _take(lock: Path, what: str, kind: int) -> int:
     """Opens and locks a file that has its name still; gives its descriptor."""
     while True:
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
             if _is_same(descriptor, lock):
                 return descriptor
         except BlockingIOError as error:

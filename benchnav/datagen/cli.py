@@ -38,7 +38,7 @@ def create(
         recipe: Id of a shipped recipe, such as paper-v1, or path of a YAML file.
         overrides: Changes to it, such as id=mine splits.train.maps=50 scenarios.hs.severity=0.5.
         out: File .h5 to write, or else a folder of many files; datasets/ID.h5 if not given, datasets/ID for many maps.
-        jobs: Worker processes. The result is the same for any number.
+        jobs: Worker processes of this machine; a cluster has its own. The result is the same for any number.
         seed: Root seed in place of the recipe's: a sibling, of id ID-seedN, with other maps of the same classes.
         splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
         first: Only the first so many maps of each split; the same maps as in the whole. 0 makes all.

@@ -162,6 +162,20 @@ def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
             assert "few.csv has fewer than 10 rows of some classes (mud 1, sand 1)" in told[0]
 
 
+def test_a_damaged_checkpoint_is_replaced_by_gps_of_a_log_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"rock,{slope},0.8\n" for slope in range(12))
+    Path("logs.csv").write_text("class,slope_deg,traversability\n" + rows)
+    Path("mine").mkdir()
+    Path("mine/config.json").write_text("{")
+    command = ["gp", "--data", "logs.csv", "--out", "mine", *QUICK_GP]
+    assert "damaged" in refuses(monkeypatch, capfd, *command)
+    assert call(monkeypatch, *command, "--overwrite") == 0
+    assert load_checkpoint("mine").class_names == ("rock",)
+
+
 def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_dropped(
     checkpoint_path: Path,
     tmp_path: Path,

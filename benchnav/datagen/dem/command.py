@@ -50,6 +50,7 @@ def import_dem(
     from benchnav.datagen.dem.tiling import read_shares
     from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.reader import TerrainDataset
+    from benchnav.datagen.files.writer import is_one_file
     from benchnav.datagen.recipe.recipe import load_recipe
 
     path = Path(out).expanduser()
@@ -61,7 +62,7 @@ def import_dem(
         photo=photo,
         traversability=traversability,
     )
-    name = id or path.stem
+    name = id or (path.stem if is_one_file(path) else path.name)
     chosen = load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
     steps = import_maps(
         rasters,

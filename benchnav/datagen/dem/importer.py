@@ -19,14 +19,14 @@ from benchnav.datagen.dem.raster import load_rasterio
 from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import check_place, join
-from benchnav.datagen.files.folder import Contents, take_place, write_manifest
+from benchnav.datagen.files.folder import Contents, restore, take_place, write_manifest
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard
 from benchnav.datagen.files.writer import is_one_file, named_errors, pack
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, Maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 from benchnav.errors import DatasetError
-from benchnav.files import sole_writer
+from benchnav.files import real_place, sole_writer
 
 _CELLS_AT_ONCE = 2**20
 _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows with the machine
@@ -72,6 +72,7 @@ def import_dem(
         ConfigError: rasterio is not installed, or a setting does not fit the recipe.
         DatasetError: a raster does not fit, a split is left without maps, or `out` exists or cannot be written.
     """
+    out = real_place(out)
     check_place(out, overwrite)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
@@ -83,6 +84,8 @@ def import_dem(
         with named_errors(out):
             stack.enter_context(sole_writer(out, str(out)))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            restore(out)
+            check_place(out, overwrite)
             shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
             folder.mkdir()
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}

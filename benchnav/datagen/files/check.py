@@ -9,10 +9,8 @@ import h5py
 import numpy as np
 
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, open_file
+from benchnav.datagen.files.reader import CHUNK_CELLS, READ_ERRORS, TerrainDataset, open_file
 from benchnav.errors import DatasetError
-
-_MAPS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, order=True)
@@ -149,8 +147,10 @@ def _arrays(
 
 def _read_some(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Reads some maps at a time; of those that cannot be read together each one, with the arrays that can be read."""
-    for start in range(0, maps, _MAPS_AT_ONCE):
-        stop = min(start + _MAPS_AT_ONCE, maps)
+    cells = max((int(np.prod(array.shape[1:])) for array in arrays.values()), default=1)
+    step = max(1, CHUNK_CELLS // max(1, cells))
+    for start in range(0, maps, step):
+        stop = min(start + step, maps)
         try:
             yield start, {name: array[start:stop] for name, array in arrays.items()}
         except READ_ERRORS:

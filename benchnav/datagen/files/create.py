@@ -1,7 +1,8 @@
 """Making datasets: shard by shard, in parallel, gone on with after a kill.
 
 A dataset of one file is made in the folder `.NAME.partial` beside it, whose shards are joined at the end. One
-of many files is made where it is to be, and is finished when its manifest is written.
+of many files is made where it is to be, and is finished when its manifest is written; where it replaces a finished
+one it is made in such a folder too.
 """
 
 import multiprocessing
@@ -9,7 +10,7 @@ import os
 import re
 import shutil
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,20 +20,20 @@ import joblib
 
 import benchnav
 from benchnav.cluster import connected, parallel, told_when_lost
-from benchnav.datagen.files.folder import Contents, take_place, whole, write_manifest
+from benchnav.datagen.files.folder import Contents, restore, take_place, whole, write_manifest
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, is_dataset, open_file, read_manifest
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make
 from benchnav.datagen.files.writer import check_target, is_one_file, named_errors, writing
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import ConfigError, DatasetError
-from benchnav.files import replacing, sole_writer
+from benchnav.files import real_place, replacing, sole_writer
 from benchnav.share import Share
 from benchnav.workers import end_with
 
 _Made = tuple[Shard, bytes]
 
-# Shards, and what is half-written of them or of the manifest.
-_OURS = re.compile(r".+-\d{8}-\d{8}\.h5|\..+\.partial")
+_SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
+_HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 
 
 def create(
@@ -65,11 +66,14 @@ def create(
     own = [
         shard for place, shard in enumerate(shards) if share is None or place % share.of == share.index - 1
     ]
+    path = real_place(path)
+    names = {shard.name for shard in shards}
     is_file = is_one_file(path)
     if is_file and share is not None:
         raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
     with named_errors(path), _held(path, share):
-        folder = _workplace(path, share, overwrite)
+        restore(path)
+        folder = _workplace(path, recipe, names, share, overwrite)
         missing = _missing(recipe, folder, shards, own, may_replace=overwrite or folder != path)
         if folder == path and (path / FOLDER_MANIFEST).exists():
             if not missing:
@@ -86,7 +90,7 @@ def create(
                     partial.write_bytes(content)
                 done += shard.maps
                 yield done, total
-        if not all((folder / shard.name).exists() for shard in shards):
+        if not _are_all_there(folder, recipe, shards, overwrite):
             return  # the other shares are made elsewhere
         files = {
             name: [folder / shard.name for shard in shards if shard.split == name] for name in recipe.splits
@@ -98,6 +102,7 @@ def create(
             return
         write_manifest(folder, contents)
         if folder != path:
+            check_folder(path, names)  # others may have put something there meanwhile
             take_place(folder, path)
 
 
@@ -116,13 +121,21 @@ def join(path: Path, contents: Contents) -> None:
                     writer.copy(split, stored[split])
 
 
-def _held(path: Path, share: Share | None) -> Any:
-    """Holds the dataset for one process, or the share of it: those of several may be made at once."""
-    name = path.name if share is None else f"{path.name}.{share.index}-of-{share.of}"
-    return sole_writer(path.with_name(name), str(path))
+@contextmanager
+def _held(path: Path, share: Share | None) -> Iterator[None]:
+    """Holds the dataset for one process, or a share of it: several shares may be made at once."""
+    with sole_writer(path, str(path), shared=share is not None):
+        if share is None:
+            yield
+            return
+        name = f"{path.name}.{share.index}-of-{share.of}"
+        with sole_writer(path.with_name(name), str(path)):
+            yield
 
 
-def _workplace(path: Path, share: Share | None, overwrite: bool) -> Path:
+def _workplace(
+    path: Path, recipe: Recipe, names: Collection[str], share: Share | None, overwrite: bool
+) -> Path:
     """Where shards are made: where they are to be, or beside a file or a finished folder that they replace.
 
     Raises:
@@ -130,11 +143,11 @@ def _workplace(path: Path, share: Share | None, overwrite: bool) -> Path:
     """
     beside = path.with_name(f".{path.name}.partial")
     if is_one_file(path):
-        if path.exists() and not overwrite:
-            shutil.rmtree(beside, ignore_errors=True)
+        if beside.exists() and not overwrite and _holds(path, recipe):
+            shutil.rmtree(beside)  # of a run that was killed when it had joined them
         check_target(path, overwrite)
         return beside
-    check_folder(path)
+    check_folder(path, names)
     if not overwrite or not (path / FOLDER_MANIFEST).exists():
         return path
     if share is not None:
@@ -162,13 +175,38 @@ def _missing(
             f"Expected `out` to be new or to hold shards of this recipe and version, but {foreign[0]} is another. "
             "Choose another `out`, or pass --overwrite."
         )
+    # Those of other shares are for these to replace.
+    mine = {shard.name for shard in own}
+    dropped = [file for file in foreign if file.name in mine or file.name not in known]
     # What is half-written of this share is of a killed run.
-    half = [
-        file for file in folder.glob(".*.partial") if any(f".{shard.name}." in file.name for shard in own)
-    ]
-    for file in (*foreign, *half):
-        file.unlink()
+    half = [file for file in folder.glob(".*.partial") if any(f".{name}." in file.name for name in mine)]
+    for file in (*dropped, *half):
+        file.unlink(missing_ok=True)
     return [shard for shard in own if folder / shard.name not in there]
+
+
+def _are_all_there(folder: Path, recipe: Recipe, shards: Sequence[Shard], overwrite: bool) -> bool:
+    """Tells whether every shard is there, of this recipe and version.
+
+    Raises:
+        DatasetError: one is of another, and no run is on its way to replace it.
+    """
+    missing = [shard.name for shard in shards if not is_there(folder / shard.name, recipe, shard)]
+    foreign = [name for name in missing if (folder / name).exists()]
+    if foreign and not overwrite:
+        raise DatasetError(
+            f"Expected all shards of one recipe and version, but {folder / foreign[0]} is of another. "
+            "Make its share anew with --overwrite, by the recipe, settings and version of the others."
+        )
+    return not missing
+
+
+def _holds(path: Path, recipe: Recipe) -> bool:
+    """Tells whether a file is a dataset of the whole of this recipe."""
+    try:
+        return path.exists() and read_manifest(path)["recipes"] == [recipe.to_dict()]
+    except DatasetError:
+        return False
 
 
 def check_place(path: Path, overwrite: bool) -> None:
@@ -187,21 +225,45 @@ def check_place(path: Path, overwrite: bool) -> None:
         )
 
 
-def check_folder(path: Path) -> None:
+def check_folder(path: Path, names: Collection[str] = ()) -> None:
     """Refuses a folder that holds anything but shards and their manifest, which no option may remove.
+
+    Args:
+        path: the folder, if there is one.
+        names: of shards that are to be made there, which may be damaged.
 
     Raises:
         DatasetError: it does, or `path` is a file.
     """
     if path.exists() and not path.is_dir():
         raise DatasetError(f"Expected `out` to be a folder or a file .h5, got the file {path}.")
-    shards = read_manifest(path)["shards"] if is_dataset(path) else {}
-    known = {FOLDER_MANIFEST, *(shard["file"] for own in shards.values() for shard in own)}
-    for file in sorted(path.iterdir()) if path.exists() else ():
-        if file.name not in known and not _OURS.fullmatch(file.name):
+    there = sorted(path.iterdir()) if path.exists() else []
+    known = {*names, *_listed(path)}
+    for file in there:
+        if file.name not in known and not _is_ours(file):
             raise DatasetError(
                 f"Expected `out` to be a new folder or one of shards, but {path} holds {file.name}."
             )
+
+
+def _listed(path: Path) -> set[str]:
+    """Names in a folder's manifest, its own among them; of a damaged one its own alone, where shards lie beside it."""
+    try:
+        shards = read_manifest(path).get("shards", {}) if is_dataset(path) else {}
+    except DatasetError:
+        return {FOLDER_MANIFEST} if any(_SHARD.fullmatch(file.name) for file in path.iterdir()) else set()
+    listed = {shard["file"] for own in shards.values() for shard in own}
+    return {FOLDER_MANIFEST, *listed} if listed else set()
+
+
+def _is_ours(file: Path) -> bool:
+    """Tells whether a file is a shard, of whatever dataset, or what is half-written of one."""
+    if _HALF.fullmatch(file.name):
+        return True
+    try:
+        return bool(_SHARD.fullmatch(file.name) and read_manifest(file))
+    except DatasetError:
+        return False
 
 
 @contextmanager

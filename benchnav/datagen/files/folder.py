@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,10 +76,20 @@ def take_place(partial: Path, out: Path) -> None:
         partial: the folder, beside `out`.
         out: where it is to be.
     """
-    if not out.exists():
-        partial.rename(out)
-        return
-    dropped = out.with_name(f".{out.name}.dropped")
-    out.rename(dropped)
+    dropped = _dropped(out)
+    shutil.rmtree(dropped, ignore_errors=True)
+    if out.exists():
+        out.rename(dropped)
     partial.rename(out)
-    shutil.rmtree(dropped)
+    shutil.rmtree(dropped, ignore_errors=True)
+
+
+def restore(out: Path) -> None:
+    """Gives a folder its name back which a run had taken away, that was killed before it put a new one there."""
+    if _dropped(out).exists() and not out.exists():
+        with suppress(FileNotFoundError):  # another share of it was quicker
+            _dropped(out).rename(out)
+
+
+def _dropped(out: Path) -> Path:
+    return out.with_name(f".{out.name}.dropped")

@@ -16,13 +16,13 @@ import numpy as np
 
 from benchnav.datagen import schema
 from benchnav.datagen.files.create import check_place, join
-from benchnav.datagen.files.folder import Contents, take_place, whole, write_manifest
+from benchnav.datagen.files.folder import Contents, restore, take_place, whole, write_manifest
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.files.writer import is_one_file, named_errors
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
 from benchnav.errors import ConfigError, DatasetError
-from benchnav.files import sole_writer
+from benchnav.files import real_place, sole_writer
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
@@ -45,13 +45,16 @@ def merge(
     Raises:
         DatasetError: the datasets are unlike, with every reason; one is damaged; shares are missing; or `out` exists.
     """
+    out = real_place(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
         raise DatasetError("Expected either datasets or shares of one dataset, got both.")
-    contents = _of_datasets(finished, dataset_id or out.stem) if finished else _of_shares(paths)
-    total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
     is_file = is_one_file(out)
+    name = dataset_id or (out.stem if is_file else out.name)
+    contents = _of_datasets(finished, name) if finished else _of_shares(paths)
+    total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
     with named_errors(out), sole_writer(out, str(out)):
+        restore(out)
         check_place(out, overwrite)
         for split, files in contents.files.items():
             for path in files:
@@ -61,10 +64,10 @@ def merge(
         if is_file:
             join(out, contents)
         else:
-            _copy(out, contents)
+            _copy(out, contents, overwrite)
 
 
-def _copy(out: Path, contents: Contents) -> None:
+def _copy(out: Path, contents: Contents, overwrite: bool) -> None:
     """Copies files into a folder that takes its place when it is whole."""
     partial = out.with_name(f".{out.name}.partial")
     with ExitStack() as stack:
@@ -80,6 +83,7 @@ def _copy(out: Path, contents: Contents) -> None:
                     copies[path] = Path(shutil.copy2(path, partial / name))
         copied = {split: [copies[path] for path in own] for split, own in contents.files.items()}
         write_manifest(partial, replace(contents, files=copied))
+        check_place(out, overwrite)  # others may have put something there meanwhile
         take_place(partial, out)
 
 

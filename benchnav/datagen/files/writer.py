@@ -197,8 +197,7 @@ def named_errors(path: Path) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise DatasetError(
-            f"Could not write {path}: {reason}. Its name holds what it held before; when that is mended, "
-            "give the same command again."
+            f"Could not write {path}: {reason}. When that is mended, give the same command again."
         ) from error
 
 

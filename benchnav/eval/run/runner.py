@@ -238,7 +238,8 @@ def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs:
 
 
 def _run_in_worker(parent: int, *given: Any) -> None:
-    end_with(parent)
+    if os.getpid() != parent:  # joblib may make the calls here, where it can start no processes
+        end_with(parent)
     _run_at(*given)
 
 

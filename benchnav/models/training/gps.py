@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import CheckpointError
 from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import cell_nll, hold_out
@@ -82,7 +83,7 @@ def train_gps_on_logs(
 ) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
     logs = read_slip_logs(data)
-    there = load_checkpoint(out) if (Path(out) / CONFIG).is_file() else None
+    there = _there(out, overwrite)
     names = there.class_names if there else logs.class_names
     cells = logs.cells(names)
     sums = SlopeSums.of(cells, len(names))
@@ -110,6 +111,18 @@ def train_gps_on_logs(
         data_digest=f"file:{logs.digest}",
     )
     target.add(GP, part)
+
+
+def _there(out: str, overwrite: bool) -> Checkpoint | None:
+    """The checkpoint that the GPs come into; None where there is none, or a damaged one that is replaced."""
+    if not (Path(out) / CONFIG).is_file():
+        return None
+    try:
+        return load_checkpoint(out)
+    except CheckpointError:
+        if not overwrite:
+            raise
+        return None
 
 
 def _warn_of_rows(data: str, counts: Mapping[str, int], replaced: str) -> None:

@@ -284,7 +284,9 @@ def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(tmp_path: Pa
     assert find_faults(path) == []
 
 
-@pytest.mark.parametrize("name", ["notes.txt", ".git", "maps.h5"])
+@pytest.mark.parametrize(
+    "name", ["notes.txt", ".git", "maps.h5", "radar-20240101-20240131.h5", "manifest.json"]
+)
 def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: str) -> None:
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / name).write_text("mine")
@@ -292,3 +294,112 @@ def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: 
         with pytest.raises(DatasetError, match="holds"):
             make(tmp_path / "d", overwrite=overwrite)
     assert (tmp_path / "d" / name).read_text() == "mine"
+
+
+def begun(path: Path, recipe: Recipe, share: int, overwrite: bool = False) -> Any:
+    """The making of a share of two that has looked at what is there, and has made nothing yet."""
+    steps = create(recipe, path, share=Share(index=share, of=2), overwrite=overwrite, shard_cells=3 * CELLS)
+    next(steps)
+    return steps
+
+
+def finish(*making: Any) -> None:
+    for steps in making:
+        for _ in steps:
+            pass
+
+
+def test_unlike_shares_that_are_made_at_once_are_no_dataset(tmp_path: Path) -> None:
+    path, recipe = tmp_path / "d", tiny_recipe()
+    one, other = begun(path, recipe, 1), begun(path, replace(recipe, seed=3), 2)
+    with pytest.raises(DatasetError, match="is of another"):
+        finish(one, other)
+    assert not (path / "manifest.json").exists()
+    finish(begun(path, recipe, 2, overwrite=True))
+    assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", recipe))
+
+
+def test_shares_replace_their_own_shards_alone(tmp_path: Path) -> None:
+    path, recipe = tmp_path / "d", replace(tiny_recipe(), seed=3)
+    make(path, share=Share(index=1, of=2))
+    make(path, share=Share(index=2, of=3))  # of another cut in shares, the same shards
+    one, other = (begun(path, recipe, share, overwrite=True) for share in (1, 2))
+    finish(one, other)
+    assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", recipe))
+
+
+def test_a_share_keeps_out_who_makes_the_whole(tmp_path: Path) -> None:
+    path = tmp_path / "d"
+    one = begun(path, tiny_recipe(), 1)
+    for share in (None, Share(index=1, of=2)):
+        with pytest.raises(BenchnavError, match="Another run"):
+            make(path, share=share, overwrite=True)
+    other = begun(path, tiny_recipe(), 2)
+    finish(one, other)
+    assert find_faults(path) == []
+    assert [item.name for item in tmp_path.iterdir()] == ["d"]
+
+
+def test_a_kill_while_a_new_folder_takes_its_place_loses_neither(tmp_path: Path) -> None:
+    path, dropped = make(tmp_path / "d"), tmp_path / ".d.dropped"
+    before = digests(path)
+    path.rename(dropped)
+    with pytest.raises(DatasetError, match="exists"):
+        make(path)
+    assert digests(path) == before
+    dropped.mkdir()
+    (dropped / "left.h5").write_text("of a kill while it was removed")
+    make(path, recipe=replace(tiny_recipe(), seed=3), overwrite=True)
+    assert digests(path) != before
+    assert [item.name for item in tmp_path.iterdir()] == ["d"]
+
+
+def test_a_link_stays_a_link_to_the_disk_that_it_leads_to(tmp_path: Path) -> None:
+    disk, path = tmp_path / "disk", tmp_path / "d"
+    disk.mkdir()
+    path.symlink_to(disk / "d", target_is_directory=True)
+    make(path)
+    before = digests(path)
+    make(path, recipe=replace(tiny_recipe(), seed=3), overwrite=True)
+    assert digests(disk / "d") == digests(path) != before
+    assert path.is_symlink()
+
+
+def test_a_folder_of_a_damaged_manifest_is_replaced(tmp_path: Path) -> None:
+    path = make(tmp_path / "d")
+    (path / "manifest.json").write_text("{broken")
+    with pytest.raises(DatasetError, match="--overwrite"):
+        make(path)
+    make(path, overwrite=True)
+    assert find_faults(path) == []
+
+
+def test_a_refusal_keeps_what_was_made_so_far(tmp_path: Path) -> None:
+    path, other = tiny_dataset(tmp_path / "d.h5"), replace(tiny_recipe(), seed=3)
+    steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
+    assert [next(steps)[0] for _ in range(3)] == [0, 3, 6]
+    steps.close()
+    with pytest.raises(DatasetError, match="exists"):
+        make(path, recipe=other)
+    steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
+    assert next(steps)[0] == 6
+    steps.close()
+
+
+def test_what_is_put_into_a_folder_while_it_is_replaced_is_kept(tmp_path: Path) -> None:
+    path = make(tmp_path / "d")
+    before = digests(path)
+    steps = create(replace(tiny_recipe(), seed=3), path, overwrite=True, shard_cells=3 * CELLS)
+    next(steps)
+    (path / "notes.txt").write_text("mine")
+    with pytest.raises(DatasetError, match=r"holds notes\.txt"):
+        finish(steps)
+    assert (path / "notes.txt").read_text() == "mine"
+    assert digests(path) == before
+
+
+def test_the_folder_that_one_stands_in_may_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "d").mkdir()
+    monkeypatch.chdir(tmp_path / "d")
+    make(Path())
+    assert find_faults(tmp_path / "d") == []

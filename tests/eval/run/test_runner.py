@@ -521,3 +521,18 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
     with pytest.raises(ConfigError, match="without `group`"):
         finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
     assert set(finish(suite, tmp_path / "run")["risk"]) == {"–", *Suite().risks}
+
+
+def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: Path) -> None:
+    config = tmp_path / "suite.yaml"
+    data = factories.tiny_dataset(tmp_path / "d.h5")
+    config.write_text(f"data: {data}\nscenarios: [std]\ninstances: 1\nrecord: none\nsteps: none\n"
+                      "trials:\n  - {planners: [straight]}\n")  # fmt: skip
+    code = "import sys; from benchnav.eval.cli import main; main()"
+    words = ["run", "--config", str(config), "--jobs", "2", "--out", str(tmp_path / "run")]
+    ran = subprocess.run(
+        [sys.executable, "-c", code, *words], env={**os.environ, "JOBLIB_MULTIPROCESSING": "0"},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "run" / "episodes.parquet").exists()
