@@ -27,6 +27,7 @@ value-at-risk". Letters in shapes: K components, H×W cells, *B any leading dime
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -40,6 +41,7 @@ _SMALLEST_STD = 1e-9
 _BISECTIONS = 30  # leave an error of at most 2⁻³¹ < 1e-9
 _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 _QUADRATURE_NODES = 24
+_NUMBERS_AT_ONCE = 2**17  # of each parameter: 1 MiB in float64
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,8 @@ class TraversabilityMixture:
         Returns:
             Traversability, shape [*B, H, W].
         """
-        return self._value_at_risk(1 - _check_level(level)).to(self.weights.dtype)
+        tail = 1 - _check_level(level)
+        return self._by_rows(lambda some: some._value_at_risk(tail)).to(self.weights.dtype)
 
     def cvar(self, level: float) -> Tensor:
         """Conditional value at risk: the mean of λ over its worst share 1 − level.
@@ -113,9 +116,7 @@ class TraversabilityMixture:
             Traversability, shape [*B, H, W].
         """
         tail = 1 - _check_level(level)
-        value = self._value_at_risk(tail)
-        shortfall = self._integrated_cdf(value) - self._integrated_cdf(torch.zeros_like(value))
-        return (value - shortfall / tail).clamp(min=0).minimum(value).to(self.weights.dtype)
+        return self._by_rows(lambda some: some._cvar(tail)).to(self.weights.dtype)
 
     def chance(self, value: float) -> Tensor:
         """P(λ ≥ value), shape [*B, H, W].
@@ -251,6 +252,24 @@ class TraversabilityMixture:
         class_of = torch.tensor([classes.index(own) for own in self.group], device=best.device)
         kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
         return replace(self, weights=kept / kept.sum(-3, keepdim=True))
+
+    def _by_rows(self, work: "Callable[[TraversabilityMixture], Tensor]") -> Tensor:
+        """Does some work on so many rows at a time that what it needs stays near the processor."""
+        height = self.weights.shape[-2]
+        rows = max(1, _NUMBERS_AT_ONCE * height // max(1, self.weights.numel()))
+        if rows >= height:
+            return work(self)
+        weights, means, stds = (values.split(rows, -2) for values in (self.weights, self.means, self.stds))
+        pieces = (
+            TraversabilityMixture(weight, mean, std, self.group)
+            for weight, mean, std in zip(weights, means, stds, strict=True)
+        )
+        return torch.cat([work(piece) for piece in pieces], -2)
+
+    def _cvar(self, tail: float) -> Tensor:
+        value = self._value_at_risk(tail)
+        shortfall = self._integrated_cdf(value) - self._integrated_cdf(torch.zeros_like(value))
+        return (value - shortfall / tail).clamp(min=0).minimum(value)
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))

@@ -329,3 +329,15 @@ def test_bad_arguments_are_refused() -> None:
             mixture.cvar(level)
     with pytest.raises(ConfigError, match="one shape"):
         TraversabilityMixture(torch.ones(1, 2, 3), torch.ones(1, 2, 3), torch.ones(1, 2, 4))
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 9, 5), (4, 1, 7, 3), (1, 2, 3, 8, 2)])
+def test_rows_at_a_time_change_no_bit(shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = torch.Generator().manual_seed(1)
+    weights, means, stds = (torch.rand(shape, generator=drawn) for _ in range(3))
+    mixture = TraversabilityMixture(weights / weights.sum(-3, keepdim=True), means, 0.2 * stds)
+    whole = mixture.cvar(0.7), mixture.var(0.6), mixture.mean()
+    for numbers in (1, 2 * mixture.weights.numel() // shape[-2]):
+        monkeypatch.setattr("benchnav.mixture._NUMBERS_AT_ONCE", numbers)
+        for found, wanted in zip((mixture.cvar(0.7), mixture.var(0.6), mixture.mean()), whole, strict=True):
+            assert torch.equal(found, wanted)
