@@ -458,6 +458,10 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     assert json.loads(Path("mine.training/mdn/settings.json").read_text())["seed"] == 7
     assert (part.config["max_epochs"], part.config["components"], part.half_precision) == (2, 2, True)
     assert load_model("mine").predict(observe(1, 32, 32)).weights.shape == (1, 2, 32, 32)  # type: ignore[union-attr]
+    # What it says of itself was measured on what is kept.
+    kept = MixtureDensityNetwork.from_tensors(part.config, part.tensors)
+    valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
+    assert measure_network(kept, valid).items() <= dict(part.metrics).items()
 
     assert call(monkeypatch, "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0
     assert "test/std" in capfd.readouterr().out
