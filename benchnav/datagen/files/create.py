@@ -70,7 +70,7 @@ def create(
     names = {shard.name for shard in shards}
     is_file = is_one_file(path)
     if is_file and share is not None:
-        raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
+        raise ConfigError(f"Expected `out` to be a folder, since a share is made, got {path}.")
     with named_errors(path), _held(path, share):
         restore(path)
         folder = _workplace(path, recipe, names, share, overwrite)

@@ -246,12 +246,6 @@ def read_maps(
     return MapDataset(partial(_take, stored(range(count))) if in_memory else stored, count, shape)
 
 
-def held_maps(fields: Batch) -> MapDataset:
-    """Maps that are in memory already, by field, each of shape [B, *, H, W]."""
-    height, width = fields["rgb"].shape[-2:]
-    return MapDataset(partial(_take, fields), len(fields["rgb"]), (height, width))
-
-
 def _read(dataset: TerrainDataset, split: str, names: tuple[str, ...], indices: Sequence[int]) -> Batch:
     return {name: torch.from_numpy(values) for name, values in dataset.read(split, indices, names).items()}
 

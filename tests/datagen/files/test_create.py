@@ -242,7 +242,7 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
     make(folder, replace(tiny_recipe(), seed=3), overwrite=True)
     assert digests(folder) == digests(tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3)))
-    with pytest.raises(ConfigError, match="folder, since a shard"):
+    with pytest.raises(ConfigError, match="folder, since a share"):
         make(tmp_path / "e.h5", share=Share(index=1, of=2))
 
 
@@ -321,9 +321,15 @@ def test_unlike_shares_that_are_made_at_once_are_no_dataset(tmp_path: Path) -> N
 
 def test_shares_replace_their_own_shards_alone(tmp_path: Path) -> None:
     path, recipe = tmp_path / "d", replace(tiny_recipe(), seed=3)
-    make(path, share=Share(index=1, of=2))
-    make(path, share=Share(index=2, of=3))  # of another cut in shares, the same shards
-    one, other = (begun(path, recipe, share, overwrite=True) for share in (1, 2))
+    finish(begun(path, tiny_recipe(), 1))
+    of_first = sorted(path.iterdir())
+    make(path)
+    (path / "manifest.json").unlink()
+    every = sorted(path.iterdir())
+    one = begun(path, recipe, 1, overwrite=True)
+    assert sorted(path.iterdir()) == [file for file in every if file not in of_first]
+    other = begun(path, recipe, 2, overwrite=True)
+    assert list(path.iterdir()) == []
     finish(one, other)
     assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", recipe))
 

@@ -1,10 +1,12 @@
+from collections.abc import Sequence
+
 import pytest
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.probabilities import sharpen
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
-from benchnav.models.training.data import MapData, MapDataset, held_maps
+from benchnav.models.training.data import MapData, MapDataset
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
 
 
@@ -88,7 +90,12 @@ def witnessed(maps: int, seed: int) -> MapDataset:
     noise = torch.randn(maps, 3, CLASSES, 16, 16, generator=generator)
     steps = (2 + STRENGTH * (shown - 0.2) + noise).round().clamp(0, 5).long()
     rgb = steps[:, :, 0] + 6 * steps[:, :, 1] + 36 * steps[:, :, 2]
-    return held_maps({"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)})
+    fields = {"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)}
+
+    def read(indices: Sequence[int]) -> dict[str, torch.Tensor]:
+        return {name: values[list(indices)] for name, values in fields.items()}
+
+    return MapDataset(read, len(rgb), (rgb.shape[-2], rgb.shape[-1]))
 
 
 def ece(probabilities: torch.Tensor, class_id: torch.Tensor) -> float:
