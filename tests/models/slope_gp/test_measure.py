@@ -26,6 +26,10 @@ def test_latent_metrics_read_each_cell_with_its_own_class() -> None:
     louder = replace(terrain, truth=normal(mean, std / 1.25))
     pieces = [perfect.select(torch.tensor([0])), louder.select(torch.tensor([1]))]
     assert measure_latent(table, pieces)["noise_error"] == pytest.approx(0.25, rel=1e-5)
+    one_cell = std.clone()
+    one_cell[2, 3, 4] /= 1.25
+    found = measure_latent(table, [replace(terrain, truth=normal(mean, one_cell))])
+    assert found["noise_error"] == pytest.approx(0.25, rel=1e-5)  # the largest, not the mean
 
 
 def test_a_second_mode_counts_in_the_nll_of_the_processes_and_not_in_their_error() -> None:
