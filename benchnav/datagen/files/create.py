@@ -152,7 +152,7 @@ def _workplace(
         return path
     if share is not None:
         raise DatasetError(
-            f"Expected no finished dataset to replace by a shard, got {path}. Remove it first."
+            f"Expected no finished dataset to replace by a share, got {path}. Remove it first."
         )
     return beside
 
