@@ -48,11 +48,12 @@ class Terrain:
 
     Args:
         rgb: uint8, shape [B, 3, H, W].
-        class_id: index into the dataset's class table, shape [B, H, W].
+        class_id: index into the dataset's class table, 255 where the class is not known, shape [B, H, W].
         elevation_m: shape [B, H, W].
         slope_deg: shape [B, H, W].
         truth: the true distribution of λ in each cell, parameters of shape [B, K, H, W]: of the cell's
-            own class at its slope, and of its soft spots where the class has them.
+            own class at its slope, and of its soft spots where the class has them. Means are NaN where the
+            class is not known.
         traversability: one realised λ, shape [B, H, W].
         grid: size and resolution.
         look_alikes: gives what colours can tell at best, from classes and slopes [B, H, W]: the truth of all

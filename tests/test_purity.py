@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchnav import gridgraph, registry, rng
-from benchnav.datagen.files.writer import pack
+from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.schema import entry_digests

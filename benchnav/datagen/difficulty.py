@@ -14,7 +14,7 @@ from rich.table import Table
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import Maps
+from benchnav.datagen.schema import UNLABELLED, Maps
 from benchnav.grid import Grid
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
@@ -35,7 +35,7 @@ _EXPLAINED = (
 
 @dataclass(frozen=True, kw_only=True)
 class Difficulty:
-    """What stands in a robot's way on the maps of a split.
+    """What stands in a robot's way on the maps of a split; shares are of the cells whose class is known.
 
     Args:
         maps: number of maps.
@@ -65,18 +65,26 @@ def of_maps(maps: Maps, recipe: Recipe) -> Difficulty:
     weights, means, stds = latent.truth(
         maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes
     )
-    stuck = latent.expected_of((weights, means, stds)) <= recipe.stuck_threshold
-    spots = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])[maps["class_id"]]
+    stuck = latent.expected_of((weights, means, stds)) <= recipe.stuck_threshold  # not where it is NaN
+    labelled = maps["class_id"] != UNLABELLED
+    weight = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])
+    spots = weight[np.where(labelled, maps["class_id"], 0)]
     on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
     times = maps["reference_time_s"].astype(np.float64)
     return Difficulty(
         maps=len(stuck),
-        stuck=float(stuck.mean()),
-        soft_ground=float((spots > 0).mean()),
-        soft_spots=float(spots.mean()),
+        stuck=_share(stuck, labelled),
+        soft_ground=_share(spots > 0, labelled),
+        soft_spots=_share(spots, labelled),
         straight=int((~(stuck & on_line).any(axis=(1, 2))).sum()),
         reference_times_s=times[np.isfinite(times)],
     )
+
+
+def _share(values: np.ndarray, labelled: np.ndarray) -> float:
+    """Mean over each map's labelled cells, then over the maps."""
+    counts = np.maximum(1, labelled.sum(axis=(1, 2)))
+    return float(((values * labelled).sum(axis=(1, 2)) / counts).mean())
 
 
 def of_split(dataset: TerrainDataset, split: str) -> Difficulty:

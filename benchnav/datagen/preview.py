@@ -16,7 +16,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, ListedColormap
+from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -25,6 +25,7 @@ from matplotlib.ticker import MaxNLocator
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
 from benchnav.errors import ConfigError
@@ -42,7 +43,7 @@ STEEP_DEG = 30.0
 _PAGE, _DPI = 9.4, 300.0
 _LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.06, 0.42, 0.94, 0.12
 _LINE, _LETTER = 0.135, 0.054
-_UNOBSERVED = "0.7"
+LACKING = "0.7"
 _HATCH = "//////"
 _READ_MAPS = 20
 _MARK: dict[str, Any] = {"ls": "", "mfc": "white", "mec": "black", "mew": 0.75, "clip_on": False}
@@ -84,7 +85,9 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     # Heights over each map's lowest point compare between maps; heights over a datum seldom do.
     maps["elevation_m"] = maps["elevation_m"] - maps["elevation_m"].min((1, 2), keepdims=True)
     classes, grid = dataset.recipe.classes, dataset.grid
-    shown, colours = np.unique(maps["class_id"]), class_colours(classes)
+    unlabelled = maps["class_id"] == UNLABELLED
+    shown, colours = np.unique(maps["class_id"][~unlabelled]), class_colours(classes)
+    maps["class_id"] = np.ma.masked_array(maps["class_id"], unlabelled)
     soft = soft_ground(maps["class_id"], classes)
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
     sheet = _lay_out(grid, len(indices), names)
@@ -116,7 +119,8 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     write(figure, sheet.across[2], sheet.bottom + 0.2, "x [m]", ha="center", va="top")
     write(figure, _LEFT, 0.06, f"{dataset.id}, split {split}", size=TITLE, va="top")
     _draw_bars(figure, sheet, levels)
-    extra = _extra_marks(bool(np.isnan(maps["traversability"]).any()), bool(soft.any()))
+    lacking = bool(unlabelled.any() or np.isnan(maps["traversability"]).any())
+    extra = _extra_marks(lacking, bool(soft.any()))
     _draw_legends(figure, sheet, names, colours[shown], extra)
     return figure
 
@@ -180,7 +184,9 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
 
 def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.ndarray:
     """Cells whose class has soft spots, bool, shape of `class_id`."""
-    return np.array([item.soft is not None for item in classes])[class_id]
+    soft = np.zeros(UNLABELLED + 1, dtype=bool)
+    soft[: len(classes)] = [item.soft is not None for item in classes]
+    return soft[class_id]
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
@@ -191,9 +197,14 @@ def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     return np.where((rank % 2 == 0)[:, None], _EARTH(place), _BLUE(place))[:, :3]
 
 
+def class_shades(colours: np.ndarray) -> Colormap:
+    """The colours of classes, [C, 3], as a colour map; cells that are masked have no class."""
+    return ListedColormap(list(colours)).with_extremes(bad=LACKING)
+
+
 def _coloured(traversability: np.ndarray) -> np.ndarray:
     """λ in the colours of the sheets, from [H, W] to uint8 [H, W, 3]."""
-    shades = matplotlib.colormaps["viridis"].with_extremes(bad=_UNOBSERVED)
+    shades = matplotlib.colormaps["viridis"].with_extremes(bad=LACKING)
     return shades(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
 
 
@@ -260,11 +271,11 @@ def _scales(relief_m: float, colours: np.ndarray) -> dict[str, dict[str, Any]]:
     """How each field is drawn: keywords of `imshow`."""
     return {
         "rgb": {},
-        "class_id": {"cmap": ListedColormap(list(colours)), "vmin": -0.5, "vmax": len(colours) - 0.5},
+        "class_id": {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5},
         "elevation_m": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
         "slope_deg": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
         "traversability": {
-            "cmap": matplotlib.colormaps["viridis"].with_extremes(bad=_UNOBSERVED), "vmin": 0, "vmax": 1
+            "cmap": matplotlib.colormaps["viridis"].with_extremes(bad=LACKING), "vmin": 0, "vmax": 1
         },
     }  # fmt: skip
 
@@ -345,11 +356,11 @@ def _draw_bars(figure: Figure, sheet: _Sheet, levels: np.ndarray) -> None:
             bar.set_xlabel(label, size=TEXT, labelpad=1.5, linespacing=1.1)
 
 
-def _extra_marks(unobserved: bool, soft: bool) -> list[Artist]:
+def _extra_marks(lacking: bool, soft: bool) -> list[Artist]:
     """Entries of the legend for what few maps show."""
     marks: list[Artist] = []
-    if unobserved:
-        marks.append(Patch(facecolor=_UNOBSERVED, label="unobserved"))
+    if lacking:
+        marks.append(Patch(facecolor=LACKING, label="not known"))
     if soft:
         marks.append(Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label="may hide soft spots"))
     return marks

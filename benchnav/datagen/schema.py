@@ -19,6 +19,7 @@ FORMAT_VERSION = (1, 2)  # the newest that is read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
+UNLABELLED = 255  # `class_id` of a cell whose class is not known, as on real ground
 
 Maps = dict[str, np.ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
 
@@ -111,9 +112,16 @@ class SplitDigest:
         return self._hash.hexdigest()
 
 
-def version_of(synthesis: Iterable[int]) -> str:
-    """The format version of a file of recipes of the given syntheses: 1.0 unless one is of synthesis 2."""
+def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]]) -> str:
+    """The format version of a file: the least that the synthesis of its recipes and the entries of its splits need."""
+    if any(has_unlabelled(entry) for entry in splits):
+        return "1.2"
     return "1.1" if max(synthesis) > 1 else "1.0"
+
+
+def has_unlabelled(entry: Mapping[str, Any]) -> bool:
+    """Tells by a split's entry in the manifest whether some of its cells have no class."""
+    return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
 def seal(manifest: Mapping[str, Any]) -> str:

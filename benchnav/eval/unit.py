@@ -7,6 +7,7 @@ from typing import Any
 
 from benchnav.eval.keep import Keep
 from benchnav.eval.trial import Trial
+from benchnav.share import Share
 
 BLOCK_INSTANCES = 50
 
@@ -76,6 +77,16 @@ class Unit:
     def block(self) -> int:
         """Number of the block."""
         return self.instances[0] // BLOCK_INSTANCES
+
+    def share(self, of: int) -> Share:
+        """The share that the unit is in, where so many machines make a run apart.
+
+        It depends on the unit and that number alone, so that an extended run leaves every unit where it was.
+        Blocks, realisations and seeds of a trial go to the shares in turn; the share that a trial begins with is
+        drawn by its id, which is a digest.
+        """
+        turn = int(self.trial.id, 16) + self.seed + self.realisation + self.block
+        return Share(index=turn % of + 1, of=of)
 
     @property
     def path(self) -> Path:

@@ -56,10 +56,11 @@ class FusedModel:
             Mixture with float32 parameters of shape [B, K, H, W]: the C classes in order, and behind them
             the second modes of those that have one; `group` tells whose they are.
         """
-        weights = self._probabilities(self.classifiers[0], observation)
-        for classifier in self.classifiers[1:]:
-            weights += self._probabilities(classifier, observation)
-        weights = sharpen(weights / len(self.classifiers), self.pool_temperature)
+        return self.fuse(self.member_probabilities(observation), observation)
+
+    def fuse(self, member_probabilities: Tensor, observation: Observation) -> TraversabilityMixture:
+        """Makes the prediction of what the members said of the observation, [M, B, C, H, W]."""
+        weights = sharpen(member_probabilities.sum(0) / len(self.classifiers), self.pool_temperature)
         means, stds = self.table.lookup(observation.slope_deg.float())
         classes = tuple(range(len(self.class_names)))
         if self.table.soft is None:

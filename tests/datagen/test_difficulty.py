@@ -10,6 +10,7 @@ from rich.console import Console
 from benchnav.datagen import difficulty
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.grid import Grid
 from tests.datagen.small import SOFT, small_stakes, terrain_class
 from tests.factories import tiny_dataset
@@ -49,6 +50,18 @@ def test_the_figures_are_those_of_hand_made_maps() -> None:
     assert found.soft_spots == pytest.approx(0.1 * 40 / 320)
     assert found.straight == 3
     assert found.reference_times_s.tolist() == [5, 7]
+
+
+def test_shares_are_of_the_cells_whose_class_is_known() -> None:
+    class_id = np.full((2, 8, 10), UNLABELLED)
+    class_id[:, :4] = 0
+    class_id[0, 1, 5] = 1  # mud on the line
+    class_id[1, :2] = 2  # soft spots in half of what is known
+    found = difficulty.of_maps(maps_of(class_id, [5.0, 6.0]), RECIPE)
+    assert found.stuck == pytest.approx(1 / 80)
+    assert found.soft_ground == pytest.approx(20 / 80)
+    assert found.soft_spots == pytest.approx(0.1 * 20 / 80)
+    assert found.straight == 1
 
 
 def test_lambda_stuck_is_the_recipe_s_and_still_stuck() -> None:

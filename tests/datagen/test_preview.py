@@ -157,7 +157,7 @@ def test_class_colours_keep_the_tables_order_and_neighbours_apart() -> None:
     np.testing.assert_array_equal(class_colours(classes[::-1]), class_colours(classes)[::-1])
 
 
-@pytest.mark.parametrize("count", [1, 2, 256])
+@pytest.mark.parametrize("count", [1, 2, 255])
 def test_tables_of_any_size_have_colours(count: int) -> None:
     one = load_recipe("paper-v1").classes[0]
     colours = class_colours([replace(one, colour=(k, k, k)) for k in range(count)])
@@ -196,7 +196,7 @@ def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
 
 def test_only_shown_classes_of_many_are_named(tmp_path: Path) -> None:
     one = load_recipe("paper-v1").classes[0]
-    many = tuple(replace(one, name=f"stony_$k_{k}$", colour=(k, k, k)) for k in range(256))
+    many = tuple(replace(one, name=f"stony_$k_{k}$", colour=(k, k, k)) for k in range(255))
     recipe = train_only(classes=many, occupancy=(1 / 30,) * 30)
     figure = preview_figure(TerrainDataset(tiny_dataset(tmp_path / "many.h5", recipe)), "train", [0])
     assert len(legend_names(figure)) == 2 + 30
@@ -225,7 +225,7 @@ def test_unobserved_traversability_is_grey_and_explained(
     dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert legend_names(preview_figure(dataset, "train", [0]))[:2] == ["start", "goal"]
-    assert "unobserved" not in legend_names(preview_figure(dataset, "train", [0]))
+    assert "not known" not in legend_names(preview_figure(dataset, "train", [0]))
     hole = np.zeros((32, 32), dtype=bool)
     hole[4:9, 10:30] = True
     with_values(
@@ -235,7 +235,7 @@ def test_unobserved_traversability_is_grey_and_explained(
         reference_time_s=lambda values: np.full_like(values, np.nan),
     )
     figure = preview_figure(dataset, "train", [0])
-    assert legend_names(figure)[:3] == ["start", "goal", "unobserved"]
+    assert legend_names(figure)[:3] == ["start", "goal", "not known"]
     image = panels(figure)["traversability 0"].images[0]
     rgba = image.to_rgba(image.get_array())
     grey = figure.legends[0].get_patches()[0].get_facecolor()

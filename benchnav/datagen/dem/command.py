@@ -49,8 +49,8 @@ def import_dem(
     from benchnav.datagen.dem.survey import Rasters
     from benchnav.datagen.dem.tiling import read_shares
     from benchnav.datagen.files.describe import say_written
+    from benchnav.datagen.files.hdf5 import is_one_file
     from benchnav.datagen.files.reader import TerrainDataset
-    from benchnav.datagen.files.writer import is_one_file
     from benchnav.datagen.recipe.recipe import load_recipe
 
     path = Path(out).expanduser()

@@ -2,7 +2,7 @@
 
 Slopes follow from the real elevation, at a map's edge too, where that of the ground beyond is read. What the
 rasters do not say comes from the recipe. The truth of λ, its distribution in each cell, is always that of the
-recipe's class table, also where λ was measured.
+recipe's class table, also where λ was measured; where the class is not known, it is not known either.
 """
 
 import shutil
@@ -20,10 +20,10 @@ from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import check_place, join
 from benchnav.datagen.files.folder import Contents, restore, take_place, write_manifest
-from benchnav.datagen.files.shard import SHARD_CELLS, Shard
-from benchnav.datagen.files.writer import is_one_file, named_errors, pack
+from benchnav.datagen.files.hdf5 import is_one_file, named_errors, pack
+from benchnav.datagen.files.shard import SHARD_CELLS, Shard, write
 from benchnav.datagen.recipe.recipe import Recipe, Split
-from benchnav.datagen.schema import FIELDS, Maps, quantise
+from benchnav.datagen.schema import FIELDS, UNLABELLED, Maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 from benchnav.errors import DatasetError
 from benchnav.files import real_place, sole_writer
@@ -34,7 +34,7 @@ _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows w
 # Why maps are left out, in the order of being found.
 _REASONS = {
     "missing_elevation": "have cells without elevation",
-    "missing_classes": "have cells without a class",
+    "missing_classes": "have no cell with a class, or cells without one and no photo of them",
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
@@ -54,8 +54,8 @@ def import_dem(
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset from rasters, yielding (maps done, maps in all); to be iterated to the end.
 
-    Maps with missing cells are left out. A map's random numbers go by its number in the ground, so they
-    are the same whichever others are left out.
+    Maps with cells without elevation or colour are left out. Cells without a class or a measured λ are kept as
+    such. A map's random numbers go by its number in the ground, so they are the same whichever others are left out.
 
     Args:
         rasters: where elevation, classes, colours and λ come from.
@@ -125,6 +125,7 @@ class _Part:
     ground: Survey
     numbers: list[int] = field(default_factory=list)
     lowest_m: list[float] = field(default_factory=list)
+    unlabelled: list[int] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
     files: list[Path] = field(default_factory=list)
     pending: list[Maps] = field(default_factory=list)
@@ -134,6 +135,8 @@ class _Part:
         """Takes maps that are kept; writes a shard where there are enough."""
         self.numbers += numbers.tolist()
         self.lowest_m += lowest_m.tolist()
+        if len(numbers):
+            self.unlabelled += (maps["class_id"] == UNLABELLED).sum(axis=(1, 2)).tolist()
         self.pending += [maps] if len(numbers) else []
         if (len(self.numbers) - self.written) * self.recipe.height * self.recipe.width >= SHARD_CELLS:
             self.flush()
@@ -146,12 +149,16 @@ class _Part:
         maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}
         self.files.append(self.folder / shard.name)
         content = pack(self.recipe.id, self.recipe, self.name, self.entry(shard.first), maps)
-        self.files[-1].write_bytes(content)
+        write(self.files[-1], content)
         self.pending, self.written = [], shard.stop
 
     def entry(self, first: int = 0) -> dict[str, Any]:
         """The manifest's entry of the maps from one on."""
-        kept = {"kept": self.numbers[first:], "lowest_m": self.lowest_m[first:]}
+        kept = {
+            "kept": self.numbers[first:],
+            "lowest_m": self.lowest_m[first:],
+            "unlabelled": self.unlabelled[first:],
+        }
         left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
         source = {**self.ground.source, **kept, "left_out": left_out}
         count = len(self.numbers) - first
@@ -165,15 +172,16 @@ def _make(
     """Makes maps and counts those that are left out; gives the others, their numbers and lowest elevations."""
     framed_m, given = ground.read(run)
     kept = np.ones(len(run.columns), dtype=bool)
-    needed = {"missing_elevation": framed_m[:, None, 1:-1, 1:-1]}
+    lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
     if "class_id" in given:
-        needed["missing_classes"] = given["class_id"]
+        unlabelled = np.isnan(given["class_id"])
+        # Without a photo a cell is painted in the colour of its class.
+        lacking["missing_classes"] = (unlabelled.all if "rgb" in given else unlabelled.any)(axis=(1, 2, 3))
     if "rgb" in given:
-        needed["missing_colours"] = given["rgb"]
-    for reason, values in needed.items():
-        lacking = kept & np.isnan(values).any(axis=(1, 2, 3))
-        left_out[reason] += int(lacking.sum())
-        kept &= ~lacking
+        lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
+    for reason, which in lacking.items():
+        left_out[reason] += int((kept & which).sum())
+        kept &= ~which
     numbers = (run.row * ground.tiling.tiles[1] + np.array(run.columns))[kept]
     if not len(numbers):
         return {}, numbers, np.empty(0)
@@ -182,10 +190,14 @@ def _make(
     lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
     class_id = class_map(recipe, run.split, numbers)
     if "class_id" in given:
-        class_id = given["class_id"][:, 0].astype(np.int64)
+        class_id = np.nan_to_num(given["class_id"][:, 0], nan=UNLABELLED).astype(np.int64)
+    labelled = class_id != UNLABELLED
     spec = recipe.splits[run.split]
     height_m = framed_m - lowest_m[:, None, None]
-    maps = complete(recipe, recipe.scenarios[spec.scenario], run.split, numbers, class_id, height_m)
+    some_class = np.where(labelled, class_id, 0)
+    maps = complete(recipe, recipe.scenarios[spec.scenario], run.split, numbers, some_class, height_m)
+    maps["class_id"] = class_id
+    maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
     if "class_id" in given:
         maps["environment"] = np.zeros(len(numbers))
     if "rgb" in given:

@@ -11,8 +11,8 @@ from pathlib import Path
 from benchnav.datagen import schema
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
+from benchnav.datagen.files.hdf5 import named_errors
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.writer import named_errors
 from benchnav.errors import DatasetError
 from benchnav.files import sole_writer
 

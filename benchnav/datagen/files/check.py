@@ -167,6 +167,8 @@ def _out_of_range(name: str, values: np.ndarray, classes: int) -> list[int]:
     field = schema.FIELDS[name]
     most = classes - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
+    if name == "class_id":
+        allowed |= values == schema.UNLABELLED
     if name in ("reference_time_s", "traversability"):  # not asked for; not observed
         allowed |= np.isnan(values)
     return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

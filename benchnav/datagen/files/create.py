@@ -21,12 +21,12 @@ import joblib
 import benchnav
 from benchnav.cluster import connected, parallel, told_when_lost
 from benchnav.datagen.files.folder import Contents, restore, take_place, whole, write_manifest
+from benchnav.datagen.files.hdf5 import check_target, is_one_file, named_errors, writing
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, is_dataset, open_file, read_manifest
-from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make
-from benchnav.datagen.files.writer import check_target, is_one_file, named_errors, writing
+from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make, write
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.errors import ConfigError, DatasetError
-from benchnav.files import real_place, replacing, sole_writer
+from benchnav.files import real_place, sole_writer
 from benchnav.share import Share
 from benchnav.workers import end_with
 
@@ -86,8 +86,7 @@ def create(
         yield done, total
         with _runner(recipe, jobs, scheduler if missing else "") as run, _left_nothing(folder, path):
             for shard, content in run(missing):
-                with replacing(folder / shard.name) as partial:
-                    partial.write_bytes(content)
+                write(folder / shard.name, content)
                 done += shard.maps
                 yield done, total
         if not _are_all_there(folder, recipe, shards, overwrite):

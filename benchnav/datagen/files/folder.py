@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchnav.datagen import schema
+from benchnav.datagen.files.hdf5 import manifest_of
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
-from benchnav.datagen.files.writer import manifest_of
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.files import write_text
 

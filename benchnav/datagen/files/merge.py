@@ -17,8 +17,8 @@ import numpy as np
 from benchnav.datagen import schema
 from benchnav.datagen.files.create import check_place, join
 from benchnav.datagen.files.folder import Contents, restore, take_place, whole, write_manifest
+from benchnav.datagen.files.hdf5 import is_one_file, named_errors
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
-from benchnav.datagen.files.writer import is_one_file, named_errors
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
 from benchnav.errors import ConfigError, DatasetError

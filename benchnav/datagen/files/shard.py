@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 import benchnav
+from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.writer import pack
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
 from benchnav.errors import DatasetError
+from benchnav.files import replacing
 
 SHARD_CELLS = 2**20
 
@@ -66,6 +67,12 @@ def make(recipe: Recipe, shard: Shard) -> bytes:
     """
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
     return pack(recipe.id, recipe, shard.split, _entry(recipe, shard), maps)
+
+
+def write(path: Path, content: bytes) -> None:
+    """Puts a shard in its place, whole or not at all."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
 
 
 def is_there(path: Path, recipe: Recipe, shard: Shard) -> bool:

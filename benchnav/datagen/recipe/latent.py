@@ -10,6 +10,7 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 import numpy as np
 
 from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, twins
+from benchnav.datagen.schema import UNLABELLED
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
 
@@ -36,14 +37,18 @@ def truth(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainCla
     """The true distribution of λ in each cell, as a Gaussian mixture before clipping.
 
     Args:
-        class_id: shape [B, H, W].
+        class_id: 255 where not known, shape [B, H, W].
         slope_deg: shape [B, H, W].
         classes: the class table.
 
     Returns:
         Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2 where the table has
-        soft spots; a class without them has them at weight 0.
+        soft spots; a class without them has them at weight 0. Where the class is not known, means are NaN.
     """
+    unlabelled = class_id == UNLABELLED
+    if unlabelled.any():
+        share, mean, std = truth(np.where(unlabelled, 0, class_id), slope_deg, classes)
+        return share, np.where(unlabelled[:, None], np.nan, mean), std
     firm = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
     if not any(c.soft for c in classes):
         return np.ones((len(firm[0]), 1, *firm[0].shape[1:])), firm[0][:, None], firm[1][:, None]
@@ -70,12 +75,14 @@ def look_alikes(
     most = max(len(own) for own in alike)
     if most == 1:
         return None
+    unlabelled = class_id == UNLABELLED
+    class_id = np.where(unlabelled, 0, class_id)
     pieces = []
     for place in range(most):
         other = np.take([own[place % len(own)] for own in alike], class_id)
         share = np.take([1 / len(own) if place < len(own) else 0.0 for own in alike], class_id)
         weights, means, stds = truth(other, slope_deg, classes)
-        pieces.append((weights * share[:, None], means, stds))
+        pieces.append((weights * share[:, None], np.where(unlabelled[:, None], np.nan, means), stds))
     weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
     return weights, means, stds
 

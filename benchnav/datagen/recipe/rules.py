@@ -10,7 +10,7 @@ from benchnav.copula import LONGEST_CORRELATION
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.environments import never_shown
 from benchnav.datagen.recipe.places import check_places
-from benchnav.datagen.schema import FIELDS
+from benchnav.datagen.schema import FIELDS, UNLABELLED
 from benchnav.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -109,8 +109,8 @@ def _check_environments(recipe: "Recipe") -> None:
         raise ConfigError(
             f"Expected `class_periods_m` of at least a cell, {recipe.resolution_m} m, got {list(periods)}."
         )
-    if len(classes) > 256:
-        raise ConfigError(f"Expected at most 256 classes, got {len(classes)}.")
+    if len(classes) > UNLABELLED:
+        raise ConfigError(f"Expected at most {UNLABELLED} classes, got {len(classes)}.")
 
 
 def _check_splits(recipe: "Recipe") -> None:

@@ -9,7 +9,7 @@ from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.run.check_world import Say, check_budgets, check_luck
+from benchnav.eval.run.check_world import Say, check_budgets, check_known_ground, check_luck
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
 from benchnav.eval.unit import Extent
@@ -70,6 +70,7 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
     for trial in _distinct(trials, ("risk",)):
         _check_risk(trial)
     check_budgets(trials, datasets, suite.instances, say)
+    check_known_ground(trials, datasets, suite.instances)
     check_luck(trials, datasets, suite)
     _check_single_class(trials, datasets)
     if elsewhere:

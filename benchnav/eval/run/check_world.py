@@ -11,6 +11,7 @@ from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial
 from benchnav.eval.unit import BLOCK_INSTANCES
 from benchnav.planning.world.frozen import check_correlation, draw_frozen
+from benchnav.planning.world.realisation import check_known
 
 Say = Callable[[str], None]
 Datasets = Mapping[str, TerrainDataset]
@@ -44,6 +45,24 @@ def check_budgets(trials: Sequence[Trial], datasets: Datasets, instances: int, s
                 f"in {late.sum()} of {len(late)} instances of {trial.split} a robot of {top_speed:g} m/s cannot "
                 f"reach the goal within T"
             )
+
+
+def check_known_ground(trials: Sequence[Trial], datasets: Datasets, instances: int) -> None:
+    """Refuses maps with cells whose λ a world cannot tell, which only maps that were imported have.
+
+    Raises:
+        ConfigError: there are such.
+    """
+    seen = set()
+    for trial in trials:
+        case, dataset = (trial.data, trial.split, trial.world.noise), datasets[trial.data]
+        imported = any("source" in part for part in dataset.splits[trial.split]["parts"])
+        if case in seen or not imported:
+            continue
+        seen.add(case)
+        chosen = range(instances or dataset.map_count(trial.split))
+        for start in chosen[::BLOCK_INSTANCES]:
+            check_known(dataset.terrain(trial.split, chosen[start : start + BLOCK_INSTANCES]), trial.world)
 
 
 def check_luck(trials: Sequence[Trial], datasets: Datasets, suite: Suite) -> None:

@@ -21,7 +21,6 @@ from benchnav.eval.folder.folder import (
     unit_rows,
 )
 from benchnav.eval.folder.sameness import differences
-from benchnav.eval.folder.shard import shard_of
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.driven_ground import keep_ground
@@ -152,7 +151,7 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run], of: int) -> None:
         return
     counts: dict[int, int] = {}
     for unit in missing:
-        index = shard_of(unit, of).index
+        index = unit.share(of).index
         counts[index] = counts.get(index, 0) + 1
     folders = {_shard(run).index: run.folder for run in runs}
     named = []

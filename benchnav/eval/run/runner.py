@@ -35,7 +35,6 @@ from benchnav.eval.folder.folder import (
     write_errors,
     write_unit,
 )
-from benchnav.eval.folder.shard import shard_of
 from benchnav.eval.folder.steps import align_steps, write_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_suite
@@ -150,7 +149,7 @@ def run_work(
             _drop(folder)
         about, trials = _begin(work, folder, say)
         every = units(trials, work.keep)
-        own = [unit for unit in every if work.shard is None or shard_of(unit, work.shard.of) == work.shard]
+        own = [unit for unit in every if work.shard is None or unit.share(work.shard.of) == work.shard]
         known = [(unit, about_unit(folder, unit, about["run_id"])) for unit in own]
         # With what it has kept, so that a run is never the poorer for being asked for more.
         missing = [

@@ -1,7 +1,8 @@
 """The terrain classifier: from a colour image to class probabilities of every cell.
 
 Any architecture and encoder of segmentation-models-pytorch fits; the default is the U-Net with a
-ResNet-18 encoder of paper III-B. Letters in shapes: B maps, H×W cells, C classes.
+ResNet-18 encoder of paper III-B. Cells whose class is not known count neither in losses nor in measures. Letters
+in shapes: B maps, H×W cells, C classes.
 """
 
 from typing import Any
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from torchmetrics import MetricCollection
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.network import build_network
@@ -34,8 +36,8 @@ class CrossEntropyWithDice(nn.Module):
         """Sets the two losses up."""
         super().__init__()
         self.dice = dice
-        self.cross_entropy = nn.CrossEntropyLoss(label_smoothing=label_smoothing)
-        self.overlap = smp.losses.DiceLoss("multiclass")
+        self.cross_entropy = nn.CrossEntropyLoss(ignore_index=UNLABELLED, label_smoothing=label_smoothing)
+        self.overlap = smp.losses.DiceLoss("multiclass", ignore_index=UNLABELLED)
 
     def forward(self, logits: Tensor, class_id: Tensor) -> Tensor:
         """Computes the loss of logits [B, C, H, W] where the classes are `class_id` [B, H, W]."""
@@ -87,14 +89,14 @@ class TerrainClassifier(lightning.LightningModule):
         """The training loss: cross-entropy, a proper score, unless more is asked for."""
         if self.config.dice:
             return CrossEntropyWithDice(self.config.dice, self.config.label_smoothing)
-        return nn.CrossEntropyLoss(label_smoothing=self.config.label_smoothing)
+        return nn.CrossEntropyLoss(ignore_index=UNLABELLED, label_smoothing=self.config.label_smoothing)
 
     def configure_metrics(self) -> MetricCollection:
         """What is measured on the validation maps."""
         return MetricCollection(
             {
-                "accuracy": MulticlassAccuracy(self.class_count, average="micro"),
-                "miou": MulticlassJaccardIndex(self.class_count, average="macro"),
+                "accuracy": MulticlassAccuracy(self.class_count, average="micro", ignore_index=UNLABELLED),
+                "miou": MulticlassJaccardIndex(self.class_count, average="macro", ignore_index=UNLABELLED),
             },
             prefix="valid_",
         )

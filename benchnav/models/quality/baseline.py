@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
@@ -28,10 +29,12 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
 
 
 def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
-    """Share of a split's cells whose class `nearest_colour` tells."""
+    """Share of a split's labelled cells whose class `nearest_colour` tells."""
     colours = torch.tensor([item.colour for item in dataset.recipe.classes])
-    right = 0.0
+    right, cells = 0, 0
     for _, maps in dataset.chunks(split, ("rgb", "class_id")):
         found = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
-        right += float((found == torch.from_numpy(maps["class_id"]).long()).double().mean((1, 2)).sum())
-    return right / dataset.map_count(split)
+        class_id = torch.from_numpy(maps["class_id"])
+        right += int((found == class_id).sum())
+        cells += int((class_id != UNLABELLED).sum())
+    return right / max(1, cells)

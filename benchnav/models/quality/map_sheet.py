@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.preview import class_colours
+from benchnav.datagen.preview import LACKING, class_colours, class_shades
 from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.drawing import TEXT, add_axes, thin_ticks, write
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
 from benchnav.models.probabilities import class_probabilities
@@ -116,7 +116,7 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
         classes: of the dataset.
     """
     kinds: dict[str, Any] = {
-        "cmap": ListedColormap(list(class_colours(classes))), "vmin": -0.5, "vmax": len(classes) - 0.5
+        "cmap": class_shades(class_colours(classes)), "vmin": -0.5, "vmax": len(classes) - 0.5
     }  # fmt: skip
     share = {"cmap": "viridis", "vmin": 0, "vmax": 1}
     scales: dict[str, dict[str, Any]] = {
@@ -130,7 +130,7 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
     ):
         values = [np.abs(sheet.layers[name]).ravel() for sheet in sheets if name in sheet.layers]
         if values:
-            most = _round_up(float(np.quantile(np.concatenate(values), _SHOWN_SHARE)))
+            most = _round_up(float(np.nanquantile(np.concatenate(values), _SHOWN_SHARE)))
             scales[name] = {"cmap": palette, "vmin": -most if name == "error" else 0, "vmax": most}
     return scales
 
@@ -150,7 +150,8 @@ def map_sheet_figure(
     width_m, height_m = sheet.extent_m
     high = _PANEL * float(np.clip(height_m / width_m, 0.3, 3))
     shown = _shown_classes(sheet)
-    legend_rows = -(-len(shown) // _LEGEND_COLUMNS)
+    lacking = bool(np.isnan(sheet.layers["error"]).any())
+    legend_rows = -(-(len(shown) + lacking) // _LEGEND_COLUMNS)
     bottom = _TOP + len(sheet.indices) * (high + _GAP) - _GAP
     size = (
         _LEFT + len(names) * (_PANEL + _GAP) - _GAP + _RIGHT,
@@ -164,8 +165,10 @@ def map_sheet_figure(
         for row, index in enumerate(sheet.indices):
             top = _TOP + row * (high + _GAP)
             panel = add_axes(figure, (left, top, _PANEL, high), f"{name} {row}")
+            panel.set_facecolor(LACKING)
+            layer = sheet.layers[name][row]
             image = panel.imshow(
-                sheet.layers[name][row],
+                np.ma.masked_equal(layer, UNLABELLED) if name == "class_true" else layer,
                 origin="lower",
                 extent=extent,
                 aspect="auto",
@@ -197,6 +200,8 @@ def map_sheet_figure(
             Patch(facecolor=colours[n], ec="0.3", lw=0.4, label=classes[n].name.replace("_", " "))
             for n in shown
         ]
+        if lacking:
+            patches.append(Patch(facecolor=LACKING, label="not known"))
         legend = figure.legend(
             handles=patches, loc="upper left", ncols=_LEGEND_COLUMNS, fontsize=TEXT, frameon=False,
             bbox_to_anchor=(_LEFT / size[0], 1 - (bottom + 0.38) / size[1]), borderaxespad=0, borderpad=0,
@@ -209,7 +214,7 @@ def map_sheet_figure(
 
 def _shown_classes(sheet: MapSheet) -> list[int]:
     layers = [sheet.layers[name] for name in ("class_true", "class_found") if name in sheet.layers]
-    return np.unique(layers).tolist() if layers else []
+    return [number for number in np.unique(layers).tolist() if number != UNLABELLED] if layers else []
 
 
 def _round_up(value: float) -> float:

@@ -5,6 +5,7 @@ themselves stand in `scores` and `uncertainty`. Letters in shapes: B maps, H×W 
 cells of all maps.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -20,8 +21,10 @@ from torchmetrics.classification import (
 from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import twins
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
+from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, predict
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.scores import (
@@ -97,7 +100,7 @@ class TraversabilityQuality:
 
     Args:
         rmse_observed: root mean square of E[λ] − λ as realised.
-        rmse_expected: root mean square of E[λ] − E[λ] in truth.
+        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none.
         nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1.
         crps: continuous ranked probability score of λ as realised.
         coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
@@ -195,21 +198,25 @@ def measure(
         generator: of the draws within atoms, on the CPU.
         alike: of each class those that look like it, itself among them; empty where none do.
     """
-    maps, cells, sums = 0, 0, torch.zeros(6, dtype=torch.float64)
+    maps, cells, sums = 0, 0, torch.zeros(7, dtype=torch.float64)
     histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
     classes: list[_ClassTally] = []
     for terrain in chunks:
-        mixture = predict(model, terrain)
+        mixture, members = _predict(model, terrain)
         scores, transformed = _score_cells(mixture, terrain, generator)
         sums += scores.cpu()
         histogram += pit_counts(transformed)
         maps, cells = maps + len(terrain), cells + transformed.numel()
         if isinstance(model, ClassModel):
-            classes = classes or [_ClassTally(model, terrain, alike)]
-            classes[0].add(class_probabilities(mixture, len(model.class_names)), terrain)
+            classes = classes or [
+                _ClassTally(len(model.class_names), terrain.rgb.device, len(members) > 1, alike)
+            ]
+            probabilities = class_probabilities(mixture, len(model.class_names))
+            classes[0].add(probabilities, members, terrain.class_id, terrain.slope_deg)
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    squared_observed, squared_expected, nll, score, covered, in_tail = (sums / cells).tolist()
+    squared_expected = float(sums[5] / sums[6])
+    squared_observed, nll, score, covered, in_tail = (sums[:5] / cells).tolist()
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
@@ -225,15 +232,32 @@ def measure(
     )
 
 
-class _ClassTally:
-    """Counts of a model's class probabilities over maps."""
+def _predict(model: AnyModel, terrain: Terrain) -> tuple[TraversabilityMixture, Tensor]:
+    """The prediction, and the class probabilities of M members, shape [M, B, C, H, W], M = 0 where there are none."""
+    if isinstance(model, FusedModel):
+        observation = terrain.observe()
+        members = model.member_probabilities(observation)
+        return model.fuse(members, observation), members
+    mixture = predict(model, terrain)
+    members = torch.zeros(0)
+    if isinstance(model, EnsembleModel):
+        members = model.member_probabilities(terrain.observe())
+    return mixture, members
 
-    def __init__(self, model: ClassModel, first: Terrain, alike: Sequence[tuple[int, ...]]) -> None:
-        count, device = len(model.class_names), first.rgb.device
-        self.members: list[EnsembleModel] = []
-        if isinstance(model, EnsembleModel):
-            one = first.select(torch.zeros(1, dtype=torch.int64, device=device))
-            self.members = [model] if len(model.member_probabilities(one.observe())) > 1 else []
+
+class _ClassTally:
+    """Counts of a model's class probabilities over maps, in the cells whose class is known.
+
+    Args:
+        count: number of classes C.
+        device: where the maps are.
+        several: whether the model has several members.
+        alike: of each class those that look like it, itself among them; empty where none do.
+    """
+
+    def __init__(
+        self, count: int, device: torch.device, several: bool, alike: Sequence[tuple[int, ...]]
+    ) -> None:
         self.by_class = MetricCollection(
             {
                 "accuracy": MulticlassAccuracy(count, average="micro"),
@@ -242,46 +266,45 @@ class _ClassTally:
             }
         ).to(device)
         self.brier, self.reliability = BrierScore().to(device), ReliabilityCurve().to(device)
-        self.rankings = [ErrorRanking().to(device) for _ in range(1 + len(self.members))]
-        self.uncertainty = [0.0 for _ in self.rankings]
-        self.cells = 0
+        self.entropy = _Uncertainty(device)
+        self.information = _Uncertainty(device) if several else None
         self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
         self.twins = TwinTally(alike, device) if any(len(own) > 1 for own in alike) else None
 
-    def add(self, probabilities: Tensor, terrain: Terrain) -> None:
-        """Adds maps: class probabilities [B, C, H, W] and the truth."""
+    def add(self, probabilities: Tensor, members: Tensor, class_id: Tensor, slope_deg: Tensor) -> None:
+        """Adds maps: probabilities [B, C, H, W], of members [M, B, C, H, W], true classes and slopes [B, H, W]."""
+        labelled = class_id != UNLABELLED
+        if not bool(labelled.any()):
+            return
+        if not bool(labelled.all()):
+            probabilities = _in_a_row(probabilities[None], labelled)[0]
+            members = _in_a_row(members, labelled) if self.information is not None else members
+            class_id, slope_deg = (layer[labelled][None, None] for layer in (class_id, slope_deg))
         found = probabilities.argmax(1)
-        self.by_class.update(found, terrain.class_id)
-        self.brier.update(probabilities, terrain.class_id)
-        self.reliability.update(probabilities, terrain.class_id)
-        measures = [predictive_entropy(probabilities)]
-        measures += [mutual_information(m.member_probabilities(terrain.observe())) for m in self.members]
-        for place, measure in enumerate(measures):
-            self.rankings[place].update(measure, found != terrain.class_id)
-            self.uncertainty[place] += float(measure.double().sum())
-        self.cells += found.numel()
-        degree = terrain.slope_deg.floor().long().clamp(0, 89)
-        counted = torch.bincount(
-            (90 * terrain.class_id + degree).flatten(), minlength=self.slope_cells.numel()
-        )
+        wrong = found != class_id
+        self.by_class.update(found, class_id)
+        self.brier.update(probabilities, class_id)
+        self.reliability.update(probabilities, class_id)
+        self.entropy.add(predictive_entropy(probabilities), wrong)
+        if self.information is not None:
+            self.information.add(mutual_information(members), wrong)
+        degree = slope_deg.floor().long().clamp(0, 89)
+        counted = torch.bincount((90 * class_id + degree).flatten(), minlength=self.slope_cells.numel())
         self.slope_cells += counted.view_as(self.slope_cells)
         if self.twins is not None:
-            self.twins.add(probabilities, terrain.class_id)
+            self.twins.add(probabilities, class_id)
 
     def quality(self) -> ClassQuality:
         by_class, curve = self.by_class.compute(), self.reliability.compute().cpu()
-        uncertainty = [total / self.cells for total in self.uncertainty]
-        auroc = [float(ranking.compute()) for ranking in self.rankings]
-        single = [float("nan")]
         return ClassQuality(
             accuracy=float(by_class["accuracy"]),
             miou=float(by_class["miou"]),
             ece=calibration_error(curve),
             brier=float(self.brier.compute()),
-            entropy=uncertainty[0],
-            mutual_information=(uncertainty[1:] or single)[0],
-            entropy_auroc=auroc[0],
-            mutual_information_auroc=(auroc[1:] or single)[0],
+            entropy=self.entropy.mean,
+            mutual_information=math.nan if self.information is None else self.information.mean,
+            entropy_auroc=self.entropy.auroc,
+            mutual_information_auroc=math.nan if self.information is None else self.information.auroc,
             confusion=tuple(tuple(row) for row in by_class["confusion"].tolist()),
             reliability=Reliability(
                 cells=tuple(int(cells) for cells in curve[0]),
@@ -293,24 +316,53 @@ class _ClassTally:
         )
 
 
+class _Uncertainty:
+    """Counts of a measure of uncertainty over cells."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._ranking, self._total, self._cells = ErrorRanking().to(device), 0.0, 0
+
+    def add(self, measure: Tensor, wrong: Tensor) -> None:
+        """Adds cells: the measure, and whether each is wrongly classified, of one shape."""
+        self._ranking.update(measure, wrong)
+        self._total += float(measure.double().sum())
+        self._cells += measure.numel()
+
+    @property
+    def mean(self) -> float:
+        return self._total / self._cells
+
+    @property
+    def auroc(self) -> float:
+        return float(self._ranking.compute())
+
+
+def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
+    """Takes N cells out of maps, from [M, B, C, H, W] to [M, 1, C, 1, N]."""
+    return layers.movedim(2, -1)[:, which].movedim(-1, 1)[:, None, :, None]
+
+
 def _score_cells(
     mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Sums of squared errors, NLL, CRPS, covered and tail cells, float64, shape [6]; and every PIT.
+    """What is summed over cells, float64, shape [7]; and every PIT.
 
-    Cells whose λ was not observed are left out.
+    The sums: squared errors, NLL, CRPS, covered cells, cells in the tail, squared errors of E[λ], and the cells of
+    which these are. Cells whose λ was not observed are left out.
     """
     known = ~terrain.traversability.isnan()
     mixture, observed = mixture.at(known), terrain.traversability[known].unsqueeze(0)
     truth = terrain.truth.at(known).mean()
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
+    errors = (expected - truth).double().square()  # not a number where the class is not known
     sums = [
         (expected - observed).double().square().sum(),
-        (expected - truth).double().square().sum(),
         -mixture.log_prob(observed).double().sum(),
         crps(mixture, observed).double().sum(),
         torch.as_tensor(coverage(transformed) * cells, device=observed.device),
         torch.as_tensor(tail_rate(transformed, LEVEL) * cells, device=observed.device),
+        errors.nansum(),
+        (~errors.isnan()).sum(),
     ]
     return torch.stack([total.double() for total in sums]), transformed

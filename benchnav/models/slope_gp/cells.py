@@ -1,7 +1,7 @@
 """Cells that a robot has driven over, from maps or from slip logs: what the class-wise GPs learn from.
 
-Cells whose slope or traversability was not observed (NaN) are left out. Letters in shapes: N cells, C
-classes.
+Cells whose slope or traversability was not observed (NaN), or whose class is not known, are left out. Letters in
+shapes: N cells, C classes.
 """
 
 from collections.abc import Iterator
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.models.slope_gp.table import SlopeTable
 
@@ -47,10 +48,10 @@ class Cells:
 
 
 def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, class_count: int) -> Cells:
-    """Takes out the cells whose slope and traversability were observed.
+    """Takes out the cells whose slope and traversability were observed and whose class is known.
 
     Args:
-        class_id: integers in [0, C), any shape.
+        class_id: integers in [0, C), 255 where not known, any shape.
         slope_deg: slopes in [0, 90], NaN where not observed, shape of `class_id`.
         traversability: λ in [0, 1], NaN where not observed, shape of `class_id`.
         class_count: C.
@@ -64,7 +65,7 @@ def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, 
             "Expected `class_id`, `slope_deg` and `traversability` of one length, "
             f"got {len(ids)}, {len(slopes)} and {len(values)}."
         )
-    seen = ~(slopes.isnan() | values.isnan())
+    seen = ~(slopes.isnan() | values.isnan()) & (ids != UNLABELLED)
     cells = Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
     _check_range("class_id", cells.class_id, class_count - 1)
     _check_range("slope_deg", cells.slope_deg, 90)

@@ -2,12 +2,15 @@
 
 from collections.abc import Iterable
 
+import torch
+
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.terrain import Terrain
 
 
 def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, float]:
-    """Measures the GPs apart from the classifier, each cell read with its true class.
+    """Measures the GPs apart from the classifier, each cell that has a class read with it.
 
     Args:
         table: the GPs over slope.
@@ -19,17 +22,20 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain]) -> dict[str, fl
     """
     squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
     for terrain in chunks:
-        table, known = table.to(terrain.class_id.device), ~terrain.traversability.isnan()
-        own = table.own(terrain.class_id, terrain.slope_deg)
-        squares += float((own.means[:, 0] - terrain.truth.means[:, 0]).double().square().sum())
-        cells += terrain.class_id.numel()
+        table, labelled = table.to(terrain.class_id.device), terrain.class_id != UNLABELLED
+        class_id = torch.where(labelled, terrain.class_id, 0)
+        own, known = table.own(class_id, terrain.slope_deg), labelled & ~terrain.traversability.isnan()
+        errors = (own.means[:, 0] - terrain.truth.means[:, 0])[labelled]
+        squares += float(errors.double().square().sum())
+        cells += errors.numel()
         observed = terrain.traversability[known].unsqueeze(0)
         surprise -= float(own.at(known).log_prob(observed).double().sum())
         seen += int(known.sum())
-        ratio = table.noise_std[terrain.class_id] / terrain.truth.stds[:, 0]
-        noise_error = max(noise_error, float((ratio - 1).abs().max()))
+        ratio = (table.noise_std[class_id] / terrain.truth.stds[:, 0])[labelled]
+        if len(ratio):
+            noise_error = max(noise_error, float((ratio - 1).abs().max()))
     return {
-        "latent_rmse": (squares / cells) ** 0.5,
+        "latent_rmse": (squares / max(1, cells)) ** 0.5,
         "noise_error": noise_error,
         "nll": surprise / max(1, seen),
     }

@@ -6,6 +6,7 @@ import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER, Part, as_stored, member_name, member_names
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
@@ -56,17 +57,18 @@ def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, 
         model: in evaluation, on the CPU.
         maps: with `rgb` and `class_id`.
     """
-    loss, right, miou = 0.0, 0, MulticlassJaccardIndex(model.class_count)
+    loss, right, cells, miou = 0.0, 0, 0, MulticlassJaccardIndex(model.class_count, ignore_index=UNLABELLED)
     with torch.inference_mode():
         for indices, some in maps.chunks():
             logits, class_id = model(some["rgb"]), some["class_id"].long()
             loss += float(model.loss(logits, class_id)) * len(indices)
             chosen = logits.argmax(1)
             right += int((chosen == class_id).sum())
+            cells += int((class_id != UNLABELLED).sum())
             miou.update(chosen, class_id)
     return {
         "valid_loss": loss / len(maps),
-        "valid_accuracy": right / (len(maps) * maps.shape[0] * maps.shape[1]),
+        "valid_accuracy": right / max(1, cells),
         "valid_miou": float(miou.compute()),
     }
 

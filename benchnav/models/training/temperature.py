@@ -15,6 +15,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
 from benchnav import rng
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.training.data import MapDataset
 
 _MOST_CELLS = 200_000
@@ -62,7 +63,7 @@ def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tup
         seed: root seed of the draw.
 
     Returns:
-        Logits [N, C] and true classes [N], int64.
+        Logits [N, C] and true classes [N], int64, of the cells whose class is known.
     """
     cells = maps.shape[0] * maps.shape[1]
     kept = min(cells, max(1, _MOST_CELLS // len(maps)))
@@ -74,4 +75,6 @@ def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tup
             for place, which in enumerate(indices):
                 drawn = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0][:kept])
                 found.append((logits[place][:, drawn].T.clone(), class_id[place, drawn]))
-    return torch.cat([logits for logits, _ in found]), torch.cat([classes for _, classes in found])
+    all_logits, all_classes = (torch.cat(parts) for parts in zip(*found, strict=True))
+    labelled = all_classes != UNLABELLED
+    return all_logits[labelled], all_classes[labelled]

@@ -47,12 +47,17 @@ class Realisation:
         key: int,
         instances: Sequence[int],
     ) -> None:
-        """Draws all luck."""
+        """Draws all luck.
+
+        Raises:
+            ConfigError: λ of some cells is not known.
+        """
+        check_known(terrain, world)
         self._grid = terrain.grid
         self.attempts = torch.ones(len(terrain), dtype=torch.int64, device=terrain.traversability.device)
         self.field: Tensor | None = None
         if world.noise == "stored":
-            self.field = _stored(terrain)
+            self.field = terrain.traversability
         elif world.noise == "frozen":
             self.field, self.attempts = draw_frozen(terrain, world, places, key, instances)
         if self.field is not None:
@@ -106,13 +111,22 @@ class Realisation:
         return made
 
 
-def _stored(terrain: Terrain) -> Tensor:
-    if bool(terrain.traversability.isnan().any()):
+def check_known(terrain: Terrain, world: World) -> None:
+    """Refuses maps with cells whose λ a world cannot tell.
+
+    Raises:
+        ConfigError: they have such cells.
+    """
+    if bool(terrain.truth.means.isnan().any()):
+        raise ConfigError(
+            "Expected maps with a class in every cell to drive on, got some without: their λ is not known. "
+            "Maps with unlabelled cells are there to train and measure models on."
+        )
+    if world.noise == "stored" and bool(terrain.traversability.isnan().any()):
         raise ConfigError(
             "Expected maps with λ in every cell for `noise` 'stored', got some that were not observed. "
             "Take `noise` 'resampled'."
         )
-    return terrain.traversability
 
 
 def _padded_parameters(truth: TraversabilityMixture, grid: Grid) -> Tensor:

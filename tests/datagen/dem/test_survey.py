@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchnav.datagen.dem.survey import provenance
-from benchnav.datagen.schema import quantise
+from benchnav.datagen.schema import UNLABELLED, quantise
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.datagen.synth.slope import slope_deg
 from tests.datagen.dem.rasters import (
@@ -250,8 +250,9 @@ def test_other_rasters_may_be_in_another_crs_and_their_gaps_leave_maps_out(tmp_p
     source, maps = source_of(dataset), maps_of(dataset)
     # They end a metre beyond 24 m × 24 m, of which the ground has 36 m × 24 m.
     assert source["kept"] == [0, 1, 3, 4, 6, 7]
-    assert source["left_out"]["missing_classes"] == 3
-    assert source["left_out"]["missing_colours"] == 0
+    # Of cells without a class a map may have some, of cells without colour none.
+    assert source["left_out"]["missing_classes"] == 0
+    assert source["left_out"]["missing_colours"] == 3
     expected = reprojected(classes, source, "mode", (48, 48))
     average = reprojected(measured, source, "average", (48, 48))
     for index, number in enumerate(source["kept"]):
@@ -374,7 +375,7 @@ def test_classes_are_mapped_by_name_and_the_largest_share_wins(tmp_path: Path) -
     assert len(recorded["sha256"]) == 64
 
 
-def test_coarse_classes_are_indices_by_default_and_their_gaps_leave_maps_out(tmp_path: Path) -> None:
+def test_coarse_classes_are_indices_by_default_and_their_gaps_leave_painted_maps_out(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", rough(16, 48))
     values = np.arange(4 * 12).reshape(4, 12) % 9
     values[1, 8] = 255
@@ -386,7 +387,7 @@ def test_coarse_classes_are_indices_by_default_and_their_gaps_leave_maps_out(tmp
     np.testing.assert_array_equal(maps_of(dataset)["class_id"][0], expected)
 
 
-def test_a_class_of_no_name_leaves_its_map_out(tmp_path: Path) -> None:
+def test_a_class_of_no_name_leaves_its_painted_map_out(tmp_path: Path) -> None:
     dem, values = write(tmp_path / "dem.tif", rough(16, 48)), np.full((16, 48), 7, np.uint8)
     values[3, 3] = 9
     classes = write(tmp_path / "classes.tif", values)
@@ -395,6 +396,53 @@ def test_a_class_of_no_name_leaves_its_map_out(tmp_path: Path) -> None:
     assert source_of(dataset)["left_out"]["missing_classes"] == 1
     assert source_of(dataset)["classes"]["ids"] == {"7": "scree", "9": None}
     assert (maps_of(dataset)["class_id"] == NAMES.index("scree")).all()
+
+
+def test_with_a_photo_cells_without_a_class_are_kept_as_such(tmp_path: Path) -> None:
+    dem, values = write(tmp_path / "dem.tif", rough(16, 72)), np.full((16, 72), 7, np.uint8)
+    values[0, :5] = 9  # the northern row of map 0
+    values[:, 24:48] = 9  # all of map 1
+    classes = write(tmp_path / "classes.tif", values)
+    photo = write(tmp_path / "photo.tif", np.full((3, 16, 72), 90, np.uint8))
+    table = {7: "scree", 9: None}
+    dataset = read(dem, classes=classes, class_ids=table, photo=photo)
+    source, maps = source_of(dataset), maps_of(dataset)
+    assert source["kept"] == [0, 2]
+    assert source["unlabelled"] == [5, 0]
+    assert source["left_out"]["missing_classes"] == 1
+    wanted = np.full((2, 16, 24), NAMES.index("scree"))
+    wanted[0, 15, :5] = UNLABELLED
+    np.testing.assert_array_equal(maps["class_id"], wanted)
+    np.testing.assert_array_equal(np.isnan(maps["traversability"]), wanted == UNLABELLED)
+    truth = dataset.terrain("test/real").truth
+    np.testing.assert_array_equal(truth.means[:, 0].isnan(), wanted == UNLABELLED)
+    assert dataset.manifest["format_version"] == "1.2"  # which readers of 1.1 refuse
+    # What was measured there is kept.
+    measured = write(tmp_path / "lambda.tif", np.full((16, 72), 0.25))
+    known = read(dem, classes=classes, class_ids=table, photo=photo, traversability=measured)
+    assert (maps_of(known)["traversability"] == 0.25).all()
+    # Other cells are as they would be without.
+    values[0, :5] = 7
+    whole = read(dem, classes=write(tmp_path / "whole.tif", values), class_ids=table, photo=photo)
+    labelled, before = wanted != UNLABELLED, maps_of(whole)
+    for name in ("traversability", "slope_deg", "rgb"):
+        assert_same_cells(maps[name], before[name], labelled)
+    assert whole.manifest["format_version"] == "1.0"
+
+
+def assert_same_cells(found: np.ndarray, wanted: np.ndarray, where: np.ndarray) -> None:
+    layers = [array if array.ndim == 3 else array[:, 0] for array in (found, wanted)]
+    np.testing.assert_array_equal(layers[0][where], layers[1][where])
+
+
+def test_ground_without_a_class_is_no_way_to_the_goal(tmp_path: Path) -> None:
+    dem, values = write(tmp_path / "dem.tif", np.zeros((16, 48))), np.zeros((16, 48), np.uint8)
+    values[:, 12:14] = UNLABELLED  # across map 0, between start and goal
+    classes = write(tmp_path / "classes.tif", values, nodata=UNLABELLED)
+    photo = write(tmp_path / "photo.tif", np.full((3, 16, 48), 90, np.uint8))
+    source = source_of(read(dem, classes=classes, photo=photo, solvable=True))
+    assert source["kept"] == [1]
+    assert source["left_out"]["not_solvable"] == 1
 
 
 def test_without_a_class_raster_the_recipe_lays_classes_out_by_map_number(tmp_path: Path) -> None:

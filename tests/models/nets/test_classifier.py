@@ -5,6 +5,7 @@ import segmentation_models_pytorch as smp
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
@@ -242,3 +243,22 @@ def test_weights_without_full_resolution_are_read_back() -> None:
     again = TerrainClassifier.from_tensors({"full_resolution": False}, 4, model.state_dict())
     with torch.no_grad():
         assert torch.equal(model(image(32, 32)), again(image(32, 32)))
+
+
+@pytest.mark.parametrize("dice", [0.0, 0.7])
+def test_cells_without_a_class_are_no_part_of_the_loss_and_the_measures(dice: float) -> None:
+    model = build(dice=dice)
+    logits = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(2), requires_grad=True)
+    class_id = torch.randint(0, 4, (2, 8, 8), generator=torch.Generator().manual_seed(3))
+    holed = class_id.clone()
+    holed[..., 5:] = UNLABELLED
+    loss = model.loss(logits, holed)
+    torch.testing.assert_close(loss, model.loss(logits[..., :5], class_id[..., :5]))
+    (gradient,) = torch.autograd.grad(loss, logits)
+    assert bool((gradient[..., 5:] == 0).all())
+    assert bool((gradient[..., :5] != 0).any())
+    found, wanted = (
+        model.metrics(logits.argmax(1), holed),
+        model.metrics(logits[..., :5].argmax(1), class_id[..., :5]),
+    )
+    assert found == wanted

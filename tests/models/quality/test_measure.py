@@ -6,6 +6,7 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
@@ -16,7 +17,7 @@ from benchnav.models.quality.scores import crps
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
 from benchnav.models.slope_gp.measure import measure_latent
 from benchnav.models.slope_gp.table import SoftModes
-from benchnav.terrain import Observation
+from benchnav.terrain import Observation, Terrain
 from tests.factories import normal
 from tests.models.stub import ColourModel
 from tests.models.support import linear_table, make_terrain
@@ -218,3 +219,91 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
             [replace(holed, traversability=torch.full_like(holed.traversability, torch.nan))],
             generator(1),
         )
+
+
+def half_labelled() -> tuple[Terrain, Terrain]:
+    """Maps of tiny-v1's classes whose right half has no class, and their left half alone."""
+    drawn = make_terrain(batch=3, classes=len(ColourModel().class_names))
+    left = drawn.traversability.clone()
+    kept = slice(None, 8)
+    truth = drawn.truth
+    half = replace(
+        drawn,
+        rgb=drawn.rgb[..., kept],
+        class_id=drawn.class_id[..., kept],
+        elevation_m=drawn.elevation_m[..., kept],
+        slope_deg=drawn.slope_deg[..., kept],
+        truth=TraversabilityMixture(
+            truth.weights[..., kept], truth.means[..., kept], truth.stds[..., kept], (0,)
+        ),
+        traversability=left[..., kept],
+        grid=Grid(16, 8, 0.5),
+    )
+    class_id, means = drawn.class_id.clone(), truth.means.clone()
+    class_id[..., 8:], means[..., 8:] = UNLABELLED, math.nan
+    unknown = TraversabilityMixture(truth.weights, means, truth.stds, (0,))
+    return replace(drawn, class_id=class_id, truth=unknown), half
+
+
+def test_cells_without_a_class_count_in_no_measure_of_classes() -> None:
+    holed, half = half_labelled()
+    alike = ((0, 1), (0, 1), *((c,) for c in range(2, len(ColourModel().class_names))))
+    whole, wanted = (measure(ColourModel(), [one], generator(), alike) for one in (holed, half))
+    found, expected = whole.classes[0], wanted.classes[0]
+    assert found.confusion == expected.confusion
+    assert found.slope_cells == expected.slope_cells
+    assert found.reliability.cells == expected.reliability.cells
+    names = (
+        "accuracy", "miou", "ece", "brier", "entropy", "mutual_information", "entropy_auroc",
+        "mutual_information_auroc",
+    )  # fmt: skip
+    for name in names:
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6), name
+    assert found.twins is not None
+    assert expected.twins is not None
+    assert astuple(found.twins) == pytest.approx(astuple(expected.twins))
+
+
+def test_where_no_class_is_known_the_measured_traversability_counts_and_the_expected_does_not() -> None:
+    holed, half = half_labelled()
+    found, of_half = (measure(ColourModel(), [one], generator()).traversability for one in (holed, half))
+    assert found.rmse_expected == pytest.approx(of_half.rmse_expected, rel=1e-6)
+    assert sum(found.pit) == 2 * sum(of_half.pit)
+    mixture = ColourModel().predict(holed.observe())
+    wanted = -float(mixture.log_prob(holed.traversability).mean())
+    assert found.nll == pytest.approx(wanted, rel=1e-5)
+
+
+def test_maps_without_any_class_are_measured_by_their_traversability_alone() -> None:
+    holed, _ = half_labelled()
+    bare = replace(
+        holed,
+        class_id=torch.full_like(holed.class_id, UNLABELLED),
+        truth=replace(holed.truth, means=torch.full_like(holed.truth.means, math.nan)),
+    )
+    quality = measure(ColourModel(), [holed, bare], generator())
+    assert quality.classes[0].accuracy == measure(ColourModel(), [holed], generator()).classes[0].accuracy
+    assert math.isnan(measure(Oracle(), [bare], generator()).traversability.rmse_expected)
+
+
+def test_an_ensemble_classifies_each_map_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Member(torch.nn.Module):
+        def __init__(self, shift: float) -> None:
+            super().__init__()
+            self.shift = shift
+
+        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+            seen.append(len(rgb))
+            return rgb.float() / 100 + self.shift * torch.arange(3).view(3, 1, 1)
+
+    seen: list[int] = []
+    model = FusedModel([Member(0.0), Member(0.3)], linear_table(), ("a", "b", "c"), pool_temperature=0.7)
+    terrain = make_terrain(batch=3)
+    quality = measure(model, [terrain], generator())
+    assert sum(seen) == 2 * 3
+    mixture = model.predict(terrain.observe())
+    probabilities = mixture.weights
+    entropy = predictive_entropy(probabilities).double().mean()
+    assert quality.classes[0].entropy == pytest.approx(float(entropy), rel=1e-6)
+    information = mutual_information(model.member_probabilities(terrain.observe())).double().mean()
+    assert quality.classes[0].mutual_information == pytest.approx(float(information), rel=1e-6)

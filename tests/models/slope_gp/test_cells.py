@@ -104,3 +104,11 @@ def test_nll_of_a_class_with_a_second_mode_is_that_of_both() -> None:
     ]
     found = cell_nll(CELLS, replace(linear_table(), soft=soft))
     assert found == pytest.approx(-np.mean(both), rel=1e-5)
+
+
+def test_cells_without_a_class_are_left_out() -> None:
+    ids = torch.tensor([0, 255, 1, 255], dtype=torch.uint8)
+    numbers = torch.tensor([0.1, 0.2, 0.3, 0.4])
+    cells = observed_cells(ids, numbers, numbers, 2)
+    assert cells.class_id.tolist() == [0, 1]
+    assert cells.traversability.tolist() == pytest.approx([0.1, 0.3])

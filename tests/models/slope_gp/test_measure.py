@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.slope_gp.measure import measure_latent
 from benchnav.models.slope_gp.table import SoftModes
 from tests.factories import normal
@@ -41,3 +42,19 @@ def test_a_second_mode_counts_in_the_nll_of_the_processes_and_not_in_their_error
     wanted = -float(own.log_prob(terrain.traversability).mean())
     assert both["nll"] == pytest.approx(wanted, rel=1e-5)
     assert both["nll"] != pytest.approx(plain["nll"], rel=1e-2)
+
+
+def test_cells_without_a_class_are_no_part_of_it() -> None:
+    terrain, table = make_terrain(batch=2), linear_table()
+    class_id, means, seen = (
+        terrain.class_id.clone(),
+        terrain.truth.means.clone(),
+        terrain.traversability.clone(),
+    )
+    class_id[1], means[1] = UNLABELLED, torch.nan
+    holed = replace(
+        terrain, class_id=class_id, truth=replace(terrain.truth, means=means), traversability=seen
+    )
+    wanted = measure_latent(table, [terrain.select(torch.tensor([0]))])
+    assert measure_latent(table, [holed]) == pytest.approx(wanted)
+    assert measure_latent(table, [holed.select(torch.tensor([1])), holed]) == pytest.approx(wanted)

@@ -150,3 +150,13 @@ def test_frozen_noise_stays_what_it_is_at_a_place() -> None:
 def test_only_resampled_noise_has_no_field() -> None:
     assert realisation(even(1)).field is None
     assert torch.equal(realisation(even(1), noise="stored").field, even(1))
+
+
+@pytest.mark.parametrize("noise", ["resampled", "stored", "frozen"])
+def test_ground_whose_class_is_not_known_is_not_driven_on(noise: str) -> None:
+    terrain = factories.terrain(even(1))
+    means = terrain.truth.means.clone()
+    means[0, 0, 2, 2] = torch.nan
+    terrain = replace(terrain, truth=replace(terrain.truth, means=means))
+    with pytest.raises(ConfigError, match="a class in every cell"):
+        Realisation(terrain, World(noise=noise), PLACES, 10, KEY, [0])

@@ -4,7 +4,6 @@ from dataclasses import replace
 import pytest
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.shard import shard_of
 from benchnav.eval.keep import Keep
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
@@ -20,23 +19,23 @@ def some_units(risks: tuple[str, ...] = ("mean", "var"), instances: int = 120, *
     )
 
 
-def test_every_unit_is_in_one_shard() -> None:
+def test_every_unit_is_in_one_share() -> None:
     every = some_units()
     assert len(every) == 4 * 2 * 2 * 3
     for of in (1, 2, 3, 7):
         for unit in every:
-            having = [index for index in range(1, of + 1) if shard_of(unit, of) == Share(index=index, of=of)]
-            assert having == [shard_of(unit, of).index]
+            having = [index for index in range(1, of + 1) if unit.share(of) == Share(index=index, of=of)]
+            assert having == [unit.share(of).index]
 
 
-def test_a_unit_stays_in_its_shard_whatever_else_is_run() -> None:
-    before = {unit.path: shard_of(unit, 5) for unit in some_units()}
+def test_a_unit_stays_in_its_share_whatever_else_is_run() -> None:
+    before = {unit.path: unit.share(5) for unit in some_units()}
     # A last block that is not full, another setting, another order, recordings.
     more = [
         replace(unit, keep=Keep(record="all"))
         for unit in reversed(some_units(risks=("cvar", "var", "mean"), instances=110))
     ]
-    after = {unit.path: shard_of(unit, 5) for unit in more}
+    after = {unit.path: unit.share(5) for unit in more}
     assert {path: after[path] for path in before} == before
     assert len(after) > len(before)
 
@@ -51,14 +50,14 @@ def test_a_unit_stays_in_its_shard_whatever_else_is_run() -> None:
 )
 def test_blocks_realisations_and_seeds_of_a_trial_go_round(draws: dict[str, object]) -> None:
     every = some_units(risks=("mean",), **draws)
-    counts = Counter((unit.trial.id, shard_of(unit, 4).index) for unit in every)
+    counts = Counter((unit.trial.id, unit.share(4).index) for unit in every)
     assert len(every) == 8
     assert set(counts.values()) == {1}
 
 
-def test_trials_do_not_all_begin_in_one_shard() -> None:
+def test_trials_do_not_all_begin_in_one_share() -> None:
     risks = tuple(f"cvar:{0.01 * level:g}" for level in range(1, 50))
-    counts = Counter(shard_of(unit, 3).index for unit in some_units(risks, 50, seeds=(0,), realisations=1))
+    counts = Counter(unit.share(3).index for unit in some_units(risks, 50, seeds=(0,), realisations=1))
     # Of 98 units a third is 33; four standard deviations are 19.
     assert all(14 < counts[index] < 52 for index in (1, 2, 3))
 

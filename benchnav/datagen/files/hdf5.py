@@ -102,7 +102,7 @@ def manifest_of(
     """The manifest of a dataset, of splits with their digests."""
     return {
         "format": schema.FORMAT,
-        "format_version": schema.version_of([recipe.synthesis for recipe in recipes]),
+        "format_version": schema.version_of([recipe.synthesis for recipe in recipes], splits.values()),
         "id": dataset_id,
         "generator": {"package": "benchnav", "version": benchnav.__version__},
         "fields": schema.field_table(*recipes[0].grid.shape),
