@@ -1,19 +1,8 @@
 """The per-cell probability distribution of traversability, with exact mean, VaR and CVaR.
 
-λ is a Gaussian mixture X clipped to [0, 1]; F is the CDF of X. Risk is the *lower* tail of λ: at
-level α both VaR and CVaR speak of the worst share p = 1 − α. Everything here rests on
-
-    G(x) = ∫_{−∞}^x F(t) dt = Σ_k w_k s_k (z Φ(z) + φ(z)),  z = (x − m_k) / s_k,
-
-since for v in [0, 1] the expected shortfall under v is E[(v − λ)⁺] = G(v) − G(0), hence
-
-    E[λ]    = 1 − (G(1) − G(0)),
-    VaR_α   = clip(F⁻¹(p), 0, 1),
-    CVaR_α  = 1/p ∫₀^p clip(F⁻¹(u), 0, 1) du = v − (G(v) − G(0)) / p  at v = VaR_α.
-
-The last form is flat in v at the VaR (it is a maximum over v), so the error of the root enters
-squared. The root is bisected a fixed number of times: no step waits for the worst cell, or for the
-device, and the error is bounded whatever the parameters. Arithmetic is in float64 whatever their dtype.
+λ is a Gaussian mixture X clipped to [0, 1]; F is the CDF of X. Risk is the *lower* tail of λ: at level α both VaR and
+CVaR speak of the worst share 1 − α; `benchnav.cvar` computes them, a map at a time, so that a map's numbers do not
+depend on how many there are. Arithmetic is in float64 whatever the dtype of the parameters.
 
 The expected time over the ground, in units of its time at λ = 1, is for a least speed ε
 
@@ -22,8 +11,8 @@ The expected time over the ground, in units of its time at λ = 1, is for a leas
 where each integrand is 0 well below m_k and 1 / x² well above, and is integrated in between by
 Gauss-Legendre quadrature over log x.
 
-Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional
-value-at-risk". Letters in shapes: K components, H×W cells, *B any leading dimensions.
+Source: equation (1) of the paper. Letters in shapes: K components, H×W cells, N cells of a map, *B any leading
+dimensions.
 """
 
 import math
@@ -35,13 +24,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.cvar import Cells, conditional_value_at_risk, mean, value_at_risk
 from benchnav.errors import ConfigError
 
 _SMALLEST_STD = 1e-9
-_BISECTIONS = 30  # leave an error of at most 2⁻³¹ < 1e-9
 _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 _QUADRATURE_NODES = 24
-_NUMBERS_AT_ONCE = 2**17  # of each parameter: 1 MiB in float64
+_DEEP_TAIL = 1e-6  # under which F has to be exact to its own last bits
+_NUMBERS_AT_ONCE = 2**17  # of each parameter of a map: 1 MiB in float64
 
 
 @dataclass(frozen=True)
@@ -92,7 +82,7 @@ class TraversabilityMixture:
 
     def mean(self) -> Tensor:
         """E[λ], shape [*B, H, W]."""
-        return self.cvar(0.0)
+        return self._map_by_map(mean)
 
     def var(self, level: float) -> Tensor:
         """Value at risk: λ falls below it with probability 1 − level.
@@ -104,7 +94,11 @@ class TraversabilityMixture:
             Traversability, shape [*B, H, W].
         """
         tail = 1 - _check_level(level)
-        return self._by_rows(lambda some: some._value_at_risk(tail)).to(self.weights.dtype)
+        if tail == 1:
+            return torch.ones_like(self.weights.select(-3, 0))
+        return self._map_by_map(
+            lambda cells: value_at_risk(cells, torch.full_like(cells.means[0], tail)), deep=tail < _DEEP_TAIL
+        )
 
     def cvar(self, level: float) -> Tensor:
         """Conditional value at risk: the mean of λ over its worst share 1 − level.
@@ -116,7 +110,12 @@ class TraversabilityMixture:
             Traversability, shape [*B, H, W].
         """
         tail = 1 - _check_level(level)
-        return self._by_rows(lambda some: some._cvar(tail)).to(self.weights.dtype)
+        if tail == 1:
+            return self.mean()
+        return self._map_by_map(
+            lambda cells: conditional_value_at_risk(cells, torch.full_like(cells.means[0], tail)),
+            deep=tail < _DEEP_TAIL,
+        )
 
     def chance(self, value: float) -> Tensor:
         """P(λ ≥ value), shape [*B, H, W].
@@ -140,16 +139,7 @@ class TraversabilityMixture:
         """
         if not 0 < floor <= 1:
             raise ConfigError(f"Expected a least speed in (0, 1], got {floor}.")
-        weights, means, stds = self._parameters()
-        # Beyond [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x² is known.
-        low = (means - _REACH * stds).clamp(floor, 1)
-        high = (means + _REACH * stds).clamp(floor, 1)
-        start, span = low.log(), high.log() - low.log()
-        time = 1 + (1 / high - 1)
-        for node, share in _legendre():
-            log_x = start + span * node
-            time = time + share * span * _probability((log_x.exp() - means) / stds) * torch.exp(-log_x)
-        return (1 / (weights * time).sum(-3)).clamp(floor, 1).to(self.weights.dtype)
+        return self._map_by_map(lambda cells: _harmonic_mean(cells, floor))
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1).
@@ -165,7 +155,7 @@ class TraversabilityMixture:
         """
         if self.weights.shape[-3] == 1:
             return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
-        return self._value_at_risk(_probability(normal.double())).to(self.weights.dtype)
+        return self._map_by_map(value_at_risk, _probability(normal.double()))
 
     def select(self, members: Tensor) -> "TraversabilityMixture":
         """Keeps some maps of the first dimension, by index, shape [M]."""
@@ -253,23 +243,32 @@ class TraversabilityMixture:
         kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
         return replace(self, weights=kept / kept.sum(-3, keepdim=True))
 
-    def _by_rows(self, work: "Callable[[TraversabilityMixture], Tensor]") -> Tensor:
-        """Does some work on so many rows at a time that what it needs stays near the processor."""
-        height = self.weights.shape[-2]
-        rows = max(1, _NUMBERS_AT_ONCE * height // max(1, self.weights.numel()))
-        if rows >= height:
-            return work(self)
-        weights, means, stds = (values.split(rows, -2) for values in (self.weights, self.means, self.stds))
-        pieces = (
-            TraversabilityMixture(weight, mean, std, self.group)
-            for weight, mean, std in zip(weights, means, stds, strict=True)
-        )
-        return torch.cat([work(piece) for piece in pieces], -2)
+    def _map_by_map(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
+        """Does some work on the cells of a map, or of some of its rows, at a time: near the processor.
 
-    def _cvar(self, tail: float) -> Tensor:
-        value = self._value_at_risk(tail)
-        shortfall = self._integrated_cdf(value) - self._integrated_cdf(torch.zeros_like(value))
-        return (value - shortfall / tail).clamp(min=0).minimum(value)
+        Args:
+            work: from `Cells` and layers of N cells to numbers [N].
+            layers: of shape [*B, H, W].
+            deep: of the cells.
+
+        Returns:
+            Shape [*B, H, W], in the dtype of the parameters.
+        """
+        weights, means, stds = (
+            values.flatten(0, -4) if values.ndim > 3 else values[None] for values in self._parameters()
+        )
+        maps, count, height, width = weights.shape
+        whole = [layer.reshape(maps, height, width) for layer in layers]
+        rows = max(1, _NUMBERS_AT_ONCE // (count * width))
+        done = []
+        for place in range(maps):
+            for start in range(0, height, rows):
+                piece = slice(start, start + rows)
+                w, m, s = (values[place, :, piece].flatten(1) for values in (weights, means, stds))
+                cells = Cells(w, m, math.sqrt(0.5) / s, deep)
+                done.append(work(cells, *(layer[place, piece].flatten() for layer in whole)))
+        shape = self.weights.select(-3, 0).shape
+        return torch.cat(done).view(shape).to(self.weights.dtype)
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
@@ -280,41 +279,25 @@ class TraversabilityMixture:
         at = value.unsqueeze(-3) if value.ndim else value
         return (weights * _probability((at - means) / stds)).sum(-3)
 
-    def _integrated_cdf(self, value: Tensor) -> Tensor:
-        weights, means, stds = self._parameters()
-        z = (value.unsqueeze(-3) - means) / stds
-        return (weights * stds * torch.addcmul(_density(z), z, _probability(z))).sum(-3)
 
-    @torch.no_grad()
-    def _value_at_risk(self, tail: float | Tensor) -> Tensor:
-        """clip(F⁻¹(tail), 0, 1) in float64, exact at 0 and 1; of one tail, or of one a cell [*B, H, W]."""
-        weights, means, stds = self._parameters()
-        low, width = torch.zeros_like(means.select(-3, 0)), 1.0
-        if not isinstance(tail, Tensor) and tail >= 1:
-            return low + width
-        # F(x) = ½ Σ_k w_k erfc(shift_k − x scale_k): few passes over memory, and exact far down in the tail.
-        scale = math.sqrt(0.5) / stds
-        shift = means * scale
-
-        def twice_cdf(value: Tensor) -> Tensor:
-            terms = torch.addcmul(shift, value.unsqueeze(-3), scale, value=-1)
-            return terms.erfc_().mul_(weights).sum(-3)
-
-        at_zero, at_one = twice_cdf(low) >= 2 * tail, twice_cdf(low + width) <= 2 * tail
-        for _ in range(_BISECTIONS):
-            width /= 2
-            middle = low + width
-            low = torch.where(twice_cdf(middle) < 2 * tail, middle, low)
-        return torch.where(at_one, 1.0, torch.where(at_zero, 0.0, low + width / 2))
+def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
+    """`harmonic_mean` of N cells, in float32: to within 1e-6."""
+    short = cells.float()
+    # Beyond [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x² is known.
+    reach = _REACH * math.sqrt(0.5) / short.scales
+    low, high = (short.means - reach).clamp(floor, 1), (short.means + reach).clamp(floor, 1)
+    start, span = low.log(), high.log() - low.log()
+    time = 1 + (1 / high - 1)
+    for node, share in _legendre():
+        log_x = start + span * node
+        below = torch.erf((log_x.exp() - short.means).mul_(short.scales)).add_(1)
+        time = torch.addcmul(time, span * (0.5 * share), below.mul_(torch.exp(-log_x)))
+    return (1 / (short.weights * time).sum(0)).clamp(floor, 1)
 
 
 def _probability(z: Tensor) -> Tensor:
     """Φ(z); several times quicker than `torch.special.ndtr`."""
     return 0.5 * torch.erfc(z * -math.sqrt(0.5))
-
-
-def _density(z: Tensor) -> Tensor:
-    return torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
 
 
 def _check_level(level: float) -> float:

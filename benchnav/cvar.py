@@ -1,0 +1,222 @@
+"""VaR and CVaR of Gaussian mixtures clipped to [0, 1], cell by cell.
+
+λ is a Gaussian mixture X clipped to [0, 1]; F is the CDF of X. Risk is the *lower* tail of λ: at level α both VaR
+and CVaR speak of the worst share p = 1 − α, the tail. All rests on
+
+    G(x) = ∫_{−∞}^x F(t) dt = Σ_k w_k s_k (z Φ(z) + φ(z)),  z = (x − m_k) / s_k,
+
+since for v in [0, 1] the expected shortfall under v is E[(v − λ)⁺] = G(v) − G(0), hence
+
+    E[λ]    = 1 − (G(1) − G(0)),
+    VaR_α   = clip(F⁻¹(p), 0, 1),
+    CVaR_α  = 1/p ∫₀^p clip(F⁻¹(u), 0, 1) du = v − (G(v) − G(0)) / p  at v = VaR_α.
+
+The last form is a maximum over v, so it is flat at the VaR: at a v that is off by d it is too low by no more than
+|F(v) / p − 1| d, about half of which is known and added. So a root in float32 will do, at which float64 is
+evaluated once; cells where that bound is not small enough are searched on in float64.
+
+The root is sought by Newton's method on the log odds of F, which are straighter than F, between bounds that close
+in. Where a step leaves the bounds, and at every other step after the first few, the bounds are halved, so that every
+cell gets there. On the CPU a cell that has its root leaves the search, so that none waits for the worst; on other
+devices all cells take all steps, so that nothing waits for the device.
+
+Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional value-at-risk".
+Letters in shapes: K components, N cells.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_SHORT_SEARCH, _LONG_SEARCH = 6, 80  # steps in float32, and most in float64
+_FREE_STEPS = 6  # of Newton's method, after which every other step halves the bounds
+_VAR_ERROR, _CVAR_ERROR = 1e-10, 1e-9  # at which a search ends
+_LEAST_GAP = 1e-11  # between bounds
+_REACH = {
+    torch.float32: 9.0,
+    torch.float64: 26.0,
+}  # of √½ z, beyond which densities are too small to be normal numbers
+_LOGISTIC_STD = math.sqrt(3) / math.pi  # standard deviations a unit of log odds
+
+# Tells of (F − tail, how far off that is by the density, tail) where a root is near enough.
+Near = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Mixtures before clipping, z = (x − means) scales / √½ being their standard normal numbers.
+
+    Args:
+        weights: summing to 1 over K, shape [K, N].
+        means: shape [K, N].
+        scales: √½ over the standard deviations, shape [K, N].
+        deep: whether F is to be exact to the last bits of itself, as a tail under a millionth needs, rather than to
+            those of 1, which takes half the time.
+    """
+
+    weights: Tensor
+    means: Tensor
+    scales: Tensor
+    deep: bool = False
+
+    def below(self, z: Tensor) -> Tensor:
+        """2 Φ of z / √½, less 1 unless `deep`."""
+        return torch.erfc(-z) if self.deep else torch.erf(z)
+
+    def share(self, total: Tensor) -> Tensor:
+        """F of the weighted sum of `below`."""
+        return total / 2 if self.deep else (total + 1) / 2
+
+    def shortfall(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """F, its density and G at a value a cell, each of shape [N]."""
+        z = (value - self.means) * self.scales
+        below, density = self.below(z), (-z * z).exp() / math.sqrt(math.pi)
+        # G is the sum of w (z (1 + below) / 2 + density / 2) / scale.
+        integral = torch.addcmul(density, z, below if self.deep else below + 1) / (2 * self.scales)
+        share, slope, shortfall = (
+            (self.weights * term).sum(0) for term in (below, density * self.scales, integral)
+        )
+        return self.share(share), slope, shortfall
+
+    def select(self, which: Tensor) -> "Cells":
+        """Keeps some cells, by index."""
+        weights, means, scales = (v.index_select(1, which) for v in (self.weights, self.means, self.scales))
+        return Cells(weights, means, scales, self.deep)
+
+    def float(self) -> "Cells":
+        """In float32."""
+        return Cells(self.weights.float(), self.means.float(), self.scales.float())
+
+
+def mean(cells: Cells) -> Tensor:
+    """Computes E[λ], with its gradient in the parameters, shape [N]."""
+    return 1 - (_integral(cells, 1.0) - _integral(cells, 0.0))
+
+
+@torch.no_grad()
+def value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
+    """Finds clip(F⁻¹(tail), 0, 1), exact at 0 and 1.
+
+    Args:
+        cells: in float64.
+        tail: p in (0, 1), shape [N].
+    """
+    return _root(cells, tail, _first_root(cells, tail), lambda excess, off, tail: off.abs() < _VAR_ERROR)
+
+
+def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
+    """Computes the mean of λ over its lowest share `tail`, with its gradient in the parameters.
+
+    Args:
+        cells: in float64.
+        tail: p in (0, 1), shape [N].
+    """
+
+    def near(excess: Tensor, off: Tensor, tail: Tensor) -> Tensor:
+        return (excess * off).abs() < _CVAR_ERROR * tail
+
+    value = _first_root(cells, tail)
+    share, density, shortfall = cells.shortfall(value)
+    with torch.no_grad():
+        excess = share - tail
+        there = near(excess, excess / density, tail) | _at_an_end(value, excess)
+        value = _replaced(value, ~there, lambda some, p, x: _root(some, p, x, near), cells, tail, value)
+    shortfall = _replaced(shortfall, ~there, lambda some, x: some.shortfall(x)[2], cells, value)
+    return (value - (shortfall - _integral(cells, 0.0)) / tail).clamp(min=0).minimum(value)
+
+
+def _integral(cells: Cells, value: float) -> Tensor:
+    """G at one value, shape [N]."""
+    return cells.shortfall(torch.full_like(cells.means[0], value))[2]
+
+
+def _may_wait(values: Tensor) -> bool:
+    """Tells whether numbers may be looked at while all is computed."""
+    return values.device.type == "cpu"
+
+
+def _at_an_end(value: Tensor, excess: Tensor) -> Tensor:
+    """Tells where the root is beyond 0 or 1."""
+    return ((value == 0) & (excess >= 0)) | ((value == 1) & (excess <= 0))
+
+
+def _replaced(
+    values: Tensor, which: Tensor, work: Callable[..., Tensor], cells: Cells, *columns: Tensor
+) -> Tensor:
+    """Values, shape [N], in some cells replaced by what `work` makes of these cells and columns."""
+    if not _may_wait(values):
+        return torch.where(which, work(cells, *columns), values)
+    index = which.nonzero().squeeze(1)
+    if len(index) == 0:
+        return values
+    return values.index_copy(0, index, work(cells.select(index), *(column[index] for column in columns)))
+
+
+@torch.no_grad()
+def _first_root(cells: Cells, tail: Tensor) -> Tensor:
+    """Seeks x in [0, 1] with F(x) = tail in float32, a few steps."""
+    short, p = cells.float(), tail.float()
+    mean = (short.weights * short.means).sum(0)
+    variance = (short.weights * (short.means.square() + 0.5 / short.scales.square())).sum(0) - mean.square()
+    odds = torch.logit(p)
+    value = (mean + _LOGISTIC_STD * variance.clamp(min=0).sqrt() * odds).clamp(0, 1)
+    low, high, slopes = torch.zeros_like(value), torch.ones_like(value), short.weights * short.scales
+    for count in range(_SHORT_SEARCH):
+        _, _, value, low, high = _move(short, slopes, p, odds, value, low, high, halve=count % 3 == 2)
+    return value.to(tail)
+
+
+def _root(cells: Cells, tail: Tensor, value: Tensor, near: Near) -> Tensor:
+    """Seeks x in [0, 1] with F(x) = tail, from values on, until they are near or all steps are taken."""
+    found, left = value.clone(), torch.arange(len(value), device=value.device)
+    settled = torch.zeros_like(value, dtype=torch.bool)
+    low, high, odds = torch.zeros_like(value), torch.ones_like(value), torch.logit(tail)
+    for count in range(_LONG_SEARCH):
+        halve, slopes = count >= _FREE_STEPS and count % 2 == 1, cells.weights * cells.scales
+        excess, off, moved, low, high = _move(cells, slopes, tail, odds, value, low, high, halve)
+        ended = near(excess, off, tail) | _at_an_end(value, excess) | (high - low < _LEAST_GAP)
+        value = torch.where(ended & halve, value, moved)
+        if not _may_wait(value):
+            found, settled = torch.where(settled, found, value), settled | ended
+            continue
+        found[left] = value
+        on = (~ended).nonzero().squeeze(1)
+        if len(on) == 0:
+            break
+        cells, left = cells.select(on), left[on]
+        tail, odds, value, low, high = (v[on] for v in (tail, odds, value, low, high))
+    return found
+
+
+def _move(
+    cells: Cells,
+    slopes: Tensor,
+    tail: Tensor,
+    odds: Tensor,
+    value: Tensor,
+    low: Tensor,
+    high: Tensor,
+    halve: bool,
+) -> tuple[Tensor, ...]:
+    """Takes one step of Newton's method on the log odds of F, or halves the bounds.
+
+    Returns:
+        F − tail at the value, and how far off that is by the density; the value and the bounds thereafter; each of
+        shape [N].
+    """
+    z = (value - cells.means).mul_(cells.scales)
+    share = cells.share(cells.below(z).mul_(cells.weights).sum(0))
+    reach = _REACH[z.dtype]
+    density = z.clamp_(-reach, reach).square_().neg_().exp_().mul_(slopes).sum(0).div_(math.sqrt(math.pi))
+    excess = share - tail
+    under = excess < 0
+    low, high = torch.where(under, value, low), torch.where(under, high, value)
+    step = (odds - torch.logit(share)) * (share * (1 - share) / density)  # not a number where F is 0 or 1
+    moved = (value + step).clamp(0, 1)
+    inside = (moved >= low) & (moved <= high)
+    if halve:
+        inside &= step.abs() < 0.1 * (high - low)
+    return excess, excess / density, torch.where(inside, moved, (low + high) / 2), low, high

@@ -1,0 +1,97 @@
+"""VaR and CVaR of hard mixtures, against plain bisection with SciPy's normal distribution."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import ndtr
+
+from benchnav import cvar
+from benchnav.mixture import TraversabilityMixture
+
+LEVELS = [0.01, 0.5, 0.9, 0.99, 0.9999, 1 - 1e-8]
+Parameters = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def hard_cells(cells: int = 600, components: int = 7, seed: int = 0) -> Parameters:
+    """Few heavy components and many light ones, from steps to planes, within [0, 1] and beyond; shape [K, N]."""
+    generator = np.random.default_rng(seed)
+    weights = np.exp(4 * generator.standard_normal((components, cells)))
+    means = generator.uniform(-0.5, 1.5, (components, cells))
+    stds = 10 ** generator.uniform(-9, 0.5, (components, cells))
+    return weights / weights.sum(0), means, stds
+
+
+def integral(parameters: Parameters, value: np.ndarray) -> np.ndarray:
+    weights, means, stds = parameters
+    z = (value - means) / stds
+    return (weights * stds * (z * ndtr(z) + np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi))).sum(0)
+
+
+def bisected(parameters: Parameters, tail: float) -> tuple[np.ndarray, np.ndarray]:
+    """VaR and CVaR."""
+    weights, means, stds = parameters
+
+    def share(value: np.ndarray) -> np.ndarray:
+        return (weights * ndtr((value - means) / stds)).sum(0)
+
+    low, high = np.zeros(weights.shape[1]), np.ones(weights.shape[1])
+    for _ in range(60):
+        middle = (low + high) / 2
+        under = share(middle) < tail
+        low, high = np.where(under, middle, low), np.where(under, high, middle)
+    value = np.where(share(0 * low) >= tail, 0, np.where(share(0 * low + 1) <= tail, 1, low))
+    return value, value - (integral(parameters, value) - integral(parameters, 0 * value)) / tail
+
+
+def mixture_of(parameters: Parameters, dtype: torch.dtype = torch.float64) -> TraversabilityMixture:
+    """A map of 20 columns."""
+    layers = (torch.from_numpy(values).to(dtype).unflatten(1, (-1, 20)) for values in parameters)
+    return TraversabilityMixture(*layers)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("waits", [True, False])
+def test_hard_cells_are_as_bisection_has_them(
+    level: float, waits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As on the CPU, where cells leave the search when they are done, and as elsewhere, where none does.
+    monkeypatch.setattr(cvar, "_may_wait", lambda values: waits)
+    parameters = hard_cells()
+    mixture = mixture_of(parameters)
+    value, mean = bisected(parameters, 1 - level)
+    found = mixture.var(level).flatten().numpy()
+    inside = (value > 0) & (value < 1)
+    assert inside.sum() > 20
+    np.testing.assert_array_equal(found[~inside], value[~inside])
+    # Where F is flat, F tells the root no better than to within its own last bits.
+    weights, means, stds = parameters
+    z = (value - means) / stds
+    density = (weights / stds * np.exp(-0.5 * z * z)).sum(0) / np.sqrt(2 * np.pi)
+    told = inside & (density > 1e-3)
+    np.testing.assert_allclose(found[told], value[told], atol=2e-9)
+    shares = (weights * ndtr((found - means) / stds)).sum(0)[inside & ~told]
+    np.testing.assert_allclose(shares, 1 - level, rtol=0, atol=1e-9)
+    # CVaR divides what is lost by the tail.
+    atol = max(1e-8, 4e-16 / (1 - level))
+    np.testing.assert_allclose(mixture.cvar(level).flatten().numpy(), mean, rtol=0, atol=atol)
+
+
+def test_a_map_is_the_same_however_many_there_are_beside_it() -> None:
+    maps = [mixture_of(hard_cells(seed=seed), torch.float32) for seed in range(3)]
+    together = TraversabilityMixture(
+        *(torch.stack([getattr(one, name) for one in maps]) for name in ("weights", "means", "stds"))
+    )
+    for level in LEVELS:
+        for place, one in enumerate(maps):
+            assert torch.equal(together.cvar(level)[place], one.cvar(level))
+            assert torch.equal(together.var(level)[place], one.var(level))
+    assert torch.equal(together.mean()[1], maps[1].mean())
+
+
+def test_large_maps_are_worked_on_in_pieces_without_seams(monkeypatch: pytest.MonkeyPatch) -> None:
+    mixture = mixture_of(hard_cells())
+    whole = mixture.cvar(0.7), mixture.var(0.7), mixture.mean(), mixture.harmonic_mean(0.05)
+    monkeypatch.setattr("benchnav.mixture._NUMBERS_AT_ONCE", 7 * 20 * 4)  # four rows
+    pieces = mixture.cvar(0.7), mixture.var(0.7), mixture.mean(), mixture.harmonic_mean(0.05)
+    for one, other in zip(whole, pieces, strict=True):
+        torch.testing.assert_close(one, other, atol=2e-7, rtol=0)
