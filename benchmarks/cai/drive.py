@@ -3,12 +3,14 @@
 None of the simulation of `benchnav` is used. Letters in shapes: B trials.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from benchmarks.cai.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import MPPI, advance_chunk, average
+from benchnav.planning.planners.mppi import MPPI, advance_chunk, weigh
 from benchnav.planning.planners.planner import Step
 from benchnav.planning.problem import Problem
 
@@ -25,8 +27,8 @@ class ManyTrialsMPPI(MPPI):
     def __init__(self, setup: Setup) -> None:
         """Keeps the settings."""
         super().__init__(setup.mppi)
-        self._advance = Fused(advance_chunk, _WORTH_COMPILING)
-        self._average = Fused(AVERAGES[setup.average], _WORTH_COMPILING)
+        self._advance = Fused(advance_chunk, _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
+        self._weigh = Fused(WEIGHS[setup.average], _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
 
 
 def average_as_drawn(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -34,7 +36,15 @@ def average_as_drawn(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, 
     return torch.clamp(mean + torch.einsum("bk,tak->bta", weights, noise), low, high)
 
 
-AVERAGES = {"clipped": average, "drawn": average_as_drawn}
+def weigh_as_drawn(
+    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor, *rest: Any
+) -> tuple[Tensor, Tensor]:
+    """As `mppi.weigh`, but that the noise is averaged as drawn."""
+    weights, _ = weigh(states, cost, mean, noise, low, high, *rest)
+    return weights, average_as_drawn(mean, noise, weights, low, high)
+
+
+WEIGHS = {"clipped": weigh, "drawn": weigh_as_drawn}
 
 
 def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:

@@ -159,8 +159,7 @@ class Problem:
 
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
         """J of the last state, and the price of ground that is not free; shapes as for `stage_cost`."""
-        ground = self.ground_at(state)
-        return self.objective.terminal(state, ground.abs(), target) + PRICE * (ground <= 0)
+        return terminal_cost(self.objective, state, self.ground_at(state), target)
 
     def select(self, members: Tensor) -> "Problem":
         """Keeps some episodes of the batch.
@@ -182,6 +181,11 @@ class Problem:
 def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
     """J of a step and the price of ground that is not free; see `Problem.stage_cost`."""
     return objective.stage(state, action, ground.abs(), target) + PRICE * (ground <= 0)
+
+
+def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: Tensor) -> Tensor:
+    """J of the last state and the price of ground that is not free; see `Problem.terminal_cost`."""
+    return objective.terminal(state, ground.abs(), target) + PRICE * (ground <= 0)
 
 
 def pose_problem(

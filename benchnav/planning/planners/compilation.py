@@ -13,12 +13,12 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable
-from typing import Generic, ParamSpec, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Generic, TypeVar
 
 import torch
 
-P = ParamSpec("P")
 R = TypeVar("R")
 
 # Under this many parallel rollouts compiling takes longer than it saves in an episode.
@@ -38,54 +38,97 @@ def worth_compiling(samples: int, device: torch.device) -> bool:
     return device.type == "cuda" or samples * _EPISODES >= _WORTH_ROLLOUTS
 
 
-class Fused(Generic[P, R]):
+class Fused(Generic[R]):
     """A pure function that is compiled at its first call, or runs as it is where that cannot be done.
 
-    Each holds its own verdict: one that cannot be compiled leaves all others as they are.
+    It is compiled once for a single episode and once for any number of them, so that a batch may shrink. Each
+    holds its own verdict: one that cannot be compiled leaves all others as they are.
 
     Args:
         function: takes and returns tensors, one of them first; it must not change its arguments.
         samples: rollouts an episode that a call is for.
+        batched: places of the arguments whose first dimension is that of the episodes.
     """
 
-    def __init__(self, function: Callable[P, R], samples: int) -> None:
+    def __init__(self, function: Callable[..., R], samples: int, batched: tuple[int, ...] = ()) -> None:
         """Keeps the function; nothing is compiled yet."""
-        self._function, self._samples = function, samples
-        self._fused: Callable[P, R] | None = None
+        self._function, self._samples, self._batched = function, samples, batched
+        self._fused: Callable[..., R] | None = None
+        self._seen: set[tuple[object, ...]] = set()
         self.compiled: bool | None = None
         """Whether it runs compiled; None before the first call."""
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+    def __call__(self, *args: Any) -> R:
         """Calls the function."""
         if self.compiled is None and not self._wanted(args[0]):
             self.compiled = False
         if self.compiled is False:
-            return self._function(*args, **kwargs)
+            return self._function(*args)
         if self._fused is None:
             self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
-        # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
-        notices = logging.getLogger("torch.utils.cpp_extension")
-        level = notices.level
-        notices.setLevel(logging.ERROR)
+        signature = self._signature(args)
         try:
-            # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
-            with torch._dynamo.config.patch(
-                recompile_limit=sys.maxsize,
-                accumulated_recompile_limit=sys.maxsize,
-                fail_on_recompile_limit_hit=True,
-                suppress_errors=False,
-            ):
-                result = self._fused(*args, **kwargs)
+            if signature in self._seen:
+                return self._fused(*args)
+            with _compiling():
+                self._mark(args)
+                result = self._fused(*args)
         except torch._dynamo.exc.TorchDynamoException as error:
+            self._seen.discard(signature)
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
             print(f"benchnav: running uncompiled, several times slower: {reason}", file=sys.stderr)
-            return self._function(*args, **kwargs)
-        finally:
-            notices.setLevel(level)
+            return self._function(*args)
+        self._seen.add(signature)
         self.compiled = True
         return result
+
+    def _signature(self, args: tuple[object, ...]) -> tuple[object, ...]:
+        """What a call is compiled for: shapes, dtypes and devices of tensors, and which the other arguments are."""
+        found: list[object] = []
+        for place, arg in enumerate(args):
+            if not isinstance(arg, torch.Tensor):
+                found.append(id(arg))
+            elif place in self._batched:
+                found.append((arg.shape[0] > 1, arg.shape[1:], arg.dtype, arg.device))
+            else:
+                found.append((arg.shape, arg.dtype, arg.device))
+        return tuple(found)
+
+    def _mark(self, args: tuple[object, ...]) -> None:
+        """Lets the number of episodes be any, but one."""
+        for place in self._batched:
+            tensor = args[place]
+            assert isinstance(tensor, torch.Tensor)
+            if len(tensor) > 1:
+                torch._dynamo.maybe_mark_dynamic(tensor, 0)
 
     def _wanted(self, example: object) -> bool:
         assert isinstance(example, torch.Tensor)
         return worth_compiling(self._samples, example.device) and not torch._dynamo.config.disable
+
+
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """Settings of PyTorch under which a call is compiled; they take longer to set than a rollout, so only then."""
+    import torch._inductor.config  # imported here: it takes a second
+
+    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
+    notices = logging.getLogger("torch.utils.cpp_extension")
+    level = notices.level
+    notices.setLevel(logging.ERROR)
+    try:
+        with (
+            # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
+            torch._dynamo.config.patch(
+                recompile_limit=sys.maxsize,
+                accumulated_recompile_limit=sys.maxsize,
+                fail_on_recompile_limit_hit=True,
+                suppress_errors=False,
+            ),
+            # Lookups keep to the map by themselves (`Grid.lookup`); to check each again takes a third of the time.
+            torch._inductor.config.patch(assert_indirect_indexing=False),
+        ):
+            yield
+    finally:
+        notices.setLevel(level)

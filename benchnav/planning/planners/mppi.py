@@ -9,8 +9,8 @@ Of the source it differs in one thing: samples are clipped to the action bounds 
 Williams averages them as drawn and clips within F. The control cost weighs the noise as drawn in both,
 since it is a ratio of the densities that the samples were drawn from.
 
-The samples' noise is shared by the episodes of a batch: it is drawn once a step, as a pure function of the
-plan state's seed and step, so an episode has the same noise alone as in any batch.
+The samples' noise is shared by the episodes of a batch: it is a pure function of the plan state's seed and step
+(see `noise`), so an episode has the same noise alone as in any batch.
 """
 
 import math
@@ -20,13 +20,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from benchnav import rng
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
+from benchnav.planning.planners.noise import NoiseBank, draw_bank
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem, stage_cost
+from benchnav.planning.problem import Problem, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
@@ -72,14 +72,14 @@ class MPPIState:
         problem: what is being solved.
         mean: mean action sequence, shape [B, T, A].
         scale: standard deviation of each action's noise, shape [A].
-        seed: root of the noise.
+        noise: of all steps.
         step: steps planned so far.
     """
 
     problem: Problem
     mean: Tensor
     scale: Tensor
-    seed: int
+    noise: NoiseBank
     step: int
 
 
@@ -95,13 +95,13 @@ class MPPI:
     def __init__(self, config: MPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
-        self._advance = Fused(advance_chunk, self.config.samples)
-        self._average = Fused(average, self.config.samples)
+        self._advance = Fused(advance_chunk, self.config.samples, batched=(0, 1, 2, 6, 7))
+        self._weigh = Fused(weigh, self.config.samples, batched=(0, 1, 2, 6, 7))
 
     @property
     def compiled(self) -> bool | None:
         """Whether it runs compiled; None before the first step."""
-        verdicts = (self._advance.compiled, self._average.compiled)
+        verdicts = (self._advance.compiled, self._weigh.compiled)
         return None if None in verdicts else all(verdicts)
 
     def init(self, problem: Problem, generator: torch.Generator) -> MPPIState:
@@ -118,7 +118,8 @@ class MPPI:
             )
         seed = int(torch.randint(2**62, (), generator=generator))
         mean = problem.start.new_zeros(len(problem), config.horizon, len(names))
-        return MPPIState(problem, mean, problem.start.new_tensor(config.noise), seed, 0)
+        scale = problem.start.new_tensor(config.noise)
+        return MPPIState(problem, mean, scale, draw_bank(seed, config.horizon, config.samples, scale), 0)
 
     def plan(self, step: Step, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step toward the goal; see `Planner`."""
@@ -129,12 +130,14 @@ class MPPI:
     ) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `LocalPlanner`."""
         problem, config, earlier = plan_state.problem, self.config, plan_state.mean
-        noise = draw_noise(plan_state, config.samples)
-        cost = rollout_cost(problem, step.state, earlier, noise, target_m, self._advance)
+        noise = plan_state.noise.at(plan_state.step)
+        states, cost = roll_out(problem, step.state, earlier, noise, target_m, self._advance)
         if config.control_cost:
             cost = cost + config.control_cost * control_cost(earlier, noise, plan_state.scale)
-        weights = torch.softmax(-cost / config.temperature, dim=1)
-        mean = self._average(earlier, noise, weights, *problem.action_bounds)
+        weights, mean = self._weigh(
+            states, cost, earlier, noise, *problem.action_bounds, problem.padded_ground, target_m[:, None].contiguous(),
+            problem.grid, problem.objective, config.temperature,
+        )  # fmt: skip
         shifted = torch.cat((mean[:, 1:], mean[:, -1:]), dim=1)
         plan = Plan.empty(len(problem), step.state.device)
         if step.draw:
@@ -144,18 +147,6 @@ class MPPI:
     def took(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
         """Plans on as before; see `LocalPlanner`."""
         return plan_state
-
-
-def draw_noise(plan_state: MPPIState, samples: int) -> Tensor:
-    """Draws the noise of one step, shape [T, A, K].
-
-    Each step's generator is seeded by a hash: PyTorch's on the CPU looks at 32 bits of a seed alone, so
-    that seeds in a row would repeat one another's steps.
-    """
-    mean, scale = plan_state.mean, plan_state.scale
-    generator = rng.generator(rng.stream_key(plan_state.seed, plan_state.step), mean.device)
-    shape = (*mean.shape[1:], samples)
-    return torch.randn(shape, generator=generator, device=mean.device, dtype=mean.dtype) * scale[:, None]
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
@@ -172,14 +163,7 @@ def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
     return torch.einsum("bta,tak->bk", mean / scale**2, noise)
 
 
-def rollout_cost(
-    problem: Problem,
-    state: Tensor,
-    mean: Tensor,
-    noise: Tensor,
-    target_m: Tensor,
-    advance: Callable[..., tuple[Tensor, Tensor]] | None = None,
-) -> Tensor:
+def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor) -> Tensor:
     """Sums J and the price of ground that is not free along sampled action sequences.
 
     Args:
@@ -188,12 +172,27 @@ def rollout_cost(
         mean: mean action sequences, shape [B, T, A].
         noise: added to every mean and clipped to the action bounds, shape [T, A, K].
         target_m: (x, y) to be reached, shape [B, 2].
-        advance: `advance_chunk` or the same compiled.
 
     Returns:
         Cost of each sequence, shape [B, K].
     """
-    advance = advance or advance_chunk
+    states, cost = roll_out(problem, state, mean, noise, target_m, advance_chunk)
+    return cost + problem.terminal_cost(states, target_m[:, None])
+
+
+def roll_out(
+    problem: Problem,
+    state: Tensor,
+    mean: Tensor,
+    noise: Tensor,
+    target_m: Tensor,
+    advance: Callable[..., tuple[Tensor, Tensor]],
+) -> tuple[Tensor, Tensor]:
+    """Rolls sampled action sequences out; arguments as for `rollout_cost`, and `advance_chunk` or the same compiled.
+
+    Returns:
+        The last states, shape [B, K, S], and the cost but for theirs, shape [B, K].
+    """
     samples = noise.shape[2]
     # State dimensions outermost in memory, so that each is contiguous in samples.
     states = state.T[:, :, None].expand(-1, -1, samples).contiguous().movedim(0, -1)
@@ -202,10 +201,10 @@ def rollout_cost(
     for first in range(0, mean.shape[1], _CHUNK_STEPS):
         chunk = slice(first, first + _CHUNK_STEPS)
         states, cost = advance(
-            states, cost, mean[:, chunk].contiguous(), noise[chunk].contiguous(), *problem.action_bounds,
+            states, cost, mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds,
             problem.padded_ground, target, problem.grid, problem.robot, problem.objective,
         )  # fmt: skip
-    return cost + problem.terminal_cost(states, target)
+    return states, cost
 
 
 def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
@@ -238,6 +237,21 @@ def advance_chunk(
         cost = cost + stage_cost(objective, states, action, ground, target)
         states = robot(states, action, ground.abs())
     return states.movedim(-1, 0).contiguous().movedim(0, -1), cost
+
+
+def weigh(
+    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
+    padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective, temperature: float,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Adds the cost of the last states and averages the samples by exp(−cost / temperature).
+
+    Returns:
+        Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
+    """
+    ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
+    cost = cost + terminal_cost(objective, states, ground, target)
+    weights = torch.softmax(-cost / temperature, dim=1)
+    return weights, average(mean, noise, weights, low, high)
 
 
 def average(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from benchnav.errors import ConfigError
 from benchnav.planning.planners import mppi
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
+from benchnav.planning.planners.noise import NoiseBank
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -54,7 +55,7 @@ def test_the_mean_is_the_softmax_average_of_the_samples(control_cost: float) -> 
     state = planner.init(problem, generator(3))
     state = replace(state, mean=torch.rand(state.mean.shape, generator=generator(4)))
     action, following, _ = planner.plan(first(problem), state)
-    noise = mppi.draw_noise(state, config.samples)
+    noise = state.noise.at(state.step)
     cost = mppi.rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)[0].double()
     for step in range(20):
         for axis, scale in enumerate(config.noise):
@@ -89,29 +90,39 @@ def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
     for share in (1.0, 0.5):
         planner = MPPI(replace(config, control_cost=share * 0.7))
         state = replace(planner.init(problem, generator()), mean=mean)
-        weighed = mppi.rollout_cost(problem, problem.start, mean, mppi.draw_noise(state, 9), problem.goal_m)
+        weighed = mppi.rollout_cost(problem, problem.start, mean, state.noise.at(0), problem.goal_m)
         assert (weighed == 0).all()
-        planner._advance.compiled = planner._average.compiled = False
+        planner._advance.compiled = planner._weigh.compiled = False
         action, following, _ = planner.plan(first(problem), state)
         torch.testing.assert_close(action[0], (1 - share) * mean[0, 0], atol=0.02, rtol=0)
         torch.testing.assert_close(following.mean[0, 0], (1 - share) * mean[0, 1], atol=0.02, rtol=0)
 
 
-def test_noise_has_its_scale_and_is_new_at_each_step() -> None:
+def test_noise_has_the_scale_that_is_set_and_is_another_for_each_seed() -> None:
     problem = factories.problem(torch.full((3, 16, 16), 0.8))
     planner = MPPI(MPPIConfig(horizon=30, noise=(0.2, 0.7)))
     state = planner.init(problem, generator())
-    noise = mppi.draw_noise(state, 4000)
-    assert noise.shape == (30, 2, 4000)
+    noise = state.noise.at(0)
+    assert noise.shape == (30, 2, 5000)
     torch.testing.assert_close(noise.std(dim=(0, 2)), torch.tensor([0.2, 0.7]), atol=0.01, rtol=0)
-    later = mppi.draw_noise(replace(state, step=1), 4000)
-    assert (noise * later).mean().abs() < 0.005
-    # Plans of seeds in a row do not repeat one another's steps.
-    assert not torch.equal(mppi.draw_noise(replace(state, seed=state.seed + 1), 4000), later)
-    # Nor those of seeds that are alike in 32 bits, which is all that PyTorch's generator looks at.
-    assert not torch.equal(mppi.draw_noise(replace(state, seed=state.seed + 2**32), 4000), noise)
-    seeds = {planner.init(problem, generator(seed)).seed for seed in range(4)}
-    assert len(seeds) == 4
+    other = planner.init(problem, generator(1))
+    assert (noise * other.noise.at(0)).mean().abs() < 0.005
+
+
+def test_each_step_plans_with_noise_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8))
+    planner, used = MPPI(SMALL), []
+    monkeypatch.setattr(
+        NoiseBank,
+        "at",
+        lambda bank, step: (
+            used.append(step) or bank.values[:, :1, None].expand(-1, -1, 256).movedim(1, 0).expand(20, -1, -1)
+        ),
+    )
+    state = planner.init(problem, generator())
+    for _ in range(3):
+        _, state, _ = planner.plan(first(problem), state)
+    assert used == [0, 1, 2]
 
 
 def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
@@ -130,7 +141,7 @@ def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
 
 def test_it_drives_at_the_target_that_it_is_given() -> None:
     problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(7.0, 4.0))
-    planner = MPPI(SMALL)
+    planner = MPPI(replace(SMALL, samples=1900))
     state = planner.init(problem, generator())
     aside = torch.tensor([[4.0, 7.0]])
     turns = [
@@ -182,7 +193,7 @@ def test_a_low_temperature_takes_the_best_sample() -> None:
     planner = MPPI(replace(SMALL, temperature=1e-4))
     state = planner.init(problem, generator())
     action, _, _ = planner.plan(first(problem), state)
-    noise = mppi.draw_noise(state, 256)
+    noise = state.noise.at(state.step)
     cost = mppi.rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)
     best = noise[0, :, cost.argmin()].clamp(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]))
     torch.testing.assert_close(action[0], best, atol=1e-3, rtol=0)
@@ -212,18 +223,15 @@ def problem_on(robot) -> Problem:  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
 def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
-    # The generator alone needs a real device.
-    monkeypatch.setattr(
-        mppi, "draw_noise", lambda state, samples: state.mean.new_empty(*state.mean.shape[1:], samples)
-    )
     monkeypatch.setattr(mppi, "Fused", lambda function, samples: function)
     with fake_cuda(problem_on(robot)) as problem:
         mean, scale = problem.start.new_zeros(2, 20, 2), problem.start.new_ones(2)
-        state = MPPIState(problem, mean, scale, seed=0, step=0)
+        values = mean.new_zeros(2, 4 * 20 * 256)
+        places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
+        bank = NoiseBank(values=values, place=places, stride=places, samples=256)
+        state = MPPIState(problem, mean, scale, bank, step=0)
         planner = MPPI(replace(SMALL, control_cost=0.1))
         action, state, plan = planner.plan(first(problem, draw=True), state)
         assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)
-        cost = mppi.rollout_cost(
-            problem, problem.start, state.mean, mppi.draw_noise(state, 9), problem.goal_m
-        )
+        cost = mppi.rollout_cost(problem, problem.start, state.mean, bank.at(1), problem.goal_m)
         assert on_cuda(cost)
