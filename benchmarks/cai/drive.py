@@ -14,7 +14,7 @@ from benchnav.planning.planners.mppi import MPPI, advance_chunk, weigh
 from benchnav.planning.planners.planner import Step
 from benchnav.planning.problem import Problem
 
-_WORTH_COMPILING = 10**6
+_ALWAYS = 0  # is compiled, however few samples
 
 
 class ManyTrialsMPPI(MPPI):
@@ -27,8 +27,8 @@ class ManyTrialsMPPI(MPPI):
     def __init__(self, setup: Setup) -> None:
         """Keeps the settings."""
         super().__init__(setup.mppi)
-        self._advance = Fused(advance_chunk, _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
-        self._weigh = Fused(WEIGHS[setup.average], _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
+        self._advance = Fused(advance_chunk, setup.mppi.samples, _ALWAYS, batched=(0, 1, 2, 6, 7))
+        self._weigh = Fused(WEIGHS[setup.average], setup.mppi.samples, _ALWAYS, batched=(0, 1, 2, 6, 7))
 
 
 def average_as_drawn(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -167,15 +167,15 @@ class Problem:
         Args:
             members: indices, shape [M].
         """
-        return _with_tensors(self, lambda value: value[members])
+        return with_tensors(self, lambda value: value[members])
 
     def clone(self) -> "Problem":
         """A copy that shares no tensor."""
-        return _with_tensors(self, torch.clone)
+        return with_tensors(self, torch.clone)
 
     def to(self, device: torch.device | str) -> "Problem":
         """The problem on a device."""
-        return _with_tensors(self, lambda value: value.to(device))
+        return with_tensors(self, lambda value: value.to(device))
 
 
 def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
@@ -230,13 +230,15 @@ def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
     return torch.cat((position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1)
 
 
-def _with_tensors(value: T, change: Any) -> T:
-    """Changes every tensor of a dataclass and of the dataclasses in it, but for the task's."""
+def with_tensors(value: T, change: Any) -> T:
+    """Changes every tensor of a dataclass and of the tuples and dataclasses in it, but for the task's."""
     changed: dict[str, Any] = {}
     for each in fields(value):  # type: ignore[arg-type]
         item = getattr(value, each.name)
         if isinstance(item, Tensor):
             changed[each.name] = change(item)
+        elif isinstance(item, tuple) and any(isinstance(one, Tensor) for one in item):
+            changed[each.name] = tuple(change(one) for one in item)
         elif is_dataclass(item) and not isinstance(item, Task | Grid):
-            changed[each.name] = _with_tensors(item, change)
+            changed[each.name] = with_tensors(item, change)
     return replace(value, **changed)  # type: ignore[type-var]

@@ -44,11 +44,20 @@ class Recorder:
         self.every = drawing_interval(problem.dt_s)
         self._plans: dict[int, list[DrawnPlan]] = {member: [] for member in members}
 
-    def watch(self, step: int, plan: Plan) -> None:
-        """Keeps a step's plan; those that no figure will show are thinned, since there may be many."""
+    def watch(self, step: int, plan: Plan, planned: list[int]) -> None:
+        """Keeps a step's plan; those that no figure will show are thinned, since there may be many.
+
+        Args:
+            step: its number.
+            plan: of some episodes.
+            planned: which of the unit's these are.
+        """
         whole = step * self.problem.dt_s <= SNAPSHOT_S + 1e-6
+        places = {member: place for place, member in enumerate(planned)}
         for member, plans in self._plans.items():
-            drawn = drawn_plan(step, plan.lines(member))
+            if member not in places:
+                continue  # it has ended
+            drawn = drawn_plan(step, plan.lines(places[member]))
             plans.append(drawn if whole else thinned(drawn))
 
     def write(self, episodes: Episodes, member: int, folder: Path) -> None:

@@ -6,7 +6,7 @@ Letters in shapes: B episodes, N steps, S state and A action dimensions.
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -15,13 +15,15 @@ from torch import Tensor
 from benchnav.errors import BenchnavError
 from benchnav.options import one_line
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.check.boundary import act, begin
+from benchnav.planning.planners.check.boundary import Answer, act, begin
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
-Watcher = Callable[[int, Plan], None]
+_FULL = 0.75  # share of a batch that still runs, over which it is left as it is
+
+Watcher = Callable[[int, Plan, list[int]], None]  # step, plan, and the episodes that are planned for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +38,8 @@ class Episodes:
         outcome: `Outcome`, shape [B].
         steps: steps to the end, shape [B].
         begin_s: wall time of what the planner prepared for the whole batch.
-        planning_s: wall time of each step's plan for the whole batch, shape [N].
+        planning_s: wall time of each step's plan, shape [N].
+        planned: how many episodes it was for, int64, shape [N].
         errors: one line for each episode that ended by a fault of its planner, empty for the others, B of
             them.
         traceback: where the planner raised; empty where it did not.
@@ -50,6 +53,7 @@ class Episodes:
     steps: Tensor
     begin_s: float
     planning_s: Tensor
+    planned: Tensor
     errors: tuple[str, ...]
     traceback: str = ""
 
@@ -66,6 +70,7 @@ class _Log:
         self.turned: list[Tensor] = []
         self.begin_s = 0.0
         self.planning_s: list[float] = []
+        self.planned: list[int] = []
         self.errors = [""] * len(start.state)
 
     def blame(self, which: Tensor, reason: str) -> None:
@@ -95,6 +100,7 @@ class _Log:
             begin_s=self.begin_s,
             # A planner that raised has no step for its last plan.
             planning_s=torch.tensor(self.planning_s[: len(self.actions)], dtype=torch.float64),
+            planned=torch.tensor(self.planned[: len(self.actions)]),
             errors=tuple(self.errors),
             traceback=traceback_,
         )
@@ -118,7 +124,7 @@ def run_episodes(
         problem: with predicted traversability.
         simulation: with the true terrain.
         generator: the planner's randomness.
-        watch: is called with a step's number and plan, before the step is taken.
+        watch: is called with a step's number, its plan and the episodes that it is for, before the step is taken.
         watch_every: of so many steps one is watched, from the first on.
 
     Returns:
@@ -130,24 +136,26 @@ def run_episodes(
     trace = ""
     began = time.perf_counter()
     try:
-        plan_state = begin(planner, problem, generator)
+        batch = _Batch(planner, problem, begin(planner, problem, generator))
         log.begin_s = time.perf_counter() - began
         while bool(now.running.any()):
             count = len(log.actions)
+            batch.drop_ended(now.running)
             watched = watch is not None and count % watch_every == 0
             step = Step(state=now.state, felt=felt, time_s=count * problem.dt_s, draw=watched)
             began = time.perf_counter()
-            answer = act(planner, step, plan_state, problem)
+            answer = batch.act(step)
             log.planning_s.append(time.perf_counter() - began)
-            plan_state = answer.plan_state
+            log.planned.append(len(batch.members))
             if watched and watch is not None:
-                watch(count, answer.plan)
-            log.blame(now.running & answer.faulty, answer.reason)
-            now = end(now, answer.faulty, Outcome.PLANNER_ERROR)
-            now = end(now, answer.plan.status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
+                watch(count, answer.plan, batch.members.tolist())
+            action, faulty, status = batch.spread(answer)
+            log.blame(now.running & faulty, answer.reason)
+            now = end(now, faulty, Outcome.PLANNER_ERROR)
+            now = end(now, status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
             before = now.state
-            now, felt, free = _move(simulation, now, answer.action)
-            log.add(before, now, answer.action, felt, free)
+            now, felt, free = _move(simulation, now, action)
+            log.add(before, now, action, felt, free)
     except RobotError:
         raise
     except (Exception, SystemExit) as error:
@@ -155,6 +163,47 @@ def run_episodes(
         log.blame(now.running, fault(error))
         now = end(now, now.running, Outcome.PLANNER_ERROR)
     return log.episodes(now, len(problem.robot.action_low), trace)
+
+
+class _Batch:
+    """The episodes that are planned for: all at first, and fewer when enough of them have ended.
+
+    Args:
+        planner: any planner.
+        problem: of all episodes.
+        plan_state: from `begin`.
+    """
+
+    def __init__(self, planner: Planner[Any], problem: Problem, plan_state: Any) -> None:
+        self.members = torch.arange(len(problem), device=problem.start.device)
+        self._planner, self._whole, self._part, self._state = planner, problem, problem, plan_state
+
+    def drop_ended(self, running: Tensor) -> None:
+        """Lets ended episodes leave, where the planner can do without them and a quarter has ended."""
+        left = running[self.members].nonzero()[:, 0]
+        if len(left) > _FULL * len(self.members) or not hasattr(self._planner, "select"):
+            return
+        self._state = self._planner.select(self._state, left)
+        self.members = self.members[left]
+        self._part = self._whole.select(self.members)
+
+    def act(self, step: Step) -> Answer:
+        """Asks the planner, for the episodes that are left."""
+        given = replace(step, state=step.state[self.members], felt=step.felt[self.members])
+        answer = act(self._planner, given, self._state, self._part)
+        self._state = answer.plan_state
+        return answer
+
+    def spread(self, answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
+        """Actions, faults and statuses of all episodes; of those that have left, what is harmless."""
+        count, low_high = len(self._whole), self._whole.action_bounds
+        action = torch.zeros_like(low_high[0]).clamp(*low_high).expand(count, -1)
+        nothing = torch.zeros(count, dtype=torch.int64, device=self.members.device)
+        return (
+            action.index_copy(0, self.members, answer.action),
+            nothing.bool().index_copy(0, self.members, answer.faulty),
+            nothing.index_copy(0, self.members, answer.plan.status),
+        )
 
 
 class RobotError(BenchnavError):

@@ -120,7 +120,7 @@ def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
 
 
 def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
-    """Wall times of planning for one robot: those of the batch over its number of episodes.
+    """Wall times of planning for one robot: those of a batch over the number of episodes that it was for.
 
     Args:
         episodes: what happened.
@@ -131,13 +131,14 @@ def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
         `planning_ms_p95`; `planning_start_ms`, what is prepared and the first step, compilation among it.
         NaN where there is no such step.
     """
-    share_ms = 1e3 / len(episodes.steps)
-    own = share_ms * episodes.planning_s[: int(episodes.steps[member])].numpy()
+    steps = int(episodes.steps[member])
+    own = 1e3 * (episodes.planning_s / episodes.planned)[:steps].numpy()
+    begin_ms = 1e3 * episodes.begin_s / len(episodes.steps)
     warm = own[1:]
     return {
         "planning_ms": float(np.median(warm)) if len(warm) else np.nan,
         "planning_ms_p95": float(np.percentile(warm, 95)) if len(warm) else np.nan,
-        "planning_start_ms": share_ms * episodes.begin_s + float(own[0]) if len(own) else np.nan,
+        "planning_start_ms": begin_ms + float(own[0]) if len(own) else np.nan,
     }
 
 

@@ -21,11 +21,6 @@ import torch
 
 R = TypeVar("R")
 
-# Under this many parallel rollouts compiling takes longer than it saves in an episode.
-_WORTH_ROLLOUTS = 40_000
-# Episodes that are taken to run in parallel, however many do.
-_EPISODES = 20
-
 
 def can_compile() -> bool:
     """Tells whether anything is compiled here: PyTorch's switch is not off, and there is a C++ compiler."""
@@ -33,9 +28,9 @@ def can_compile() -> bool:
     return not torch._dynamo.config.disable and any(shutil.which(name) for name in compilers if name)
 
 
-def worth_compiling(samples: int, device: torch.device) -> bool:
-    """Tells whether rollouts of so many samples an episode are to be compiled."""
-    return device.type == "cuda" or samples * _EPISODES >= _WORTH_ROLLOUTS
+def worth_compiling(rollouts: int, least: int, device: torch.device) -> bool:
+    """Tells whether so many rollouts an episode are to be compiled."""
+    return device.type == "cuda" or rollouts >= least
 
 
 class Fused(Generic[R]):
@@ -46,13 +41,17 @@ class Fused(Generic[R]):
 
     Args:
         function: takes and returns tensors, one of them first; it must not change its arguments.
-        samples: rollouts an episode that a call is for.
+        rollouts: how many of an episode a call is for.
+        least: so many are worth the seconds that compiling takes. Fewer run eagerly, which takes the same time however
+            few they are.
         batched: places of the arguments whose first dimension is that of the episodes.
     """
 
-    def __init__(self, function: Callable[..., R], samples: int, batched: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, function: Callable[..., R], rollouts: int, least: int, batched: tuple[int, ...] = ()
+    ) -> None:
         """Keeps the function; nothing is compiled yet."""
-        self._function, self._samples, self._batched = function, samples, batched
+        self._function, self._rollouts, self._least, self._batched = function, rollouts, least, batched
         self._fused: Callable[..., R] | None = None
         self._seen: set[tuple[object, ...]] = set()
         self.compiled: bool | None = None
@@ -105,7 +104,9 @@ class Fused(Generic[R]):
 
     def _wanted(self, example: object) -> bool:
         assert isinstance(example, torch.Tensor)
-        return worth_compiling(self._samples, example.device) and not torch._dynamo.config.disable
+        return (
+            worth_compiling(self._rollouts, self._least, example.device) and not torch._dynamo.config.disable
+        )
 
 
 @contextmanager

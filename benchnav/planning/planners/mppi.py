@@ -31,6 +31,7 @@ from benchnav.planning.robots import Robot
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
+_WORTH_COMPILING = 2000  # samples
 _DRAWN_SAMPLES = 40
 
 
@@ -95,8 +96,9 @@ class MPPI:
     def __init__(self, config: MPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
-        self._advance = Fused(advance_chunk, self.config.samples, batched=(0, 1, 2, 6, 7))
-        self._weigh = Fused(weigh, self.config.samples, batched=(0, 1, 2, 6, 7))
+        samples = self.config.samples
+        self._advance = Fused(advance_chunk, samples, _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
+        self._weigh = Fused(weigh, samples, _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
 
     @property
     def compiled(self) -> bool | None:
@@ -147,6 +149,10 @@ class MPPI:
     def took(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
         """Plans on as before; see `LocalPlanner`."""
         return plan_state
+
+    def select(self, plan_state: MPPIState, members: Tensor) -> MPPIState:
+        """Keeps some episodes; see `Planner`."""
+        return replace(plan_state, problem=plan_state.problem.select(members), mean=plan_state.mean[members])
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:

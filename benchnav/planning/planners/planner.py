@@ -95,6 +95,8 @@ class Planner(Protocol[State]):
       model and risk setting.
     - `remarks(task)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
     - `compiled`: whether it runs compiled; None before its first plan.
+    - `select(plan_state, members)`: the plan state of some of the episodes, int64 [M], which then are planned
+      for alone. With it episodes leave the batch when they have ended, and cost no more.
     """
 
     def init(self, problem: Problem, generator: torch.Generator) -> State:

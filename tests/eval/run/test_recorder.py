@@ -223,7 +223,7 @@ def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
     assert recorder.every == 5
     samples = torch.rand(4, 40, 30, 2)
     for step in (0, 150, 155, 900):
-        recorder.watch(step, Plan.empty(4, samples=samples))
+        recorder.watch(step, Plan.empty(4, samples=samples), [0, 1, 2, 3])
     for member, plans in recorder._plans.items():
         whole = drawn_plan(0, {"samples": samples[member]})
         assert [plan.step for plan in plans] == [0, 150, 155, 900]

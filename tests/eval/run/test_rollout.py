@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -6,7 +7,9 @@ import torch
 
 from benchnav.eval.run import rollout
 from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem
+from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
 from tests import factories
@@ -65,3 +68,90 @@ def test_a_plan_that_was_never_made_has_no_time(monkeypatch: pytest.MonkeyPatch)
     episodes = run(monkeypatch, raises_at=3)
     assert episodes.planning_s.tolist() == [1, 2]
     assert episodes.errors == ("RuntimeError: enough",) * BATCH
+
+
+class Homing:
+    """Drives at the goal by what it kept of the problem; notes for which goals it was asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[list[float]] = []
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        return problem
+
+    def plan(self, step: Step, plan_state: Problem) -> Any:
+        self.asked.append(plan_state.goal_m[:, 0].tolist())
+        action = steer_toward(step.state, plan_state.goal_m, plan_state.robot)
+        path = plan_state.goal_m[:, None]
+        return action, plan_state, Plan.empty(len(action), path=path)
+
+
+class Leaving(Homing):
+    """May be left by episodes that have ended."""
+
+    def select(self, plan_state: Problem, members: torch.Tensor) -> Problem:
+        return plan_state.select(members)
+
+
+GOALS = torch.tensor([[7.0, 1.25], [2.5, 1.25], [3.5, 1.25], [6.0, 1.25]])
+
+
+def home(
+    planner: Homing, planned: list[tuple[int, list[int], list[float]]] | None = None
+) -> rollout.Episodes:
+    """Four robots side by side; the second and the third are there soon."""
+    ground, goals = torch.full((4, 16, 16), 0.9), GOALS
+    problem = factories.problem(ground, time_budget_s=40.0)
+    problem = replace(problem, goal_m=goals)
+    simulation = Simulation(
+        factories.terrain(ground),
+        factories.task(),
+        World(time_budget_s=40.0),
+        factories.places(goals),
+        0,
+        range(4),
+    )
+
+    def watch(step: int, plan: Plan, members: list[int]) -> None:
+        assert planned is not None
+        planned.append((step, members, plan.path[:, 0, 0].tolist()))
+
+    watcher = None if planned is None else watch
+    return rollout.run_episodes(planner, problem, simulation, torch.Generator(), watcher, 5)
+
+
+def test_episodes_that_have_ended_are_planned_for_no_more_and_nothing_else_changes() -> None:
+    staying, leaving = Homing(), Leaving()
+    whole, part = home(staying), home(leaving)
+    assert {len(goals) for goals in staying.asked} == {4}
+    assert leaving.asked[0] == GOALS[:, 0].tolist()
+    assert leaving.asked[-1] == [7.0]
+    assert part.planned.tolist() == [len(goals) for goals in leaving.asked]
+    assert whole.planned.tolist() == [4] * len(staying.asked)
+    assert bool((whole.outcome == Outcome.SUCCESS).all())
+    for name in ("states", "actions", "traversability", "outcome", "steps"):
+        mine, other = getattr(part, name), getattr(whole, name)
+        for member, count in enumerate(whole.steps.tolist()):
+            own = (member, slice(count)) if mine.dim() > 1 else member
+            assert torch.equal(mine[own], other[own]), name
+
+
+def test_who_watches_is_told_whose_plans_they_are() -> None:
+    planned: list[tuple[int, list[int], list[float]]] = []
+    episodes = home(Leaving(), planned)
+    assert [step for step, _, _ in planned] == list(range(0, episodes.actions.shape[1], 5))
+    for _, members, goals in planned:
+        assert goals == GOALS[members, 0].tolist()
+    assert planned[0][1] == [0, 1, 2, 3]
+    assert planned[-1][1] == [0]
+
+
+def test_a_planner_that_cannot_be_left_is_blamed() -> None:
+    class Stubborn(Homing):
+        def select(self, plan_state: Problem, members: torch.Tensor) -> Problem:
+            raise RuntimeError("all or none")
+
+    episodes = home(Stubborn())
+    assert episodes.outcome[0] == Outcome.PLANNER_ERROR
+    assert episodes.errors[0] == "RuntimeError: all or none"
+    assert episodes.outcome[1] == Outcome.SUCCESS

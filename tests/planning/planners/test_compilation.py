@@ -1,5 +1,6 @@
 import logging
 import sys
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -9,13 +10,15 @@ import torch._dynamo.config
 import torch._inductor.config
 
 from benchnav.planning.planners import compilation
+from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.compilation import Fused, worth_compiling
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
 from tests import factories
 from tests.planning.planners.driving import first, generator
 
 CPU = torch.device("cpu")
-MANY = 5000
+MANY = 5000, 2000
+FEW = 100, 2000
 
 
 def scaled(x: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
@@ -29,26 +32,28 @@ compiling = torch.compiler.is_compiling
 
 
 @pytest.fixture(autouse=True)
-def _fresh() -> None:
+def _fresh() -> Iterator[None]:
     eager.clear()
+    with torch._dynamo.config.patch(disable=False):  # `make test` turns compiling off elsewhere
+        yield
 
 
 def inputs(columns: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.linspace(0, 1, 3 * columns).reshape(3, columns), torch.tensor(2.0)
 
 
-def test_what_is_worth_compiling_depends_on_samples_and_device_alone() -> None:
-    assert worth_compiling(5000, CPU)
-    assert worth_compiling(2000, CPU)
-    assert not worth_compiling(1999, CPU)
-    assert worth_compiling(10, torch.device("cuda"))
+def test_what_is_worth_compiling_depends_on_rollouts_and_device_alone() -> None:
+    assert worth_compiling(5000, 2000, CPU)
+    assert worth_compiling(2000, 2000, CPU)
+    assert not worth_compiling(1999, 2000, CPU)
+    assert worth_compiling(10, 2000, torch.device("cuda"))
 
 
 def test_more_shapes_than_pytorch_allows_stay_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     # The limit is the tracer's, so that no C++ need be compiled.
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     limit = torch._dynamo.config.recompile_limit
-    fused = Fused(scaled, MANY)
+    fused = Fused(scaled, *MANY)
     assert fused.compiled is None
     for columns in range(1, limit + 3):
         x, factor = inputs(columns)
@@ -58,14 +63,14 @@ def test_more_shapes_than_pytorch_allows_stay_compiled(monkeypatch: pytest.Monke
 
 
 def test_few_samples_run_eagerly() -> None:
-    fused = Fused(scaled, 100)
+    fused = Fused(scaled, *FEW)
     fused(*inputs(40))
     assert fused.compiled is False
     assert len(eager) == 1
 
 
 def test_pytorchs_own_switch_turns_it_off() -> None:
-    fused = Fused(scaled, MANY)
+    fused = Fused(scaled, *MANY)
     with torch._dynamo.config.patch(disable=True):
         fused(*inputs(41))
     assert fused.compiled is False
@@ -81,7 +86,7 @@ def uncompilable(x: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 def test_what_cannot_be_compiled_runs_eagerly_and_leaves_all_else_alone(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    hopeless, fine = Fused(uncompilable, MANY), Fused(scaled, MANY)
+    hopeless, fine = Fused(uncompilable, *MANY), Fused(scaled, *MANY)
     x, factor = inputs(42)
     for _ in range(2):
         torch.testing.assert_close(hopeless(x, factor), 2 * x)
@@ -91,13 +96,13 @@ def test_what_cannot_be_compiled_runs_eagerly_and_leaves_all_else_alone(
     fine(x, factor)
     assert fine.compiled is True
     assert eager == []
-    another = Fused(uncompilable, MANY)
+    another = Fused(uncompilable, *MANY)
     another(x, factor)
     assert another.compiled is False
 
 
 def test_without_a_compiler_it_runs_eagerly(capsys: pytest.CaptureFixture[str]) -> None:
-    fused = Fused(scaled, MANY)
+    fused = Fused(scaled, *MANY)
     x, factor = inputs(43)
     with torch._inductor.config.patch(
         {"cpp.cxx": ("no-such-compiler",), "force_disable_caches": True, "cpp_wrapper": False}
@@ -112,7 +117,7 @@ def test_a_mistake_in_the_function_is_raised_as_it_is() -> None:
         raise ValueError("not today")
 
     with pytest.raises(ValueError, match="not today"):
-        Fused(mistaken, MANY)(torch.zeros(3))
+        Fused(mistaken, *MANY)(torch.zeros(3))
 
 
 def settings() -> dict[str, Any]:
@@ -135,9 +140,9 @@ def test_no_setting_of_pytorch_is_left_changed() -> None:
         during.append(settings())
         return x
 
-    fused = Fused(scaled, MANY)
+    fused = Fused(scaled, *MANY)
     fused(*inputs(44))
-    Fused(uncompilable, MANY)(*inputs(44))
+    Fused(uncompilable, *MANY)(*inputs(44))
     assert settings() == before
     fused._fused = look  # type: ignore[assignment]
     fused(torch.zeros(1))
@@ -170,13 +175,13 @@ def test_compiled_and_eager_planners_agree(monkeypatch: pytest.MonkeyPatch) -> N
     problem = factories.problem(maps)
     uncompilable_problem = factories.problem(maps, objective=Doubtful())
     actions = []
-    for worth in (1_000_000, 1):
-        monkeypatch.setattr(compilation, "_WORTH_ROLLOUTS", worth)
+    for worth in (False, True):
+        monkeypatch.setattr(compilation, "worth_compiling", lambda *_, worth=worth: worth)
         planner = MPPI(SMALL)
         assert planner.compiled is None
         action, state, _ = planner.plan(first(problem), planner.init(problem, generator()))
         actions.append(torch.cat((action, state.mean.flatten(1)), dim=1))
-        assert planner.compiled is (worth == 1)
+        assert planner.compiled is worth
     torch.testing.assert_close(actions[0], actions[1], atol=1e-4, rtol=1e-4)
     doubtful, other = MPPI(SMALL), MPPI(SMALL)
     doubtful.plan(first(problem), doubtful.init(uncompilable_problem, generator()))
@@ -192,3 +197,39 @@ def test_a_unit_of_three_episodes_and_one_of_twenty_agree_on_compiling() -> None
         problem = factories.problem(torch.full((batch, 16, 16), 0.8))
         planner.plan(first(problem), planner.init(problem, generator()))
         assert planner.compiled is False
+
+
+def test_one_function_serves_any_number_of_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    fused = Fused(scaled, *MANY, batched=(0,))
+    traced, real = [], compilation._compiling
+    monkeypatch.setattr(compilation, "_compiling", lambda: traced.append(0) or real())
+    factor = torch.tensor(2.0)
+    for rows in (7, 3, 1, 20, 1):
+        x = torch.rand(rows, 46, generator=generator())
+        torch.testing.assert_close(fused(x, factor), (2 * x + 1).sin())
+    assert len(traced) == 2  # of several episodes, and of one
+    assert eager == []
+
+
+@pytest.mark.parametrize("name", ["mppi", "astar_dwa"])
+def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thread_and_two(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = 0.35 + 0.6 * torch.rand(3, 24, 20, generator=generator())
+    problem = factories.problem(maps, start=(1.25, 1.25), goal=(8.25, 9.25))
+    monkeypatch.setattr(compilation, "worth_compiling", lambda *_: compiled)
+    found: dict[tuple[bool, int, int], torch.Tensor] = {}
+    threads = torch.get_num_threads()
+    for compiled in (False, True):
+        for count in (1, 2):
+            for episodes in (3, 1):
+                torch.set_num_threads(count)
+                planner: Any = MPPI(MPPIConfig(samples=300)) if name == "mppi" else AStarDWA()
+                posed = problem.select(torch.arange(episodes))
+                action, _, _ = planner.plan(first(posed), planner.init(posed, generator()))
+                assert planner.compiled is compiled
+                found[compiled, count, episodes] = action
+    torch.set_num_threads(threads)
+    for action in found.values():
+        torch.testing.assert_close(action, found[False, 1, 3][: len(action)], atol=1e-4, rtol=0)

@@ -223,7 +223,7 @@ def problem_on(robot) -> Problem:  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
 def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
-    monkeypatch.setattr(mppi, "Fused", lambda function, samples: function)
+    monkeypatch.setattr(mppi, "Fused", lambda function, *_, **__: function)
     with fake_cuda(problem_on(robot)) as problem:
         mean, scale = problem.start.new_zeros(2, 20, 2), problem.start.new_ones(2)
         values = mean.new_zeros(2, 4 * 20 * 256)

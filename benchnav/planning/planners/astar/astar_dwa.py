@@ -37,6 +37,11 @@ class AStarDWA(Guided[DWAState]):
         self._dwa = DWA(self.config.dwa)
         super().__init__(self.config, self._dwa)
 
+    @property
+    def compiled(self) -> bool | None:
+        """Whether rollouts are compiled; None before the first."""
+        return self._dwa.compiled
+
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Names the accelerations that are not the robot's, and paths that no setting moves; see `Planner`."""
         return (*self._dwa.remarks(task.robot), *super().remarks(task))

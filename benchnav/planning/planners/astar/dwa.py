@@ -10,16 +10,23 @@ episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.grid import Grid
+from benchnav.planning.objective import Objective
+from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, stage_cost, with_tensors
 from benchnav.planning.robots import Robot, action_limits
 
+# A chunk of the horizon compiles in seconds.
+_CHUNK_STEPS = 10
+_WORTH_COMPILING = 100  # pairs
 # Of a trajectory's positions, every so many are drawn.
 _DRAW_EVERY = 5
 
@@ -80,6 +87,13 @@ class DWA:
     def __init__(self, config: DWAConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or DWAConfig()
+        pairs = self.config.speeds * self.config.turn_rates
+        self._hold = Fused(hold, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5))
+
+    @property
+    def compiled(self) -> bool | None:
+        """Whether it runs compiled; None before the first step."""
+        return self._hold.compiled
 
     def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
         """Starts from standing robots; draws nothing. See `LocalPlanner`."""
@@ -91,12 +105,12 @@ class DWA:
         """Picks the window's best pair; see `LocalPlanner`."""
         problem = plan_state.problem
         window = velocity_window(problem, plan_state.velocity, self.config)
-        cost, positions = judge(problem, step.state, window, target_m, self.config)
+        cost = judge(problem, step.state, window, target_m, self.config, self._hold)
         best = cost.argmin(dim=1)[:, None, None]
         action = window.gather(1, best.expand(-1, 1, 2))[:, 0]
         plan = Plan.empty(len(problem), step.state.device)
         if step.draw:
-            drawn = torch.stack(positions, dim=2)
+            drawn = held_paths(problem, step.state, window, self.config.horizon)
             path = drawn.gather(1, best[..., None].expand(-1, 1, *drawn.shape[2:]))[:, 0]
             plan = Plan.empty(len(problem), step.state.device, path=path, samples=drawn[:, :, ::_DRAW_EVERY])
         return action, plan_state, plan
@@ -114,6 +128,10 @@ class DWA:
             ]
             velocity = plan_state.velocity + torch.stack(change, dim=1)
         return DWAState(problem, velocity)
+
+    def select(self, plan_state: DWAState, members: Tensor) -> DWAState:
+        """Keeps some episodes; see `Planner`."""
+        return with_tensors(plan_state, lambda value: value[members])
 
     def remarks(self, robot: Robot) -> tuple[str, ...]:
         """Names the accelerations of the window where they are not the robot's."""
@@ -153,8 +171,13 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
 
 
 def judge(
-    problem: Problem, state: Tensor, window: Tensor, target_m: Tensor, config: DWAConfig
-) -> tuple[Tensor, list[Tensor]]:
+    problem: Problem,
+    state: Tensor,
+    window: Tensor,
+    target_m: Tensor,
+    config: DWAConfig,
+    advance: Callable[..., tuple[Tensor, Tensor, Tensor]] | None = None,
+) -> Tensor:
     """Rolls out the window's pairs and sums their costs.
 
     Args:
@@ -163,25 +186,48 @@ def judge(
         window: pairs (v, ω), shape [B, M, 2].
         target_m: way-points (x, y), shape [B, 2].
         config: settings.
+        advance: `hold` or the same compiled.
 
     Returns:
-        Cost of each pair, shape [B, M]; positions after each step, the first included, T + 1 of shape
-        [B, M, 2].
+        Cost of each pair, shape [B, M].
     """
-    target = target_m[:, None]
-    states = state[:, None].expand(-1, window.shape[1], -1)
-    positions = [states[..., :2]]
+    advance, target = advance or hold, target_m[:, None].contiguous()
+    # State dimensions outermost in memory, so that each is contiguous in pairs.
+    states = state.T[:, :, None].expand(-1, -1, window.shape[1]).contiguous().movedim(0, -1)
+    pairs = window.movedim(-1, 0).contiguous().movedim(0, -1)
     cost = torch.zeros_like(window[..., 0])
     under_way = torch.ones_like(cost, dtype=torch.bool)
-    for _ in range(config.horizon):
-        ground = problem.ground_at(states)
-        cost = cost + problem.stage_cost(states, window, ground, target) * under_way
-        states = problem.robot(states, window, ground.abs())
-        positions.append(states[..., :2])
-        offset = states[..., :2] - target
-        under_way = under_way & ((offset * offset).sum(-1) > config.arrival_m**2)
+    for first in range(0, config.horizon, _CHUNK_STEPS):
+        states, cost, under_way = advance(
+            states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
+            problem.objective, config.arrival_m, min(_CHUNK_STEPS, config.horizon - first),
+        )  # fmt: skip
     last = problem.terminal_cost(states, target) + config.heading_weight * _turn_left(state, states, target)
-    return cost + last * under_way, positions
+    return cost + last * under_way
+
+
+def hold(
+    states: Tensor, cost: Tensor, under_way: Tensor, window: Tensor, padded_ground: Tensor, target: Tensor,
+    grid: Grid, robot: Robot, objective: Objective, arrival_m: float, steps: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Holds each pair for some steps, adding up the costs of those that have not arrived."""
+    for _ in range(steps):
+        ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
+        cost = cost + stage_cost(objective, states, window, ground, target) * under_way
+        states = robot(states, window, ground.abs())
+        offset = states[..., :2] - target
+        under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
+    return states.movedim(-1, 0).contiguous().movedim(0, -1), cost, under_way
+
+
+def held_paths(problem: Problem, state: Tensor, window: Tensor, horizon: int) -> Tensor:
+    """Positions along the window's pairs, the first included, shape [B, M, T + 1, 2]."""
+    states = state[:, None].expand(-1, window.shape[1], -1)
+    positions = [states[..., :2]]
+    for _ in range(horizon):
+        states = problem.robot(states, window, problem.traversability_at(states))
+        positions.append(states[..., :2])
+    return torch.stack(positions, dim=2)
 
 
 def _turn_left(state: Tensor, last: Tensor, target: Tensor) -> Tensor:

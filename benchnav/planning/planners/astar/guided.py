@@ -17,9 +17,10 @@ from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.straight import steer_toward
-from benchnav.planning.problem import Problem, Task
+from benchnav.planning.problem import Problem, Task, with_tensors
 
 Local = TypeVar("Local")
+T = TypeVar("T")
 
 
 class LocalPlanner(Protocol[Local]):
@@ -40,6 +41,10 @@ class LocalPlanner(Protocol[Local]):
 
     def took(self, plan_state: Local, action: Tensor) -> Local:
         """Notes the actions that are taken, which may be others than it chose, shape [B, A]."""
+        ...
+
+    def select(self, plan_state: Local, members: Tensor) -> Local:
+        """Keeps some episodes; see `Planner`."""
         ...
 
 
@@ -135,3 +140,17 @@ class Guided(Generic[Local]):
             plan = replace(plan, reference=astar.path_points(problem, field, state, whole))
         local = self.local.took(local, action)
         return action, replace(plan_state, local=local, recovery=recovery), plan
+
+    def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
+        """Keeps some episodes; see `Planner`."""
+
+        def keep(tensors: T) -> T:
+            return with_tensors(tensors, lambda value: value[members])
+
+        return GuidedState(
+            problem=plan_state.problem.select(members),
+            field=keep(plan_state.field),
+            ground=keep(plan_state.ground),
+            local=self.local.select(plan_state.local, members),
+            recovery=keep(plan_state.recovery),
+        )

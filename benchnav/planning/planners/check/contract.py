@@ -49,9 +49,9 @@ def check_planner(
     their device; a `Plan` with a `PlanStatus` for each episode, and layers of the shapes that it names;
     the problem, the step and the plan state left as they were, and with them the global generators of
     Python, NumPy and PyTorch; the same answer when asked again, from the same seed, after other problems
-    were begun, and whether it is drawn or not; for an episode alone what it is in a batch; no error where
-    some robots of the batch have arrived or left the map. What a planner makes of a closed wall is its own
-    affair.
+    were begun, and whether it is drawn or not; for an episode alone, and for some that `select` keeps, what it is
+    in a batch; no error where some robots of the batch have arrived or left the map. What a planner makes of a
+    closed wall is its own affair.
 
     Args:
         planner: any planner, or the name, file or mapping of one as suites have it.
@@ -146,6 +146,7 @@ def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
         step = replace(step, state=moved, felt=met)
     yield from _compare_seed(planner, problem, steps[0], actions[0])
     yield from _compare_alone(planner, problem, steps[:_STEPS], actions, tolerance)
+    yield from _compare_selected(planner, problem, steps[:_STEPS], actions, tolerance)
     yield from _compare_later(planner, problem, steps[0], first_state, actions[0])
     yield from _compare_blind(planner, problem, steps[0], actions[0])
 
@@ -219,6 +220,31 @@ def _compare_alone(
             yield "Expected for an episode alone the action that it got in a batch, got another."
             return
         plan_state = said[1]
+
+
+def _compare_selected(
+    planner: Any, problem: Problem, steps: Sequence[Step], actions: Sequence[Tensor], tolerance: float
+) -> Breaches:
+    """Plans the first step for all, and the second for two of them that are kept, out of their order."""
+    if not hasattr(planner, "select") or len(steps) < 2:
+        return
+    members = torch.tensor([len(problem) - 1, len(problem) - 2], device=problem.start.device)
+    plan_state, _ = _begin(planner, problem)
+    said, _ = _ask(planner, steps[0], plan_state, problem)
+    if said is NOTHING:
+        return
+    kept, found = watch("select", lambda: planner.select(said[1], members), plan_state=said[1])
+    yield from found
+    if kept is NOTHING:
+        return
+    step = replace(steps[1], state=steps[1].state[members], felt=steps[1].felt[members])
+    said, found = _ask(planner, step, kept, problem.select(members))
+    yield from found
+    low, high = problem.action_bounds
+    if said is not NOTHING and not bool(
+        ((said[0] - actions[1][members]).abs() <= tolerance * (high - low)).all()
+    ):
+        yield "Expected of episodes that `select` keeps the actions that they got among all, got others."
 
 
 def _compare_later(planner: Any, problem: Problem, step: Step, plan_state: Any, action: Tensor) -> Breaches:

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from benchnav.errors import ConfigError
-from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, judge, velocity_window
+from benchnav.planning.planners.astar import dwa as dwa_module
+from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, held_paths, judge, velocity_window
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from tests import factories
@@ -67,8 +68,9 @@ def test_costs_equal_a_loop_over_pairs_and_steps() -> None:
     target = torch.tensor([[3.6, 2.6], [7.0, 6.0]])
     window = torch.tensor([[[0.9, 0.2], [0.1, -0.7]], [[0.0, 0.0], [1.0, 1.0]]])
     config = DWAConfig(horizon=23, heading_weight=3.0, arrival_m=0.3)
-    cost, positions = judge(problem, problem.start, window, target, config)
-    assert len(positions) == 24
+    cost = judge(problem, problem.start, window, target, config)
+    positions = held_paths(problem, problem.start, window, 23)
+    assert positions.shape == (2, 2, 24, 2)
     arrivals = 0
     for b in range(2):
         for m in range(2):
@@ -87,7 +89,7 @@ def test_costs_equal_a_loop_over_pairs_and_steps() -> None:
                 x, y = x + 0.1 * lam * v * math.cos(heading), y + 0.1 * lam * v * math.sin(heading)
                 heading += 0.1 * lam * w
                 arrived = arrived or math.hypot(x - gx, y - gy) <= 0.3
-                assert positions[t + 1][b, m].tolist() == pytest.approx([x, y], abs=1e-4)
+                assert positions[b, m, t + 1].tolist() == pytest.approx([x, y], abs=1e-4)
             if not arrived:
                 bearing = math.atan2(gy - 2.2, gx - 3.3)
                 expected += 3.0 * abs(bearing - heading)
@@ -160,7 +162,8 @@ def test_trajectories_are_stacked_only_to_be_drawn() -> None:
     torch.testing.assert_close(plan.path[:, 1], expected[:, :2])
 
 
-def test_no_tensor_is_made_on_another_device() -> None:
+def test_no_tensor_is_made_on_another_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dwa_module, "Fused", lambda function, *_, **__: function)
     with fake_cuda(factories.problem(torch.full((2, 16, 20), 0.9), robot=DifferentialDrive())) as problem:
         dwa = DWA()
         action, state, plan = dwa.plan_toward(

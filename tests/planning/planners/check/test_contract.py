@@ -316,3 +316,19 @@ def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -
     if known is not None and registry.make("robot", robot).action_names not in known:
         pytest.skip("it does not steer this robot")
     check_planner(made, robots=[robot])
+
+
+@pytest.mark.parametrize("order", ["kept", "sorted"])
+def test_what_select_keeps_has_to_be_those_that_were_asked_for(order: str) -> None:
+    class Leaving(Good):
+        def select(self, plan_state: Any, members: Tensor) -> Any:
+            chosen = members if order == "kept" else members.sort().values
+            return replace(
+                plan_state, problem=plan_state.problem.select(chosen), last=plan_state.last[chosen]
+            )
+
+    if order == "kept":
+        check_planner(Leaving(), robots=[Unicycle()])
+        return
+    with pytest.raises(ConfigError, match="of episodes that `select` keeps"):
+        check_planner(Leaving(), robots=[Unicycle()])
