@@ -104,7 +104,7 @@ class EnvBatch:
             return
         # Only what began anew is built: the others keep their maps and luck.
         index = torch.from_numpy(members)
-        self._simulation = self._simulation.exchange(index, fresh)
+        self._simulation.exchange_(index, fresh)
         self._now = _each(self._now, lambda name, value: value.index_copy(0, index, getattr(start, name)))
 
     def step(

@@ -5,7 +5,6 @@ planner and setting meets the same, whatever the batch or the order. Letters in 
 H×W cells, K components.
 """
 
-import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -57,7 +56,7 @@ class Realisation:
         self.attempts = torch.ones(len(terrain), dtype=torch.int64, device=terrain.traversability.device)
         self.field: Tensor | None = None
         if world.noise == "stored":
-            self.field = terrain.traversability
+            self.field = terrain.traversability.clone()
         elif world.noise == "frozen":
             self.field, self.attempts = draw_frozen(terrain, world, places, key, instances)
         if self.field is not None:
@@ -91,24 +90,22 @@ class Realisation:
         met = TraversabilityMixture(weights, means, stds).from_normal(noise)[:, 0, 0]
         return torch.where(self._grid.contains(x, y), met, 0.0)
 
-    def exchange(self, members: Tensor, others: "Realisation") -> "Realisation":
-        """Gives some episodes what they meet in another realisation of the same world.
+    def exchange_(self, members: Tensor, others: "Realisation") -> None:
+        """Gives some episodes what they meet in another realisation of the same world, in place.
 
         Args:
             members: indices of the episodes, int64, shape [M].
             others: of M episodes on maps of the same grid.
         """
-        made = copy.copy(self)
-        for name in ("_ground", "attempts"):
-            setattr(made, name, getattr(self, name).index_copy(0, members, getattr(others, name)))
+        self._ground.index_copy_(0, members, others._ground)
+        self.attempts.index_copy_(0, members, others.attempts)
         if self.field is not None and others.field is not None:
-            made.field = self.field.index_copy(0, members, others.field)
-            return made
+            self.field.index_copy_(0, members, others.field)
+            return
         # Time budgets may differ; what is beyond an episode's own is never met.
         most = max(self._noise.shape[1], others._noise.shape[1])
         own, new = (torch.nn.functional.pad(n, (0, most - n.shape[1])) for n in (self._noise, others._noise))
-        made._noise = own.index_copy(0, members, new)
-        return made
+        self._noise = own.index_copy(0, members, new)
 
 
 def check_known(terrain: Terrain, world: World) -> None:

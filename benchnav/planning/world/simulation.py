@@ -4,7 +4,6 @@ It holds the true terrain; λ is read where the robot stands and scales its moti
 episodes, S state and A action dimensions.
 """
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -135,18 +134,16 @@ class Simulation:
         action = action.clamp(self._low, self._high)
         return self.robot(now.state.clone(), action, torch.ones_like(now.state[:, 0]))
 
-    def exchange(self, members: Tensor, others: "Simulation") -> "Simulation":
-        """Gives some episodes the maps, goals and luck of another simulation; the rest keep theirs.
+    def exchange_(self, members: Tensor, others: "Simulation") -> None:
+        """Gives some episodes the maps, goals and luck of another simulation, in place; the rest keep theirs.
 
         Args:
             members: indices of the episodes, int64, shape [M].
             others: M episodes of the same task and world.
         """
-        made = copy.copy(self)
         for name in ("_goal_m", "time_budget_s", "steps"):
-            setattr(made, name, getattr(self, name).index_copy(0, members, getattr(others, name)))
-        made._realisation = self._realisation.exchange(members, others._realisation)
-        return made
+            setattr(self, name, getattr(self, name).index_copy(0, members, getattr(others, name)))
+        self._realisation.exchange_(members, others._realisation)
 
 
 def end(now: SimulationState, which: Tensor, outcome: Outcome) -> SimulationState:
