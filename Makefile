@@ -52,6 +52,8 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/datasets.py
 	$(BIN)/python benchmarks/gps.py
 	$(BIN)/python benchmarks/training.py
+	$(BIN)/python benchmarks/engine.py
+	$(BIN)/python benchmarks/rollouts.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

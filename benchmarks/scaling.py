@@ -72,6 +72,7 @@ def main() -> None:
         panel.set_xticks(list(curve), [f"{n:,}".replace(",", " ") for n in curve], rotation=45)
         panel.minorticks_off()
         panel.grid(visible=True, alpha=0.3)
+    panels[0].set_yticks([0.2, 0.5, 1, 2, 5, 10], ["0.2", "0.5", "1", "2", "5", "10"])
     panels[0].set_ylabel("ms a step and episode")
     figure.savefig(Path(sys.argv[1]), dpi=150)
     for name, curve in (*curves.items(), ("episodes, A*+DWA", guided)):

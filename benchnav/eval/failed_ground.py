@@ -12,7 +12,7 @@ from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import Run, open_run
 from benchnav.eval.report.charts.failure_sheet import FailedGround
-from benchnav.eval.report.sheets import GroundOf
+from benchnav.eval.report.failure_choice import GroundOf
 from benchnav.eval.run.episode import build, one_thread
 from benchnav.eval.trial import Trial
 from benchnav.eval.unit import Unit

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.report.charts.panels import blocks, several_models
-from benchnav.eval.report.figures import trial_name
+from benchnav.eval.report.figure_style import trial_name
 from benchnav.eval.report.tables import rate_in_words
 from benchnav.eval.stats.best import TOLD, competing
 from benchnav.planning.world.outcome import FAILURES

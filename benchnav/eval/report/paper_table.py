@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.report.charts.panels import blocks
-from benchnav.eval.report.figures import display_name
+from benchnav.eval.report.figure_style import display_name
 from benchnav.eval.report.rendering import latex, latex_label
 from benchnav.eval.report.tables import bold_note, rate_in_words
 from benchnav.eval.trial import NOT_USED

@@ -22,14 +22,14 @@ from benchnav.eval.report.charts.outcomes import outcome_figure
 from benchnav.eval.report.charts.success import success_figure
 from benchnav.eval.report.charts.sweeps import find_sweeps
 from benchnav.eval.report.charts.trajectories import choose, trajectory_figure
+from benchnav.eval.report.failure_choice import GroundOf, Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
-from benchnav.eval.report.figures import STYLE, save
+from benchnav.eval.report.figure_style import STYLE, save
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.page import Drawn, write_page
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recorded.recording import read_snapshots
 from benchnav.eval.report.rendering import markdown, to_markdown, to_terminal
-from benchnav.eval.report.sheets import GroundOf, Sheets, collect_sheets
 from benchnav.eval.report.tables import NOT_USED, ResultTable, result_table
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.stats.best import against_best, told_the_truth

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchnav.eval.report.charts.sweeps import SEVERITY, Line, Sweep
-from benchnav.eval.report.figures import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, display_name
+from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, display_name
 from benchnav.eval.trial import NOT_USED
 
 _MEASURES = {

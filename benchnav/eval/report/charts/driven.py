@@ -14,7 +14,7 @@ from benchnav.errors import ConfigError
 from benchnav.eval.folder.folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.report.contenders import NAMING, contender_names, trial_colours
-from benchnav.eval.report.figures import save
+from benchnav.eval.report.figure_style import save
 from benchnav.eval.report.recorded.ground import HOLDING
 from benchnav.files import replacing
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, TWO_COLUMNS_IN
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, TWO_COLUMNS_IN
 from benchnav.eval.report.recorded.ground import HOLDING
 
 ACROSS = 4

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.figures import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, trial_name
+from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, trial_name
 from benchnav.eval.stats.best import BLOCK
 from benchnav.eval.trial import NOT_USED
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from benchnav.eval.report.contenders import contender_names
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS, trial_name
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, trial_name
 from benchnav.eval.report.recorded.drawn_plan import STYLES
 from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, immobilised_at, outline
 from benchnav.eval.report.recorded.recording import Recording

@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
 from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground
 from benchnav.eval.report.recorded.drawn_plan import STYLES, DrawnPlan, drawing_interval, thinned
 from benchnav.eval.report.recorded.ground import immobilised_at

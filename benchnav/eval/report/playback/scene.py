@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
 from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import Recording
 from benchnav.grid import Grid

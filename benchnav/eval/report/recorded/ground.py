@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import matplotlib
 import numpy as np
 
-from benchnav.eval.report.figures import TRAVERSABILITY_COLOURS
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
 from benchnav.planning.world.outcome import Outcome
 
 # Dark red lies far from all colours of λ, for the colour-blind too.

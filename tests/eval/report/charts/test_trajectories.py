@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from benchnav.eval.report.charts.trajectories import MOST_PANELS, choose, trajectory_figure
-from benchnav.eval.report.figures import save
+from benchnav.eval.report.figure_style import save
 from benchnav.eval.report.recorded.ground import field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import take_snapshot
 from benchnav.eval.report.recorded.snapshot import Snapshot

@@ -11,7 +11,7 @@ from benchnav.errors import BenchnavError
 from benchnav.eval.report.charts.failure_sheet import FailedGround, Shown, choose
 from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.failures import steps_of
-from benchnav.eval.report.figures import trial_name
+from benchnav.eval.report.figure_style import trial_name
 from benchnav.eval.stats.best import competing
 from benchnav.eval.trial import NOT_USED
 

@@ -7,8 +7,8 @@ import pytest
 
 from benchnav.errors import BenchnavError
 from benchnav.eval.report.charts.failure_sheet import FailedGround
+from benchnav.eval.report.failure_choice import Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
-from benchnav.eval.report.sheets import Sheets, collect_sheets
 from tests.eval.report import made
 
 RATES = {"mean": 2, "var": 5, "cvar": 8}
