@@ -11,14 +11,14 @@ since for v in [0, 1] the expected shortfall under v is E[(v − λ)⁺] = G(v) 
     VaR_α   = clip(F⁻¹(p), 0, 1),
     CVaR_α  = 1/p ∫₀^p clip(F⁻¹(u), 0, 1) du = v − (G(v) − G(0)) / p  at v = VaR_α.
 
-The last form is a maximum over v, so it is flat at the VaR: at a v that is off by d it is too low by no more than
-|F(v) / p − 1| d, about half of which is known and added. So a root in float32 will do, at which float64 is
-evaluated once; cells where that bound is not small enough are searched on in float64.
+The last form is a maximum over v, so it is flat at the VaR: at a v that is off by d it is too low by at most
+|F(v) / p − 1| d. So a root in float32 will do, at which float64 is evaluated once. Where that bound is not small
+enough, or d cannot be told since the density changes on the way, the search goes on in float64.
 
 The root is sought by Newton's method on the log odds of F, which are straighter than F, between bounds that close
-in. Where a step leaves the bounds, and at every other step after the first few, the bounds are halved, so that every
-cell gets there. On the CPU a cell that has its root leaves the search, so that none waits for the worst; on other
-devices all cells take all steps, so that nothing waits for the device.
+in. Where a step leaves the bounds they are halved; in float64 also at every other step after the first few, so that
+every cell gets there. On the CPU a cell that has its root leaves the search, so that none waits for the worst; on
+other devices all cells take all steps, so that nothing waits for the device.
 
 Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional value-at-risk".
 Letters in shapes: K components, N cells.
@@ -34,14 +34,17 @@ from torch import Tensor
 _SHORT_SEARCH, _LONG_SEARCH = 6, 80  # steps in float32, and most in float64
 _FREE_STEPS = 6  # of Newton's method, after which every other step halves the bounds
 _VAR_ERROR, _CVAR_ERROR = 1e-10, 1e-9  # at which a search ends
+_SHARE_ERROR = 1e-9  # of F, as a share of the tail
+_STRAIGHT = 0.1  # standard deviations within which a density hardly changes
 _LEAST_GAP = 1e-11  # between bounds
 _REACH = {
     torch.float32: 9.0,
     torch.float64: 26.0,
 }  # of √½ z, beyond which densities are too small to be normal numbers
+_MOST_ODDS = 16.0  # logarithms; beyond them float32 holds no share but 0 and 1
 _LOGISTIC_STD = math.sqrt(3) / math.pi  # standard deviations a unit of log odds
 
-# Tells of (F − tail, how far off that is by the density, tail) where a root is near enough.
+# Takes F − tail, how far off that is by the density, and the tail; tells which roots are near enough.
 Near = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -70,16 +73,16 @@ class Cells:
         """F of the weighted sum of `below`."""
         return total / 2 if self.deep else (total + 1) / 2
 
-    def shortfall(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """F, its density and G at a value a cell, each of shape [N]."""
+    def shortfall(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """F, its density, the standard deviation of the components that make it up there, and G; each of shape [N]."""
         z = (value - self.means) * self.scales
         below, density = self.below(z), (-z * z).exp() / math.sqrt(math.pi)
         # G is the sum of w (z (1 + below) / 2 + density / 2) / scale.
         integral = torch.addcmul(density, z, below if self.deep else below + 1) / (2 * self.scales)
-        share, slope, shortfall = (
-            (self.weights * term).sum(0) for term in (below, density * self.scales, integral)
+        share, slope, mass, total = (
+            added(self.weights * term) for term in (below, density * self.scales, density, integral)
         )
-        return self.share(share), slope, shortfall
+        return self.share(share), slope, math.sqrt(0.5) * mass / slope, total
 
     def select(self, which: Tensor) -> "Cells":
         """Keeps some cells, by index."""
@@ -104,7 +107,12 @@ def value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
         cells: in float64.
         tail: p in (0, 1), shape [N].
     """
-    return _root(cells, tail, _first_root(cells, tail), lambda excess, off, tail: off.abs() < _VAR_ERROR)
+
+    def near(excess: Tensor, off: Tensor, tail: Tensor) -> Tensor:
+        return (off.abs() < _VAR_ERROR) & (excess.abs() < _SHARE_ERROR * tail)
+
+    root = _root(cells, tail, _first_root(cells, tail), near)
+    return torch.where(cells.means.isnan().any(0), torch.nan, root)
 
 
 def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
@@ -116,21 +124,23 @@ def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
     """
 
     def near(excess: Tensor, off: Tensor, tail: Tensor) -> Tensor:
-        return (excess * off).abs() < _CVAR_ERROR * tail
+        return excess.abs() < _SHARE_ERROR * tail
 
     value = _first_root(cells, tail)
-    share, density, shortfall = cells.shortfall(value)
+    share, density, std, shortfall = cells.shortfall(value)
     with torch.no_grad():
         excess = share - tail
-        there = near(excess, excess / density, tail) | _at_an_end(value, excess)
-        value = _replaced(value, ~there, lambda some, p, x: _root(some, p, x, near), cells, tail, value)
-    shortfall = _replaced(shortfall, ~there, lambda some, x: some.shortfall(x)[2], cells, value)
+        off = excess / density
+        is_near = ((excess * off).abs() < _CVAR_ERROR * tail) & (off.abs() < _STRAIGHT * std)
+        far = ~(is_near | _at_an_end(value, excess))
+        value = _replaced(value, far, lambda some, p, x: _root(some, p, x, near), cells, tail, value)
+    shortfall = _replaced(shortfall, far, lambda some, x: some.shortfall(x)[3], cells, value)
     return (value - (shortfall - _integral(cells, 0.0)) / tail).clamp(min=0).minimum(value)
 
 
 def _integral(cells: Cells, value: float) -> Tensor:
     """G at one value, shape [N]."""
-    return cells.shortfall(torch.full_like(cells.means[0], value))[2]
+    return cells.shortfall(torch.full_like(cells.means[0], value))[3]
 
 
 def _may_wait(values: Tensor) -> bool:
@@ -159,13 +169,15 @@ def _replaced(
 def _first_root(cells: Cells, tail: Tensor) -> Tensor:
     """Seeks x in [0, 1] with F(x) = tail in float32, a few steps."""
     short, p = cells.float(), tail.float()
-    mean = (short.weights * short.means).sum(0)
-    variance = (short.weights * (short.means.square() + 0.5 / short.scales.square())).sum(0) - mean.square()
-    odds = torch.logit(p)
+    mean = added(short.weights * short.means)
+    variance = added(short.weights * (short.means.square() + 0.5 / short.scales.square())) - mean.square()
+    odds = torch.logit(tail).clamp(-_MOST_ODDS, _MOST_ODDS).float()
     value = (mean + _LOGISTIC_STD * variance.clamp(min=0).sqrt() * odds).clamp(0, 1)
     low, high, slopes = torch.zeros_like(value), torch.ones_like(value), short.weights * short.scales
     for count in range(_SHORT_SEARCH):
-        _, _, value, low, high = _move(short, slopes, p, odds, value, low, high, halve=count % 3 == 2)
+        _, _, value, low, high = _move(
+            short, slopes, p, odds, value, low, high, halve=count % 3 == 2, settle=True
+        )
     return value.to(tail)
 
 
@@ -176,9 +188,14 @@ def _root(cells: Cells, tail: Tensor, value: Tensor, near: Near) -> Tensor:
     low, high, odds = torch.zeros_like(value), torch.ones_like(value), torch.logit(tail)
     for count in range(_LONG_SEARCH):
         halve, slopes = count >= _FREE_STEPS and count % 2 == 1, cells.weights * cells.scales
-        excess, off, moved, low, high = _move(cells, slopes, tail, odds, value, low, high, halve)
-        ended = near(excess, off, tail) | _at_an_end(value, excess) | (high - low < _LEAST_GAP)
-        value = torch.where(ended & halve, value, moved)
+        excess, off, moved, low, high = _move(
+            cells, slopes, tail, odds, value, low, high, halve, settle=False
+        )
+        # Cells that are not known, whose parameters are not numbers, have no root.
+        ended = (
+            near(excess, off, tail) | _at_an_end(value, excess) | (high - low < _LEAST_GAP) | excess.isnan()
+        )
+        value = torch.where(ended, value, moved)
         if not _may_wait(value):
             found, settled = torch.where(settled, found, value), settled | ended
             continue
@@ -200,6 +217,7 @@ def _move(
     low: Tensor,
     high: Tensor,
     halve: bool,
+    settle: bool,
 ) -> tuple[Tensor, ...]:
     """Takes one step of Newton's method on the log odds of F, or halves the bounds.
 
@@ -208,9 +226,9 @@ def _move(
         shape [N].
     """
     z = (value - cells.means).mul_(cells.scales)
-    share = cells.share(cells.below(z).mul_(cells.weights).sum(0))
+    share = cells.share(added(cells.below(z).mul_(cells.weights)))
     reach = _REACH[z.dtype]
-    density = z.clamp_(-reach, reach).square_().neg_().exp_().mul_(slopes).sum(0).div_(math.sqrt(math.pi))
+    density = added(z.clamp_(-reach, reach).square_().neg_().exp_().mul_(slopes)).div_(math.sqrt(math.pi))
     excess = share - tail
     under = excess < 0
     low, high = torch.where(under, value, low), torch.where(under, high, value)
@@ -218,5 +236,13 @@ def _move(
     moved = (value + step).clamp(0, 1)
     inside = (moved >= low) & (moved <= high)
     if halve:
-        inside &= step.abs() < 0.1 * (high - low)
+        inside &= settle & (step.abs() < 0.1 * (high - low))
     return excess, excess / density, torch.where(inside, moved, (low + high) / 2), low, high
+
+
+def added(terms: Tensor) -> Tensor:
+    """The sum over K, from [K, N] to [N], in one order however many cells there are, as `sum` has not."""
+    total = terms[0].clone()
+    for term in terms[1:]:
+        total += term
+    return total

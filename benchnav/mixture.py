@@ -1,8 +1,8 @@
 """The per-cell probability distribution of traversability, with exact mean, VaR and CVaR.
 
 λ is a Gaussian mixture X clipped to [0, 1]; F is the CDF of X. Risk is the *lower* tail of λ: at level α both VaR and
-CVaR speak of the worst share 1 − α; `benchnav.cvar` computes them, a map at a time, so that a map's numbers do not
-depend on how many there are. Arithmetic is in float64 whatever the dtype of the parameters.
+CVaR speak of the worst share 1 − α; `benchnav.cvar` computes them. Arithmetic is in float64 whatever the dtype of the
+parameters, and a cell's numbers do not depend on how many others there are.
 
 The expected time over the ground, in units of its time at λ = 1, is for a least speed ε
 
@@ -24,14 +24,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.cvar import Cells, conditional_value_at_risk, mean, value_at_risk
+from benchnav.cvar import Cells, added, conditional_value_at_risk, mean, value_at_risk
 from benchnav.errors import ConfigError
 
 _SMALLEST_STD = 1e-9
 _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 _QUADRATURE_NODES = 24
 _DEEP_TAIL = 1e-6  # under which F has to be exact to its own last bits
-_NUMBERS_AT_ONCE = 2**17  # of each parameter of a map: 1 MiB in float64
+_NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class TraversabilityMixture:
 
     def mean(self) -> Tensor:
         """E[λ], shape [*B, H, W]."""
-        return self._map_by_map(mean)
+        return self._in_pieces(mean)
 
     def var(self, level: float) -> Tensor:
         """Value at risk: λ falls below it with probability 1 − level.
@@ -96,7 +96,7 @@ class TraversabilityMixture:
         tail = 1 - _check_level(level)
         if tail == 1:
             return torch.ones_like(self.weights.select(-3, 0))
-        return self._map_by_map(
+        return self._in_pieces(
             lambda cells: value_at_risk(cells, torch.full_like(cells.means[0], tail)), deep=tail < _DEEP_TAIL
         )
 
@@ -112,7 +112,7 @@ class TraversabilityMixture:
         tail = 1 - _check_level(level)
         if tail == 1:
             return self.mean()
-        return self._map_by_map(
+        return self._in_pieces(
             lambda cells: conditional_value_at_risk(cells, torch.full_like(cells.means[0], tail)),
             deep=tail < _DEEP_TAIL,
         )
@@ -139,7 +139,7 @@ class TraversabilityMixture:
         """
         if not 0 < floor <= 1:
             raise ConfigError(f"Expected a least speed in (0, 1], got {floor}.")
-        return self._map_by_map(lambda cells: _harmonic_mean(cells, floor))
+        return self._in_pieces(lambda cells: _harmonic_mean(cells, floor))
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1).
@@ -155,7 +155,7 @@ class TraversabilityMixture:
         """
         if self.weights.shape[-3] == 1:
             return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
-        return self._map_by_map(value_at_risk, _probability(normal.double()))
+        return self._in_pieces(value_at_risk, _probability(normal.double()))
 
     def select(self, members: Tensor) -> "TraversabilityMixture":
         """Keeps some maps of the first dimension, by index, shape [M]."""
@@ -243,32 +243,28 @@ class TraversabilityMixture:
         kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
         return replace(self, weights=kept / kept.sum(-3, keepdim=True))
 
-    def _map_by_map(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
-        """Does some work on the cells of a map, or of some of its rows, at a time: near the processor.
+    def _in_pieces(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
+        """Does some work on so many cells at a time that all stays near the processor.
 
         Args:
-            work: from `Cells` and layers of N cells to numbers [N].
+            work: from `Cells` and layers of N cells to numbers [N], each of its own cell alone.
             layers: of shape [*B, H, W].
             deep: of the cells.
 
         Returns:
             Shape [*B, H, W], in the dtype of the parameters.
         """
-        weights, means, stds = (
-            values.flatten(0, -4) if values.ndim > 3 else values[None] for values in self._parameters()
-        )
-        maps, count, height, width = weights.shape
-        whole = [layer.reshape(maps, height, width) for layer in layers]
-        rows = max(1, _NUMBERS_AT_ONCE // (count * width))
+        parameters = [values.movedim(-3, 0).flatten(1) for values in (self.weights, self.means, self.stds)]
+        flat = [layer.flatten() for layer in layers]
+        count, total = parameters[0].shape
+        size = max(1, _NUMBERS_AT_ONCE // count)
         done = []
-        for place in range(maps):
-            for start in range(0, height, rows):
-                piece = slice(start, start + rows)
-                w, m, s = (values[place, :, piece].flatten(1) for values in (weights, means, stds))
-                cells = Cells(w, m, math.sqrt(0.5) / s, deep)
-                done.append(work(cells, *(layer[place, piece].flatten() for layer in whole)))
-        shape = self.weights.select(-3, 0).shape
-        return torch.cat(done).view(shape).to(self.weights.dtype)
+        for start in range(0, max(1, total), size):
+            piece = slice(start, start + size)
+            weights, means, stds = (values[:, piece].to(torch.float64) for values in parameters)
+            cells = Cells(weights, means, math.sqrt(0.5) / stds.clamp(min=_SMALLEST_STD), deep)
+            done.append(work(cells, *(layer[piece] for layer in flat)))
+        return torch.cat(done).view(self.weights.select(-3, 0).shape).to(self.weights.dtype)
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
@@ -292,7 +288,7 @@ def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
         log_x = start + span * node
         below = torch.erf((log_x.exp() - short.means).mul_(short.scales)).add_(1)
         time = torch.addcmul(time, span * (0.5 * share), below.mul_(torch.exp(-log_x)))
-    return (1 / (short.weights * time).sum(0)).clamp(floor, 1)
+    return (1 / added(short.weights * time)).clamp(floor, 1)
 
 
 def _probability(z: Tensor) -> Tensor:

@@ -76,6 +76,49 @@ def test_hard_cells_are_as_bisection_has_them(
     np.testing.assert_allclose(mixture.cvar(level).flatten().numpy(), mean, rtol=0, atol=atol)
 
 
+@pytest.mark.parametrize("std", [0.0, 1e-8, 1e-7, 1e-6, 1e-4])
+@pytest.mark.parametrize("level", [0.1, 0.5, 0.9, 0.99])
+def test_points_and_spikes_are_weighed_as_they_are(std: float, level: float) -> None:
+    # Three points of which one is at an end, where the sorted weights tell both measures.
+    generator = np.random.default_rng(1)
+    cells = 4000
+    weights = generator.dirichlet((0.7, 0.7, 0.7), cells).T
+    means = np.sort(generator.integers(0, 33, (3, cells)) / 32, axis=0)
+    parameters = weights, means, np.full_like(means, std)
+    mixture, tail = mixture_of(parameters), 1 - level
+    taken = np.diff(np.minimum(weights.cumsum(0), tail), axis=0, prepend=0)
+    wanted = (taken * means).sum(0) / tail
+    # A normal spike that is cut at 0 or 1, or by the tail, is off its middle by a part of its width.
+    np.testing.assert_allclose(
+        mixture.cvar(level).flatten().numpy(), wanted, rtol=0, atol=1e-7 + 2 * std / tail
+    )
+    places = (weights.cumsum(0) < tail - 1e-6).sum(0)
+    sure = (np.abs(weights.cumsum(0) - tail) > 1e-4).all(0)
+    value = np.take_along_axis(means, places[None].clip(max=2), axis=0)[0]
+    found = mixture.var(level).flatten().numpy()
+    np.testing.assert_allclose(found[sure], value[sure], rtol=0, atol=1e-7 + 5 * std)
+
+
+def test_levels_near_0_and_1_give_numbers() -> None:
+    parameters = (np.ones((1, 20)), np.full((1, 20), 0.5), np.full((1, 20), 1e-6))
+    mixture = mixture_of(parameters)
+    for level in (1e-16, 1e-12, 1e-9, 1e-8, 1 - 1e-12, 1 - 1e-15):
+        for found in (mixture.cvar(level), mixture.var(level)):
+            torch.testing.assert_close(found, torch.full_like(found, 0.5), atol=1e-5, rtol=0)
+
+
+def test_cells_that_are_not_known_stay_so_and_hold_up_no_others() -> None:
+    weights, means, stds = hard_cells()
+    means[:, 7] = np.nan
+    unknown, known = mixture_of((weights, means, stds)), mixture_of(hard_cells())
+    for level in LEVELS:
+        for measure in ("cvar", "var"):
+            found, wanted = (getattr(one, measure)(level).flatten() for one in (unknown, known))
+            assert found[7].isnan()
+            others = torch.arange(len(found)) != 7
+            assert torch.equal(found[others], wanted[others])
+
+
 def test_a_map_is_the_same_however_many_there_are_beside_it() -> None:
     maps = [mixture_of(hard_cells(seed=seed), torch.float32) for seed in range(3)]
     together = TraversabilityMixture(

@@ -24,6 +24,7 @@ from benchnav.planning.problem import Task, heading_to
 from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
+from benchnav.planning.world.realisation import check_known
 from benchnav.planning.world.settings import read_world
 from benchnav.planning.world.simulation import Simulation, SimulationState
 from benchnav.planning.world.world import World
@@ -71,7 +72,9 @@ class EnvBatch:
         self._maps = dataset.terrain(split)
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
-        self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)  # to be refused at once
+        # To be refused at once.
+        self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)
+        check_known(self._maps, self._world)
         self._low, self._high = (
             torch.tensor(bound, dtype=torch.float32) for bound in (made.action_low, made.action_high)
         )
@@ -167,17 +170,19 @@ class EnvBatch:
     def _begin(self, members: np.ndarray) -> tuple[Simulation, SimulationState]:
         """A simulation of some sub-environments alone, and its start."""
         instances = torch.from_numpy(self._instance[members])
-        places = self._places.select(instances)
-        simulation = Simulation(
-            self._maps.select(instances),
-            self._task,
-            self._world,
-            places,
-            rng.stream_key(0, "environment"),
-            self._luck[members].tolist(),
-        )
-        pose = heading_to(places.start_m, places.goal_m)
-        return simulation, simulation.init(self._task.robot.initial_state(pose))
+        # What is made under inference mode could not be changed in place outside of it.
+        with torch.inference_mode(False):
+            places = self._places.select(instances)
+            simulation = Simulation(
+                self._maps.select(instances),
+                self._task,
+                self._world,
+                places,
+                rng.stream_key(0, "environment"),
+                self._luck[members].tolist(),
+            )
+            pose = heading_to(places.start_m, places.goal_m)
+            return simulation, simulation.init(self._task.robot.initial_state(pose))
 
     def _shaped(self, before: SimulationState) -> Tensor:
         """Progress less time, and a prize or fine at the end, shape [B]."""

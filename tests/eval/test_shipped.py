@@ -18,6 +18,8 @@ from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import find_checkpoint, load_model, predict
 from benchnav.models.quality.measure import evaluate
 
+FEW_SAMPLES = {"mppi": {"samples": 1024}, "astar_mppi": {"mppi": {"samples": 1024}}}
+
 
 @pytest.mark.parametrize("planner", ["astar_dwa", "astar_mppi", "cl_rrt", "mppi"])
 def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
@@ -28,7 +30,7 @@ def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
         planners=(planner,),
         risks=("mean",),
         scenarios=("std",),
-        planner_options={"mppi": {"samples": 1024}} if planner == "mppi" else {},
+        planner_options={planner: FEW_SAMPLES[planner]} if planner in FEW_SAMPLES else {},
         record="none",
     )
     for _ in run_suite(suite, tmp_path / "run"):

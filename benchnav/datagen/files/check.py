@@ -95,8 +95,10 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
                     Fault(split, first, field, "is damaged", name) for field in sound if field not in maps
                 )
                 fields = [field for field in schema.FIELDS if field in maps]
+                classes = len(dataset.recipe.classes)
+                unlabelled = schema.has_unlabelled(dataset.splits[split])
                 for field in fields:
-                    faulty = _out_of_range(field, maps[field], len(dataset.recipe.classes))
+                    faulty = _out_of_range(field, maps[field], classes, unlabelled)
                     yield from (Fault(split, first + i, field, "is out of range", name) for i in faulty)
                 readable = readable and len(fields) == len(schema.FIELDS)
                 if not fields:
@@ -162,12 +164,12 @@ def _read_some(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int
                 yield index, readable
 
 
-def _out_of_range(name: str, values: np.ndarray, classes: int) -> list[int]:
+def _out_of_range(name: str, values: np.ndarray, classes: int, unlabelled: bool) -> list[int]:
     """Which maps have a value that may not be."""
     field = schema.FIELDS[name]
     most = classes - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
-    if name == "class_id":
+    if name == "class_id" and unlabelled:
         allowed |= values == schema.UNLABELLED
     if name in ("reference_time_s", "traversability"):  # not asked for; not observed
         allowed |= np.isnan(values)

@@ -187,7 +187,12 @@ class _ModelOf:
 
 @lru_cache(maxsize=2)
 def _block(run_id: str, data: str, split: str, instances: tuple[int, ...]) -> Block:
-    return read_maps(TerrainDataset(find_dataset(data)), split, instances)
+    return read_maps(_dataset(run_id, data), split, instances)
+
+
+@lru_cache(maxsize=2)
+def _dataset(run_id: str, data: str) -> TerrainDataset:
+    return TerrainDataset(find_dataset(data))
 
 
 @lru_cache(maxsize=2)

@@ -25,7 +25,7 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
-from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, predict
+from benchnav.models.predictor import PRIVILEGED, AnyModel, ClassModel, EnsembleModel, predict
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.scores import (
     LEVEL,
@@ -124,7 +124,7 @@ class Quality:
     Args:
         maps: how many maps were predicted.
         traversability: of the distributions.
-        classes: of the class probabilities; empty for a model that predicts no classes.
+        classes: of the class probabilities; empty for a model that predicts no classes, and on maps without any.
     """
 
     maps: int
@@ -203,7 +203,7 @@ def measure(
     classes: list[_ClassTally] = []
     for terrain in chunks:
         mixture, members = _predict(model, terrain)
-        scores, transformed = _score_cells(mixture, terrain, generator)
+        scores, transformed = _score_cells(mixture, terrain, generator, isinstance(model, PRIVILEGED))
         sums += scores.cpu()
         histogram += pit_counts(transformed)
         maps, cells = maps + len(terrain), cells + transformed.numel()
@@ -228,7 +228,7 @@ def measure(
             tail_rate=in_tail,
             pit=tuple(histogram.tolist()),
         ),
-        classes=tuple(tally.quality() for tally in classes),
+        classes=tuple(tally.quality() for tally in classes if tally.entropy.cells),
     )
 
 
@@ -320,17 +320,17 @@ class _Uncertainty:
     """Counts of a measure of uncertainty over cells."""
 
     def __init__(self, device: torch.device) -> None:
-        self._ranking, self._total, self._cells = ErrorRanking().to(device), 0.0, 0
+        self._ranking, self._total, self.cells = ErrorRanking().to(device), 0.0, 0
 
     def add(self, measure: Tensor, wrong: Tensor) -> None:
         """Adds cells: the measure, and whether each is wrongly classified, of one shape."""
         self._ranking.update(measure, wrong)
         self._total += float(measure.double().sum())
-        self._cells += measure.numel()
+        self.cells += measure.numel()
 
     @property
     def mean(self) -> float:
-        return self._total / self._cells
+        return self._total / self.cells
 
     @property
     def auroc(self) -> float:
@@ -343,26 +343,31 @@ def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
 
 
 def _score_cells(
-    mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator
+    mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator, privileged: bool
 ) -> tuple[Tensor, Tensor]:
     """What is summed over cells, float64, shape [7]; and every PIT.
 
     The sums: squared errors, NLL, CRPS, covered cells, cells in the tail, squared errors of E[λ], and the cells of
-    which these are. Cells whose λ was not observed are left out.
+    which these are. Cells whose λ was not observed are left out; of a privileged model, which says nothing where no
+    class is known, those without a class as well.
     """
+    labelled = terrain.class_id != UNLABELLED
     known = ~terrain.traversability.isnan()
+    known = known & labelled if privileged else known
+    if not bool(known.any()):
+        return torch.zeros(7, dtype=torch.float64), torch.zeros(0)
     mixture, observed = mixture.at(known), terrain.traversability[known].unsqueeze(0)
     truth = terrain.truth.at(known).mean()
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
-    errors = (expected - truth).double().square()  # not a number where the class is not known
+    errors = (expected - truth)[0, labelled[known]].double().square()
     sums = [
         (expected - observed).double().square().sum(),
         -mixture.log_prob(observed).double().sum(),
         crps(mixture, observed).double().sum(),
         torch.as_tensor(coverage(transformed) * cells, device=observed.device),
         torch.as_tensor(tail_rate(transformed, LEVEL) * cells, device=observed.device),
-        errors.nansum(),
-        (~errors.isnan()).sum(),
+        errors.sum(),
+        torch.as_tensor(errors.numel(), device=observed.device),
     ]
     return torch.stack([total.double() for total in sums]), transformed

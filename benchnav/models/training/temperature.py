@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from benchnav import rng
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.errors import DatasetError
 from benchnav.models.training.data import MapDataset
 
 _MOST_CELLS = 200_000
@@ -64,6 +65,9 @@ def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tup
 
     Returns:
         Logits [N, C] and true classes [N], int64, of the cells whose class is known.
+
+    Raises:
+        DatasetError: there is no such cell.
     """
     cells = maps.shape[0] * maps.shape[1]
     kept = min(cells, max(1, _MOST_CELLS // len(maps)))
@@ -73,8 +77,10 @@ def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tup
         for indices, some in maps.chunks():
             logits, class_id = classifier(some["rgb"]).float().flatten(2), some["class_id"].flatten(1).long()
             for place, which in enumerate(indices):
-                drawn = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0][:kept])
+                order = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0])
+                drawn = order[class_id[place, order] != UNLABELLED][:kept]
                 found.append((logits[place][:, drawn].T.clone(), class_id[place, drawn]))
-    all_logits, all_classes = (torch.cat(parts) for parts in zip(*found, strict=True))
-    labelled = all_classes != UNLABELLED
-    return all_logits[labelled], all_classes[labelled]
+    logits, class_id = (torch.cat(parts) for parts in zip(*found, strict=True))
+    if not len(class_id):
+        raise DatasetError("Expected validation maps with cells whose class is known, got none.")
+    return logits, class_id

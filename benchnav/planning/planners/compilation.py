@@ -13,7 +13,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
@@ -67,12 +67,8 @@ class Fused(Generic[R]):
             self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
         signature = self._signature(args)
         try:
-            if signature in self._seen:
-                return self._fused(*args)
-            with _compiling():
-                self._mark(args)
-                result = self._fused(*args)
-        except torch._dynamo.exc.TorchDynamoException as error:
+            result = self._call(args, signature)
+        except (torch._dynamo.exc.TorchDynamoException, torch._dynamo.exc.FailOnRecompileLimitHit) as error:
             self._seen.discard(signature)
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
@@ -82,12 +78,27 @@ class Fused(Generic[R]):
         self.compiled = True
         return result
 
+    def _call(self, args: tuple[Any, ...], signature: tuple[object, ...]) -> R:
+        assert self._fused is not None
+        if signature in self._seen:
+            try:
+                return self._fused(*args)
+            except torch._dynamo.exc.FailOnRecompileLimitHit:
+                pass  # what it was compiled for has changed in what the signature does not tell
+        with _compiling(checked=not all(_is_ours(arg) for arg in args)):
+            self._mark(args)
+            return self._fused(*args)
+
     def _signature(self, args: tuple[object, ...]) -> tuple[object, ...]:
-        """What a call is compiled for: shapes, dtypes and devices of tensors, and which the other arguments are."""
-        found: list[object] = []
+        """What a call is compiled for: shapes, dtypes and devices of tensors, the other arguments, PyTorch's modes."""
+        found: list[object] = [
+            torch.is_inference_mode_enabled(),
+            torch.is_grad_enabled(),
+            torch.get_num_threads(),
+        ]
         for place, arg in enumerate(args):
             if not isinstance(arg, torch.Tensor):
-                found.append(id(arg))
+                found.append(arg if isinstance(arg, Hashable) else id(arg))
             elif place in self._batched:
                 found.append((arg.shape[0] > 1, arg.shape[1:], arg.dtype, arg.device))
             else:
@@ -110,8 +121,12 @@ class Fused(Generic[R]):
 
 
 @contextmanager
-def _compiling() -> Iterator[None]:
-    """Settings of PyTorch under which a call is compiled; they take longer to set than a rollout, so only then."""
+def _compiling(checked: bool) -> Iterator[None]:
+    """Settings of PyTorch under which a call is compiled; they take longer to set than a rollout, so only then.
+
+    Args:
+        checked: whether indices are checked that are computed on the way.
+    """
     import torch._inductor.config  # imported here: it takes a second
 
     # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
@@ -127,9 +142,16 @@ def _compiling() -> Iterator[None]:
                 fail_on_recompile_limit_hit=True,
                 suppress_errors=False,
             ),
-            # Lookups keep to the map by themselves (`Grid.lookup`); to check each again takes a third of the time.
-            torch._inductor.config.patch(assert_indirect_indexing=False),
+            torch._inductor.config.patch(assert_indirect_indexing=checked),
         ):
             yield
     finally:
         notices.setLevel(level)
+
+
+def _is_ours(arg: object) -> bool:
+    """Tells what is of PyTorch or of this package, whose lookups keep to the map, from a user's robot or objective.
+
+    To check each index takes a third of the time.
+    """
+    return type(arg).__module__.split(".")[0] in ("torch", "builtins", "benchnav")

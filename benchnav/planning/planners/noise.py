@@ -1,11 +1,12 @@
 """The noise of a sampling planner: drawn once in bulk, and read anew at each step.
 
 Drawing normals costs more than rolling out what they perturb. So a bank of them is drawn when a planner begins, a
-few times as many as a step needs, and each step reads it elsewhere: every action of every time step gets a run of
-the bank that begins at a place of its own, and the places move on from step to step by strides that are drawn too.
-Within a step a sample's numbers are independent of one another, as they lie at different places of the bank; between
-steps, and between samples of one step, numbers occur again in other company. All is a pure function of seed and
-step, on any device. Letters in shapes: K samples, T horizon steps, A action dimensions, N numbers of the bank.
+few times as many as a step needs, and each step reads it from other places: the bank has a part for each time step of
+the horizon, and of it every action gets a run that begins at a place of its own. From step to step the parts change
+hands and the places move, by strides that are drawn too. Within a step the numbers of a sample are independent, as no
+two of them lie at one place of the bank; between steps, and between samples, numbers occur again in other company. All
+is a pure function of seed and step, on any device. Letters in shapes: K samples, T horizon steps, A action dimensions,
+N numbers of a part.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from benchnav import rng
 
-_STEPS = 4  # as many of which the bank would serve without reading a number twice
+_RUNS = 4  # of samples that a part holds side by side
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class NoiseBank:
     """Normal numbers, and where each step reads them.
 
     Args:
-        values: scaled for each action, shape [A, N].
-        place: where the runs of step 0 begin, int64, shape [T, A].
+        values: scaled for each action, shape [A, T, N].
+        place: where the runs of step 0 begin in their parts, int64, shape [T, A].
         stride: how far they move on from step to step, int64, shape [T, A].
         samples: K, the length of a run.
     """
@@ -36,12 +37,13 @@ class NoiseBank:
 
     def at(self, step: int) -> Tensor:
         """The noise of a step, shape [T, A, K]."""
-        actions, numbers = self.values.shape
-        runs = numbers - self.samples + 1
-        begin = (self.place + step * self.stride) % runs
-        begin = begin + numbers * torch.arange(actions, device=begin.device)
-        every = self.values.as_strided((actions * numbers - self.samples + 1, self.samples), (1, 1))
-        return every.index_select(0, begin.flatten()).view(*begin.shape, self.samples)
+        actions, horizon, numbers = self.values.shape
+        within = (self.place + step * self.stride) % (numbers - self.samples + 1)
+        part = (torch.arange(horizon, device=within.device) + step) % horizon
+        action = torch.arange(actions, device=within.device)
+        begin = (action * horizon + part[:, None]) * numbers + within
+        windows = self.values.as_strided((self.values.numel() - self.samples + 1, self.samples), (1, 1))
+        return windows.index_select(0, begin.flatten()).view(horizon, actions, self.samples)
 
 
 def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank:
@@ -55,8 +57,8 @@ def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank
     """
     # PyTorch's generator looks at 32 bits of a seed alone: the key is a hash of all of them.
     generator = rng.generator(rng.stream_key(seed, "noise"))
-    actions, numbers = len(scale), _STEPS * horizon * samples
-    values = torch.randn((actions, numbers), generator=generator, dtype=scale.dtype).to(scale.device)
+    actions, numbers = len(scale), _RUNS * samples
+    values = torch.randn((actions, horizon, numbers), generator=generator, dtype=scale.dtype).to(scale.device)
     runs, shape = numbers - samples + 1, (horizon, actions)
     place, stride = (torch.randint(runs, shape, generator=generator).to(scale.device) for _ in range(2))
-    return NoiseBank(values=values * scale[:, None], place=place, stride=stride, samples=samples)
+    return NoiseBank(values=values * scale[:, None, None], place=place, stride=stride, samples=samples)

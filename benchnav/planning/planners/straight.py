@@ -65,3 +65,7 @@ class Straight:
         action = steer_toward(step.state, plan_state.goal_m, plan_state.robot)
         line = torch.stack((step.state[:, :2], plan_state.goal_m), dim=1)
         return action, plan_state, Plan.empty(len(action), action.device, path=line)
+
+    def select(self, plan_state: Problem, members: Tensor) -> Problem:
+        """Keeps some episodes; see `Planner`."""
+        return plan_state.select(members)

@@ -283,7 +283,27 @@ def test_maps_without_any_class_are_measured_by_their_traversability_alone() -> 
     )
     quality = measure(ColourModel(), [holed, bare], generator())
     assert quality.classes[0].accuracy == measure(ColourModel(), [holed], generator()).classes[0].accuracy
-    assert math.isnan(measure(Oracle(), [bare], generator()).traversability.rmse_expected)
+    alone = measure(ColourModel(), [bare], generator())
+    assert math.isnan(alone.traversability.rmse_expected)
+    assert alone.classes == ()
+
+
+def test_who_knows_the_truth_is_measured_where_it_says_something() -> None:
+    holed, half = half_labelled()
+    found, wanted = (measure(Oracle(), [one], generator()).traversability for one in (holed, half))
+    assert sum(found.pit) == sum(wanted.pit) == half.traversability.numel()
+    for name in ("rmse_observed", "rmse_expected", "nll", "crps", "coverage", "tail_rate"):
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-6, abs=1e-9), name
+
+
+def test_maps_without_any_observed_traversability_are_passed_over() -> None:
+    terrain = make_terrain(batch=2, classes=len(ColourModel().class_names))
+    unseen = replace(terrain, traversability=torch.full_like(terrain.traversability, math.nan))
+    both = measure(ColourModel(), [terrain, unseen], generator())
+    assert both.traversability == measure(ColourModel(), [terrain], generator()).traversability
+    assert both.classes == measure(ColourModel(), [terrain, terrain], generator()).classes
+    with pytest.raises(DatasetError, match="an observed λ"):
+        measure(ColourModel(), [unseen], generator())
 
 
 def test_an_ensemble_classifies_each_map_once(monkeypatch: pytest.MonkeyPatch) -> None:

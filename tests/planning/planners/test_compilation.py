@@ -1,6 +1,7 @@
 import logging
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,7 +11,8 @@ import torch._dynamo.config
 import torch._inductor.config
 
 from benchnav.planning.planners import compilation
-from benchnav.planning.planners.astar.astar_dwa import AStarDWA
+from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
+from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.planners.compilation import Fused, worth_compiling
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
 from tests import factories
@@ -203,12 +205,12 @@ def test_one_function_serves_any_number_of_episodes(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     fused = Fused(scaled, *MANY, batched=(0,))
     traced, real = [], compilation._compiling
-    monkeypatch.setattr(compilation, "_compiling", lambda: traced.append(0) or real())
+    monkeypatch.setattr(compilation, "_compiling", lambda checked: traced.append(checked) or real(checked))
     factor = torch.tensor(2.0)
     for rows in (7, 3, 1, 20, 1):
         x = torch.rand(rows, 46, generator=generator())
         torch.testing.assert_close(fused(x, factor), (2 * x + 1).sin())
-    assert len(traced) == 2  # of several episodes, and of one
+    assert traced == [False, False]  # of several episodes, and of one
     assert eager == []
 
 
@@ -219,13 +221,14 @@ def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thre
     maps = 0.35 + 0.6 * torch.rand(3, 24, 20, generator=generator())
     problem = factories.problem(maps, start=(1.25, 1.25), goal=(8.25, 9.25))
     monkeypatch.setattr(compilation, "worth_compiling", lambda *_: compiled)
+    few, short = MPPIConfig(samples=300, horizon=10), AStarDWAConfig(dwa=DWAConfig(horizon=10))
     found: dict[tuple[bool, int, int], torch.Tensor] = {}
     threads = torch.get_num_threads()
     for compiled in (False, True):
         for count in (1, 2):
             for episodes in (3, 1):
                 torch.set_num_threads(count)
-                planner: Any = MPPI(MPPIConfig(samples=300)) if name == "mppi" else AStarDWA()
+                planner: Any = MPPI(few) if name == "mppi" else AStarDWA(short)
                 posed = problem.select(torch.arange(episodes))
                 action, _, _ = planner.plan(first(posed), planner.init(posed, generator()))
                 assert planner.compiled is compiled
@@ -233,3 +236,28 @@ def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thre
     torch.set_num_threads(threads)
     for action in found.values():
         torch.testing.assert_close(action, found[False, 1, 3][: len(action)], atol=1e-4, rtol=0)
+
+
+def test_another_mode_of_pytorch_is_compiled_for_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    fused, factor = Fused(scaled, *MANY, batched=(0,)), torch.tensor(2.0)
+    with torch.inference_mode():
+        fused(torch.rand(50, 47), factor)
+    for rows in range(49, 30, -1):
+        x = torch.rand(rows, 47)
+        torch.testing.assert_close(fused(x, factor), (2 * x + 1).sin())
+    assert fused.compiled is True
+    assert eager == []
+
+
+def test_indices_of_users_parts_stay_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    told, real = [], compilation._compiling
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    monkeypatch.setattr(compilation, "_compiling", lambda checked: told.append(checked) or real(checked))
+    problem = factories.problem(torch.full((2, 16, 20), 0.8))
+    for robot in (problem.robot, type("Mine", (type(problem.robot),), {"__module__": "mine"})()):
+        posed = replace(problem, task=replace(problem.task, robot=robot))
+        planner = MPPI(MPPIConfig(samples=2000, horizon=2))
+        planner.plan(first(posed), planner.init(posed, generator()))
+    # The rollouts, whose arguments the robot is one of, and what weighs them.
+    assert told == [False, False, True, False]

@@ -48,19 +48,30 @@ def test_noise_is_a_function_of_seed_and_step_alone() -> None:
     assert torch.equal(bank().at(10**6), bank().at(10**6))  # far beyond any episode
 
 
-def test_no_run_leaves_its_action_or_the_bank() -> None:
-    one = bank(horizon=2, samples=50)
-    numbers = one.values.shape[1]
-    places = torch.arange(numbers).float()
-    marked = NoiseBank(
-        values=torch.stack((places, 10_000 + places)), place=one.place, stride=one.stride, samples=50
-    )
+def marked(horizon: int, samples: int) -> NoiseBank:
+    """A bank whose numbers tell their places."""
+    one = bank(horizon=horizon, samples=samples)
+    places = torch.arange(one.values.numel(), dtype=torch.float32).view(one.values.shape)
+    return NoiseBank(values=places, place=one.place, stride=one.stride, samples=samples)
+
+
+@pytest.mark.parametrize(("horizon", "samples"), [(2, 50), (50, 40), (7, 1)])
+def test_runs_keep_to_their_parts_and_no_number_serves_a_sample_twice(horizon: int, samples: int) -> None:
+    one = marked(horizon, samples)
+    part = 4 * samples
     for step in range(300):
-        noise = marked.at(step)
+        noise = one.at(step)
         assert bool((noise.diff(dim=2) == 1).all())
-        assert bool((noise[:, 0] < numbers).all())
-        assert bool((noise[:, 1] >= 10_000).all())
-    # Runs begin everywhere.
-    begin = torch.stack([marked.at(step)[:, 0, 0] for step in range(300)])
-    assert begin.min() < 0.05 * numbers
-    assert begin.max() > 0.8 * (numbers - 50)
+        owner = (noise // part).long()
+        assert torch.equal(owner[..., 0], owner[..., -1])
+        assert len(owner[..., 0].unique()) == 2 * horizon
+        assert bool((owner[:, 1] >= horizon).all())
+        assert bool((owner[:, 0] < horizon).all())
+
+
+def test_runs_begin_everywhere_and_parts_change_hands() -> None:
+    one = marked(5, 50)
+    begin = torch.stack([one.at(step)[2, 0, 0] for step in range(600)]).long()
+    assert set((begin // 200).tolist()) == set(range(5))
+    assert (begin % 200).min() < 10
+    assert (begin % 200).max() > 140
