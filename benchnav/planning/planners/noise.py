@@ -39,7 +39,8 @@ class NoiseBank:
         """The noise of a step, shape [T, A, K]."""
         actions, horizon, numbers = self.values.shape
         within = (self.place + step * self.stride) % (numbers - self.samples + 1)
-        part = (torch.arange(horizon, device=within.device) + step) % horizon
+        # Backward: forward the plan, which shifts by a step as well, would get noise for a moment from one part always.
+        part = (torch.arange(horizon, device=within.device) - step) % horizon
         action = torch.arange(actions, device=within.device)
         begin = (action * horizon + part[:, None]) * numbers + within
         windows = self.values.as_strided((self.values.numel() - self.samples + 1, self.samples), (1, 1))

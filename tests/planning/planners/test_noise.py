@@ -73,5 +73,8 @@ def test_runs_begin_everywhere_and_parts_change_hands() -> None:
     one = marked(5, 50)
     begin = torch.stack([one.at(step)[2, 0, 0] for step in range(600)]).long()
     assert set((begin // 200).tolist()) == set(range(5))
+    # Also those of one moment, which is a time step less at each step.
+    moment = torch.stack([one.at(step)[4 - step, 0, 0] for step in range(5)]).long()
+    assert len((moment // 200).unique()) == 5
     assert (begin % 200).min() < 10
     assert (begin % 200).max() > 140
