@@ -5,12 +5,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
 from benchnav.datagen.cli import main as datagen
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.errors import ConfigError
 from benchnav.eval.cli import main as evaluate
 from benchnav.models.cli import main as train
 from tests.datagen.dem.rasters import rough, write
@@ -77,3 +79,5 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     (line,) = capfd.readouterr().err.strip().splitlines()
     assert "Expected maps with a class in every cell to drive on" in line
     assert not (tmp_path / "run").exists()
+    with pytest.raises(ConfigError, match="a class in every cell"):
+        gymnasium.make("benchnav/OffRoad-v0", data="real.h5", split="train")

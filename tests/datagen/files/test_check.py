@@ -153,3 +153,10 @@ def test_damaged_shards_are_named_and_they_alone_made_anew(tmp_path: Path) -> No
     assert TerrainDataset(path).digest == digest
     assert same(content(path), before)
     assert all(file.stat().st_mtime_ns == when for file, when in kept.items())
+
+
+def test_a_cell_without_a_class_is_a_fault_where_none_was_said_to_be(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with h5py.File(path, "r+") as file:
+        file["train/class_id"][5, 2, 3] = schema.UNLABELLED
+    assert Fault("train", 5, "class_id", "is out of range") in find_faults(path)
