@@ -9,7 +9,7 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.training.classifiers import fit_classifier
+from benchnav.models.training.classifiers import fit_classifier, measure_classifier
 from benchnav.models.training.fit import FitOptions, KeepBest
 
 CPU = FitOptions(trainer={"precision": "32-true", "accelerator": "cpu"})
@@ -262,3 +262,38 @@ def test_cells_without_a_class_are_no_part_of_the_loss_and_the_measures(dice: fl
         model.metrics(logits[..., :5].argmax(1), class_id[..., :5]),
     )
     assert found == wanted
+
+
+def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
+    rgb, class_id = (
+        image(8, 8, batch=2),
+        torch.randint(0, 4, (2, 8, 8), generator=torch.Generator().manual_seed(1)),
+    )
+    holed = class_id.clone()
+    holed[..., 3:] = UNLABELLED
+
+    class Maps:
+        shape = (8, 8)
+
+        def __init__(self, ids: torch.Tensor, width: int) -> None:
+            self.some = {"rgb": rgb[..., :width], "class_id": ids[..., :width]}
+
+        def __len__(self) -> int:
+            return 2
+
+        def chunks(self) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
+            return [([0, 1], self.some)]
+
+    class Colour(torch.nn.Module):
+        class_count = 4
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.loss = torch.nn.CrossEntropyLoss(ignore_index=UNLABELLED)
+
+        def forward(self, seen: torch.Tensor) -> torch.Tensor:
+            return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
+
+    found, wanted = (measure_classifier(Colour(), maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
+    assert found == pytest.approx(wanted)
+    assert 0 < found["valid_accuracy"] < 1

@@ -1,10 +1,13 @@
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.quality.baseline import nearest_colour, nearest_colour_accuracy
 from tests.factories import tiny_dataset, tiny_recipe
 
@@ -23,3 +26,18 @@ def test_in_full_light_colour_tells_every_class_and_in_shade_it_does_not(tmp_pat
     shaded = TerrainDataset(tiny_dataset(tmp_path / "shaded.h5", recipe))
     accuracy = {split: nearest_colour_accuracy(shaded, split) for split in ("train", "test/hs")}
     assert 0 < accuracy["test/hs"] < accuracy["train"] < 1
+
+
+def test_cells_without_a_class_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = tiny_recipe()
+    bright = {name: replace(one, ambient=1.0) for name, one in recipe.scenarios.items()}
+    lit = TerrainDataset(tiny_dataset(tmp_path / "lit.h5", replace(recipe, scenarios=bright)))
+    read = lit.chunks
+
+    def holed(*given: object) -> Iterator[tuple[object, dict[str, np.ndarray]]]:
+        for indices, maps in read(*given):
+            maps["class_id"][:, :11] = UNLABELLED
+            yield indices, maps
+
+    monkeypatch.setattr(lit, "chunks", holed)
+    assert nearest_colour_accuracy(lit, "train") == pytest.approx(1)
