@@ -143,6 +143,7 @@ def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path, monkeypatch: 
             assert part["maps"] == piece.maps
             assert part["source"]["kept"] == source["kept"][which]
             assert part["source"]["lowest_m"] == source["lowest_m"][which]
+            assert part["source"]["unlabelled"] == source["unlabelled"][which]
 
 
 def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None:
