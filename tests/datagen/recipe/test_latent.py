@@ -8,6 +8,7 @@ from scipy import stats
 
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, twins
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
 from tests.datagen.small import SOFT, terrain_class
@@ -110,6 +111,19 @@ def test_what_looks_alike_is_the_average_over_its_classes() -> None:
     mean = alike.mean()[0, 0]
     assert mean[0] == pytest.approx(float(mean[2]), abs=1e-9)
     assert mean[1] == pytest.approx(float(mean[5]), abs=1e-9)
+
+
+def test_of_a_cell_without_a_class_nothing_is_known() -> None:
+    table = (terrain_class("a", 1), terrain_class("b", 2, soft=SOFT), terrain_class("c", 1, offset=0.4))
+    known, slope = cells(0, 1, 2, slope_deg=6.0)
+    holed = known.copy()
+    holed[..., 1] = UNLABELLED
+    for measure in (latent.truth, latent.look_alikes):
+        found, wanted = (as_mixture(measure(ids, slope, table)).mean()[0, 0] for ids in (holed, known))
+        assert found.isnan().tolist() == [False, True, False]
+        assert torch.equal(found[[0, 2]], wanted[[0, 2]])
+    drawn = latent.quantile_of(latent.truth(holed, slope, table), np.zeros(holed.shape))
+    assert np.isnan(drawn[0, 0]).tolist() == [False, True, False]
 
 
 def test_colours_that_all_differ_tell_the_truth() -> None:
