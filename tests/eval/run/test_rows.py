@@ -33,7 +33,7 @@ def made(**changes: object) -> tuple:  # type: ignore[type-arg]
         steps=torch.tensor([2, 4]),
         begin_s=0.6,
         planning_s=torch.tensor([1.0, 0.2, 0.4, 0.1], dtype=torch.float64),
-        planned=torch.tensor([2, 2, 2, 1]),
+        planned=torch.tensor([2, 2, 1, 1]),
         errors=("", "late"),
     )
     return problem, episodes
@@ -55,7 +55,7 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
     assert first["roughness_radps2"] == pytest.approx(5.0)
     # A robot's share of those that were planned for, two and at last one; from the second of its own steps on.
     assert (first["planning_ms"], first["planning_ms_p95"]) == (pytest.approx(100), pytest.approx(100))
-    assert (second["planning_ms"], second["planning_ms_p95"]) == (pytest.approx(100), pytest.approx(190))
+    assert (second["planning_ms"], second["planning_ms_p95"]) == (pytest.approx(100), pytest.approx(370))
     assert first["planning_start_ms"] == second["planning_start_ms"] == pytest.approx(800)
     assert (first["compiled"], first["error"]) == (True, "")
     assert (second["instance"], second["outcome"], second["success"]) == (9, "stuck", False)

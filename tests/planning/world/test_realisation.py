@@ -161,3 +161,10 @@ def test_ground_whose_class_is_not_known_is_not_driven_on(noise: str) -> None:
     terrain = replace(terrain, truth=replace(terrain.truth, means=means))
     with pytest.raises(ConfigError, match="a class in every cell"):
         Realisation(terrain, World(noise=noise), PLACES, 10, KEY, [0])
+
+
+def test_what_changes_in_place_is_no_map() -> None:
+    terrain = factories.terrain(even(1))
+    one = Realisation(terrain, World(noise="stored"), PLACES, 10, KEY, [0])
+    assert one.field is not None
+    assert one.field.data_ptr() != terrain.traversability.data_ptr()
