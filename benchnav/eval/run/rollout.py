@@ -15,7 +15,7 @@ from torch import Tensor
 from benchnav.errors import BenchnavError
 from benchnav.options import one_line
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.check.boundary import Answer, act, begin
+from benchnav.planning.planners.check.boundary import Answer, act, begin, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome, tell_standstill
@@ -196,13 +196,11 @@ class _Batch:
 
     def spread(self, answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
         """Actions, faults and statuses of all episodes; of those that have left, what is harmless."""
-        count, low_high = len(self._whole), self._whole.action_bounds
-        action = torch.zeros_like(low_high[0]).clamp(*low_high).expand(count, -1)
-        nothing = torch.zeros(count, dtype=torch.int64, device=self.members.device)
+        zeros = torch.zeros(len(self._whole), dtype=torch.int64, device=self.members.device)
         return (
-            action.index_copy(0, self.members, answer.action),
-            nothing.bool().index_copy(0, self.members, answer.faulty),
-            nothing.index_copy(0, self.members, answer.plan.status),
+            standing_actions(self._whole).index_copy(0, self.members, answer.action),
+            zeros.bool().index_copy(0, self.members, answer.faulty),
+            zeros.index_copy(0, self.members, answer.plan.status),
         )
 
 

@@ -13,7 +13,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
@@ -98,7 +98,7 @@ class Fused(Generic[R]):
         ]
         for place, arg in enumerate(args):
             if not isinstance(arg, torch.Tensor):
-                found.append(arg if isinstance(arg, Hashable) else id(arg))
+                found.append(_key(arg))
             elif place in self._batched:
                 found.append((arg.shape[0] > 1, arg.shape[1:], arg.dtype, arg.device))
             else:
@@ -147,6 +147,15 @@ def _compiling(checked: bool) -> Iterator[None]:
             yield
     finally:
         notices.setLevel(level)
+
+
+def _key(arg: object) -> object:
+    """An argument by its value where that has a hash; else which object it is, as of a frozen robot with a list."""
+    try:
+        hash(arg)
+    except TypeError:
+        return id(arg)
+    return arg
 
 
 def _is_ours(arg: object) -> bool:

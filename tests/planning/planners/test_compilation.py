@@ -1,7 +1,7 @@
 import logging
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.planners.compilation import Fused, worth_compiling
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.robots import Unicycle
 from tests import factories
 from tests.planning.planners.driving import first, generator
 
@@ -261,3 +262,17 @@ def test_indices_of_users_parts_stay_checked(monkeypatch: pytest.MonkeyPatch) ->
         planner.plan(first(posed), planner.init(posed, generator()))
     # The rollouts, whose arguments the robot is one of, and what weighs them.
     assert told == [False, False, True, False]
+
+
+def test_a_robot_without_a_hash_is_compiled_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Listed(Unicycle):
+        gears: list[float] = field(default_factory=lambda: [1.0])
+
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    problem = factories.problem(torch.full((2, 16, 20), 0.8), robot=Listed())
+    planner = MPPI(MPPIConfig(samples=2000, horizon=2))
+    state = planner.init(problem, generator())
+    for _ in range(2):
+        _, state, _ = planner.plan(first(problem), state)
+    assert planner.compiled is True

@@ -68,8 +68,7 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
     """
     given = replace(step, state=step.state.clone(), felt=step.felt.clone())
     said = planner.plan(given, plan_state)
-    standing = torch.zeros_like(problem.action_bounds[0]).clamp(*problem.action_bounds)
-    standing = standing.expand(len(problem), -1)
+    standing = standing_actions(problem)
     fault = find_fault(said, problem)
     if fault:
         everyone = torch.ones_like(step.felt, dtype=torch.bool)
@@ -86,6 +85,11 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
         faulty=faulty,
         reason=NOT_FINITE,
     )
+
+
+def standing_actions(problem: Problem) -> Tensor:
+    """What harms least where there is no answer: zeros, within the bounds, shape [B, A]."""
+    return torch.zeros_like(problem.action_bounds[0]).clamp(*problem.action_bounds).expand(len(problem), -1)
 
 
 def find_fault(said: Any, problem: Problem) -> str:
