@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from benchnav import cvar
 from benchnav.mixture import TraversabilityMixture
@@ -97,6 +97,16 @@ def test_points_and_spikes_are_weighed_as_they_are(std: float, level: float) -> 
     value = np.take_along_axis(means, places[None].clip(max=2), axis=0)[0]
     found = mixture.var(level).flatten().numpy()
     np.testing.assert_allclose(found[sure], value[sure], rtol=0, atol=1e-7 + 5 * std)
+
+
+def test_far_down_in_the_tail_cvar_is_that_of_the_closed_form() -> None:
+    level = 1 - 1e-13
+    mixture = mixture_of((np.ones((1, 20)), np.full((1, 20), 0.5), np.full((1, 20), 0.05)))
+    normal = ndtri(1 - level)
+    wanted = 0.5 - 0.05 * np.exp(-0.5 * normal**2) / np.sqrt(2 * np.pi) / (1 - level)
+    torch.testing.assert_close(
+        mixture.cvar(level), torch.full((1, 20), wanted, dtype=torch.float64), atol=1e-6, rtol=0
+    )
 
 
 def test_levels_near_0_and_1_give_numbers() -> None:
