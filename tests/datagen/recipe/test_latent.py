@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
@@ -136,6 +136,12 @@ def test_colours_that_all_differ_tell_the_truth() -> None:
     stds=hnp.arrays(float, (2, 5), elements=st.floats(1e-3, 0.5)),
     normal=hnp.arrays(float, 5, elements=st.floats(-6, 6)),
 )
+@example(  # narrow modes far apart, at the rank between them
+    weight=np.full(5, 0.5),
+    means=np.array([[0.0] * 5, [1.0] * 5]),
+    stds=np.full((2, 5), 0.0625),
+    normal=np.zeros(5),
+)
 @settings(deadline=None)
 def test_quantiles_are_those_of_the_mixture(
     weight: np.ndarray, means: np.ndarray, stds: np.ndarray, normal: np.ndarray
@@ -143,8 +149,14 @@ def test_quantiles_are_those_of_the_mixture(
     weights = np.stack([1 - weight, weight])
     parameters = tuple(values[None, :, None] for values in (weights, means, stds))
     found = latent.quantile_of(parameters, normal[None, None])
-    expected = as_mixture(parameters).from_normal(torch.from_numpy(normal[None, None])).numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2.0**-24)
+    mixture = as_mixture(parameters)
+    expected = mixture.from_normal(torch.from_numpy(normal[None, None])).numpy()
+    # Between two narrow modes that are far apart the CDF is flat: many values have one rank to rounding.
+    same_value = np.isclose(found, expected, rtol=0, atol=2.0**-24)
+    ranks = [mixture.cdf(torch.from_numpy(values)).numpy() for values in (found, expected)]
+    inside = (found > 0) & (found < 1) & (expected > 0) & (expected < 1)
+    same_rank = inside & np.isclose(*ranks, rtol=0, atol=1e-14)
+    assert (same_value | same_rank).all(), (found, expected)
 
 
 def test_quantiles_of_one_component_are_in_closed_form() -> None:
