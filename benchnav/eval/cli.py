@@ -26,6 +26,7 @@ def run_command(
     shard: str = "",
     backend: Literal["local", "dask"] = "local",
     scheduler: str = "",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> int:
     """Run a suite into a folder, going on with or extending the run that is there.
 
@@ -39,6 +40,7 @@ def run_command(
         shard: I/N runs the I-th of N shares of the run alone; `merge` makes one run of them.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
+        device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
     """
     from benchnav.command import show_progress
     from benchnav.errors import ConfigError
@@ -52,7 +54,9 @@ def run_command(
     folder = Path(out)
     for planner, options in suite.planner_options.items():
         _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
-    steps = run_suite(suite, folder, workers.jobs, overwrite, planner_limit_s, _say, share, workers.scheduler)
+    steps = run_suite(
+        suite, folder, workers.jobs, overwrite, planner_limit_s, _say, share, workers.scheduler, device
+    )
     show_progress(steps, "units")
     if share is None:
         return _finish(folder)

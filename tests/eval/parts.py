@@ -72,10 +72,10 @@ class Faulty:
         return problem
 
     def plan(self, step: Step, plan_state: Problem):  # type: ignore[no-untyped-def]
-        batch = len(step.state)
-        action = torch.tensor([[1.0, 0.0]]).repeat(batch, 1)
+        batch, device = len(step.state), step.state.device
+        action = torch.tensor([[1.0, 0.0]], device=device).repeat(batch, 1)
         if step.time_s < self.after_s - 1e-6:
-            return action, plan_state, Plan.empty(batch)
+            return action, plan_state, Plan.empty(batch, device)
         if self.fault == "write":
             step.state[:, :2] = plan_state.goal_m
             step.felt.zero_()
@@ -92,9 +92,9 @@ class Faulty:
         if self.fault == "hang":
             time.sleep(600)
         if self.fault == "give up":
-            failed = torch.full((batch,), int(PlanStatus.FAILED))
-            return action, plan_state, Plan.empty(batch, status=failed)
-        return action, plan_state, Plan.empty(batch)
+            failed = torch.full((batch,), int(PlanStatus.FAILED), device=device)
+            return action, plan_state, Plan.empty(batch, device, status=failed)
+        return action, plan_state, Plan.empty(batch, device)
 
 
 class Picky(Faulty):

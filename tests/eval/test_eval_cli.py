@@ -79,6 +79,8 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
         (("--jobs", "3", "--overwrite"), {"jobs": 3, "overwrite": True}),
         (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Share(index=2, of=4)}),
         (("--backend", "dask", "--scheduler", "tcp://a:1"), {"scheduler": "tcp://a:1"}),
+        (("--device", "cpu"), {"device": "cpu"}),
+        (("--device", "cuda"), {"device": "cuda"}),
     ],
 )  # fmt: skip
 def test_the_options_of_run_are_those_that_the_suite_is_run_with(
@@ -99,6 +101,7 @@ def test_the_options_of_run_are_those_that_the_suite_is_run_with(
         "planner_limit_s": 0.0,
         "shard": None,
         "scheduler": "",
+        "device": "auto",
     } | changed
     assert {name: told[name] for name in expected} == expected
     assert told["folder"] == tmp_path / "run"
@@ -164,6 +167,7 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monk
         ("run", "--world", "mars", "--model", "oracle"),
         ("run", "--noise", "frozen", "--model", "oracle"),
         ("run", "--planner_limit_s", "-1", "--model", "oracle"),
+        ("run", "--device", "gpu", "--model", "oracle"),
         ("run", "--config", "no-such.yaml"),
         ("run", "--out", "/proc/none/run", "--model", "oracle"),
         ("run", "--out", "/dev/null", "--model", "oracle"),

@@ -40,7 +40,8 @@ def describe_code() -> dict[str, Any]:
 
 def describe_machine() -> dict[str, Any]:
     """The machine, for people."""
-    return {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    about = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    return {**about, "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None}
 
 
 def describe_command() -> str:
@@ -106,6 +107,11 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
             changed.append(f"{name} ({earlier['code'][name]} to {now['code'][name]})")
     if earlier["planner_limit_s"] != now["planner_limit_s"]:
         changed.append(f"planner_limit_s ({earlier['planner_limit_s']:g} to {now['planner_limit_s']:g})")
+    before, after = (
+        about.get("device", "cpu") for about in (earlier, now)
+    )  # none in runs before it could be chosen
+    if before != after:
+        changed.append(f"device ({before} to {after})")
     changed += [
         name for name, identity in earlier["parts"].items() if now["parts"].get(name, identity) != identity
     ]

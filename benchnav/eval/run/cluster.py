@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import joblib
+import torch
 
 from benchnav import cluster
 from benchnav.errors import BenchnavError, ConfigError
@@ -21,16 +22,17 @@ from benchnav.eval.folder import provenance
 from benchnav.eval.unit import Extent, Unit
 from benchnav.files import replacing
 
-RunUnit = Callable[[Unit, Path, str, float], None]
+RunUnit = Callable[[Unit, Path, str, float, str], None]
 
 
 @contextmanager
-def connected(scheduler: str, planner_limit_s: float) -> Iterator[Any]:
+def connected(scheduler: str, planner_limit_s: float, device: str) -> Iterator[Any]:
     """A client of a cluster whose workers are fit for a run of this code.
 
     Args:
         scheduler: address, such as tcp://127.0.0.1:8786.
         planner_limit_s: time limit of each call of a planner; 0 for none.
+        device: where all is to be computed, "cpu" or "cuda".
 
     Raises:
         ConfigError: the scheduler cannot be reached, has no worker, or has one that is not fit.
@@ -41,6 +43,7 @@ def connected(scheduler: str, planner_limit_s: float) -> Iterator[Any]:
             "datasets": {},
             "parts": {},
             "planner_limit_s": planner_limit_s,
+            "device": device,
         }
         for address, state in client.run(describe_worker, on_error="return").items():
             check_worker(address, state, own)
@@ -57,7 +60,7 @@ def run_on_cluster(
         missing: what is run.
         folder: the run folder.
         about: its `run.json`.
-        run_unit: runs a unit into a folder, given the run's id and the time limit of planners.
+        run_unit: runs a unit into a folder, given the run's id, the time limit of planners and the device.
 
     Raises:
         ConfigError: a worker is not fit for the run.
@@ -81,6 +84,7 @@ def describe_worker(dask_worker: Any) -> dict[str, Any]:
         "code": _code(),
         "threads": dask_worker.state.nthreads,
         "starts_processes": not multiprocessing.current_process().daemon,
+        "has_gpu": torch.cuda.is_available(),
     }
 
 
@@ -110,7 +114,13 @@ def check_worker(address: str, state: Mapping[str, Any] | BaseException, about: 
             f"Expected workers that may start processes, which `planner_limit_s` needs, got {address}. Start them "
             "with `dask worker … --no-nanny`, or with DASK_DISTRIBUTED__WORKER__DAEMON=False."
         )
-    now = {"datasets": {}, "parts": {}, "planner_limit_s": about["planner_limit_s"], **state}
+    if about["device"] == "cuda" and not state["has_gpu"]:
+        raise ConfigError(
+            f"Expected workers with a GPU for `device` cuda, got {address} without. Pass --device cpu, or start "
+            "workers on machines that have one."
+        )
+    given = {name: about[name] for name in ("planner_limit_s", "device")}
+    now = {"datasets": {}, "parts": {}, **given, **state}
     changed = provenance.differences(about, now)
     if changed:
         raise ConfigError(
@@ -146,7 +156,7 @@ def _make(
             raise ConfigError(f"Worker {worker.address} lacks what the run needs: {error}") from error
         check_worker(worker.address, state, about)
         with TemporaryDirectory(dir=worker.local_directory) as scratch:
-            run_unit(unit, Path(scratch), run_id, about["planner_limit_s"])
+            run_unit(unit, Path(scratch), run_id, about["planner_limit_s"], about["device"])
             files = (path for path in Path(scratch).rglob("*") if path.is_file())
             return unit, {path.relative_to(scratch).as_posix(): path.read_bytes() for path in files}
 
@@ -160,6 +170,7 @@ def _subset(about: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
         "code": about["code"],
         "parts": about["parts"],
         "planner_limit_s": about["planner_limit_s"],
+        "device": about["device"],
         "datasets": {trial.data: {"id": dataset["id"], "maps": maps}},
     }
 

@@ -29,6 +29,8 @@ from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
 from benchnav.terrain import Terrain
 
+CPU = torch.device("cpu")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
@@ -42,6 +44,10 @@ class Block:
     terrain: Terrain
     places: Places
 
+    def to(self, device: torch.device) -> "Block":
+        """The same on a device."""
+        return Block(terrain=self.terrain.to(device), places=self.places.to(device))
+
 
 def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> Block:
     """Reads some instances of a split, with starts, goals and reference times."""
@@ -52,32 +58,33 @@ def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> 
     )
 
 
-def read_block(unit: Unit, run_id: str) -> Block:
-    """Reads a unit's maps and places; they are kept for one run alone."""
-    return _block(run_id, unit.trial.data, unit.trial.split, unit.instances)
+def read_block(unit: Unit, run_id: str, device: torch.device = CPU) -> Block:
+    """Reads a unit's maps and places onto a device; they are kept for one run alone."""
+    return _block(run_id, unit.trial.data, unit.trial.split, unit.instances, device)
 
 
 class PredictionError(BenchnavError):
     """A model or a risk measure raised; the cause says what."""
 
 
-def build(unit: Unit, run_id: str) -> tuple[Problem, Simulation]:
+def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem, Simulation]:
     """Makes the problem and the simulation of a unit.
 
     Args:
         unit: what is to be run.
         run_id: predictions are kept for one run alone.
+        device: where all is computed.
 
     Raises:
         PredictionError: the model or the risk measure failed.
         BenchnavError: the data cannot be read, or are not enough for the world.
     """
     trial = unit.trial
-    block, task = read_block(unit, run_id), trial.make_task()
+    block, task = read_block(unit, run_id, device), trial.make_task()
     luck = luck_key(unit.seed, trial.split, unit.realisation)
     simulation = Simulation(block.terrain, task, trial.world, block.places, luck, unit.instances)
     try:
-        mixture = _predict(unit, run_id, simulation.field)
+        mixture = _predict(unit, run_id, device, simulation.field)
         risk_map = risk.apply(trial.make_risk(), mixture)
     except (Exception, SystemExit) as error:
         raise PredictionError(fault(error)) from error
@@ -99,15 +106,15 @@ def time_budgets(unit: Unit, run_id: str) -> Tensor:
     return unit.trial.world.budget_s(read_block(unit, run_id).places.reference_time_s, top_speed)
 
 
-def _predict(unit: Unit, run_id: str, field: Tensor | None) -> TraversabilityMixture:
+def _predict(unit: Unit, run_id: str, device: torch.device, field: Tensor | None) -> TraversabilityMixture:
     """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
     trial = unit.trial
     model = _model(run_id, _ModelOf(trial))
     if not isinstance(model, Clairvoyant):
-        return _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances)
+        return _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances, device)
     if field is None:
         raise ConfigError("Expected λ that stays what it is for the clairvoyant, got resampled λ.")
-    return predict(model, replace(read_block(unit, run_id).terrain, traversability=field))
+    return predict(model, replace(read_block(unit, run_id, device).terrain, traversability=field))
 
 
 def luck_key(seed: int, split: str, realisation: int) -> int:
@@ -186,8 +193,8 @@ class _ModelOf:
 
 
 @lru_cache(maxsize=2)
-def _block(run_id: str, data: str, split: str, instances: tuple[int, ...]) -> Block:
-    return read_maps(_dataset(run_id, data), split, instances)
+def _block(run_id: str, data: str, split: str, instances: tuple[int, ...], device: torch.device) -> Block:
+    return read_maps(_dataset(run_id, data), split, instances).to(device)
 
 
 @lru_cache(maxsize=2)
@@ -197,9 +204,9 @@ def _dataset(run_id: str, data: str) -> TerrainDataset:
 
 @lru_cache(maxsize=2)
 def _prediction(
-    run_id: str, model: _ModelOf, data: str, split: str, instances: tuple[int, ...]
+    run_id: str, model: _ModelOf, data: str, split: str, instances: tuple[int, ...], device: torch.device
 ) -> TraversabilityMixture:
-    return predict(_model(run_id, model), _block(run_id, data, split, instances).terrain)
+    return predict(_model(run_id, model), _block(run_id, data, split, instances, device).terrain)
 
 
 @lru_cache(maxsize=2)

@@ -14,6 +14,7 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.device import find_device
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, RUN, Run, open_run, read_table
@@ -74,8 +75,13 @@ def rerun(
         )
     if workers.elsewhere or run.about["planner_limit_s"]:
         check_everywhere(trial for trial, _ in run.trials.values())
-    limit_s = run.about["planner_limit_s"]
-    work = Work(suite=run.about["suite"], trials=run.trials, keep=Keep(), planner_limit_s=limit_s)
+    work = Work(
+        suite=run.about["suite"],
+        trials=run.trials,
+        keep=Keep(),
+        planner_limit_s=run.about["planner_limit_s"],
+        device=find_device(run.about.get("device", "cpu")).type,
+    )
     with sole_writer(folder, str(folder)):
         yield from run_work(work, folder, workers, overwrite, say)
 

@@ -1,9 +1,11 @@
 """Running episodes: a planner and the simulation in a closed loop, as one batch.
 
-Letters in shapes: B episodes, N steps, S state and A action dimensions.
+A GPU works through what it is given while the next is prepared, as long as nobody waits for its numbers. So on
+devices other than the CPU the loop looks at which episodes still run at every few steps only, and faults are kept as
+tensors until the end. Letters in shapes: B episodes, N steps, S state and A action dimensions.
 """
 
-import time
+import itertools
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +15,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import BenchnavError
+from benchnav.eval.run.clock import Clock
 from benchnav.options import one_line
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.check.boundary import Answer, act, begin, standing_actions
@@ -22,13 +25,14 @@ from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 
 _FULL = 0.75  # share of a batch that still runs, over which it is left as it is
+_LOOK_EVERY = 8  # steps between two looks at which episodes still run, where a look waits for a GPU
 
 Watcher = Callable[[int, Plan, list[int]], None]  # step, plan, and the episodes that are planned for
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episodes:
-    """What happened in a batch of episodes. Beyond an episode's own `steps` its state stands still.
+    """What happened in a batch of episodes, on the CPU. Beyond an episode's own `steps` its state stands still.
 
     Args:
         states: shape [B, N + 1, S].
@@ -68,14 +72,18 @@ class _Log:
         self.met: list[Tensor] = []
         self.driven_m: list[Tensor] = []
         self.turned: list[Tensor] = []
-        self.begin_s = 0.0
-        self.planning_s: list[float] = []
+        self.clock = Clock(start.state.device)  # what is prepared, then each plan
         self.planned: list[int] = []
-        self.errors = [""] * len(start.state)
+        self._reasons: list[str] = []
+        self._fault = torch.full_like(
+            start.outcome, -1
+        )  # the first reason of each episode, by its place in the list
 
     def blame(self, which: Tensor, reason: str) -> None:
-        for member in which.nonzero()[:, 0].tolist():
-            self.errors[member] = self.errors[member] or reason
+        """Notes what ended some episodes, bool [B]; those that have a reason keep it."""
+        if reason not in self._reasons:
+            self._reasons.append(reason)
+        self._fault = torch.where(which & (self._fault < 0), self._reasons.index(reason), self._fault)
 
     def add(self, before: Tensor, after: SimulationState, action: Tensor, met: Tensor, free: Tensor) -> None:
         self.states.append(after.state)
@@ -88,20 +96,22 @@ class _Log:
         track = torch.stack(self.states, dim=1)
         none = track.new_zeros(len(track), 0)
         driven = torch.stack(self.driven_m, dim=1) if self.actions else none
+        commanded = (
+            torch.stack(self.actions, dim=1) if self.actions else none[..., None].expand(-1, 0, actions)
+        )
+        seconds = self.clock.seconds()
         return Episodes(
-            states=track,
-            actions=torch.stack(self.actions, dim=1)
-            if self.actions
-            else none[..., None].expand(-1, 0, actions),
-            traversability=torch.stack(self.met, dim=1) if self.actions else none,
-            turn_rate_radps=torch.stack(self.turned, dim=1) if self.actions else none,
-            outcome=tell_standstill(now.outcome, now.step, track[..., :2], driven, self.dt_s),
-            steps=now.step,
-            begin_s=self.begin_s,
+            states=track.cpu(),
+            actions=commanded.cpu(),
+            traversability=(torch.stack(self.met, dim=1) if self.actions else none).cpu(),
+            turn_rate_radps=(torch.stack(self.turned, dim=1) if self.actions else none).cpu(),
+            outcome=tell_standstill(now.outcome, now.step, track[..., :2], driven, self.dt_s).cpu(),
+            steps=now.step.cpu(),
+            begin_s=seconds[0] if seconds else 0.0,
             # A planner that raised has no step for its last plan.
-            planning_s=torch.tensor(self.planning_s[: len(self.actions)], dtype=torch.float64),
+            planning_s=torch.tensor(seconds[1 : len(self.actions) + 1], dtype=torch.float64),
             planned=torch.tensor(self.planned[: len(self.actions)]),
-            errors=tuple(self.errors),
+            errors=tuple("" if place < 0 else self._reasons[place] for place in self._fault.tolist()),
             traceback=traceback_,
         )
 
@@ -133,19 +143,22 @@ def run_episodes(
     now = simulation.init(problem.start)
     log = _Log(now, problem.dt_s)
     felt = torch.full_like(now.state[:, 0], torch.nan)
+    look_every = 1 if felt.device.type == "cpu" else _LOOK_EVERY
     trace = ""
-    began = time.perf_counter()
     try:
-        batch = _Batch(planner, problem, begin(planner, problem, generator))
-        log.begin_s = time.perf_counter() - began
-        while bool(now.running.any()):
-            count = len(log.actions)
-            batch.drop_ended(now.running)
+        with log.clock.timed():
+            plan_state = begin(planner, problem, generator)
+        batch = _Batch(planner, problem, plan_state)
+        for count in itertools.count():
+            if count % look_every == 0:
+                running = now.running.cpu()
+                if not bool(running.any()):
+                    break
+                batch.drop_ended(running)
             watched = watch is not None and count % watch_every == 0
             step = Step(state=now.state, felt=felt, time_s=count * problem.dt_s, draw=watched)
-            began = time.perf_counter()
-            answer = batch.act(step)
-            log.planning_s.append(time.perf_counter() - began)
+            with log.clock.timed():
+                answer = batch.act(step)
             log.planned.append(len(batch.members))
             if watched and watch is not None:
                 watch(count, answer.plan, batch.members.tolist())
@@ -159,7 +172,7 @@ def run_episodes(
     except RobotError:
         raise
     except (Exception, SystemExit) as error:
-        trace = traceback.format_exc()
+        trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
         now = end(now, now.running, Outcome.PLANNER_ERROR)
     return log.episodes(now, len(problem.robot.action_low), trace)
@@ -175,32 +188,38 @@ class _Batch:
     """
 
     def __init__(self, planner: Planner[Any], problem: Problem, plan_state: Any) -> None:
-        self.members = torch.arange(len(problem), device=problem.start.device)
+        self.members = torch.arange(len(problem))
         self._planner, self._whole, self._part, self._state = planner, problem, problem, plan_state
+        self._index = self.members.to(problem.start.device)
 
     def drop_ended(self, running: Tensor) -> None:
-        """Lets ended episodes leave, where the planner can do without them and a quarter has ended."""
+        """Lets ended episodes leave, where the planner can do without them and a quarter has ended.
+
+        Args:
+            running: which episodes go on, bool on the CPU, shape [B].
+        """
         left = running[self.members].nonzero()[:, 0]
         if len(left) > _FULL * len(self.members) or not hasattr(self._planner, "select"):
             return
-        self._state = self._planner.select(self._state, left)
         self.members = self.members[left]
-        self._part = self._whole.select(self.members)
+        self._index = self.members.to(self._index.device)
+        self._state = self._planner.select(self._state, left.to(self._index.device))
+        self._part = self._whole.select(self._index)
 
     def act(self, step: Step) -> Answer:
         """Asks the planner, for the episodes that are left."""
-        given = replace(step, state=step.state[self.members], felt=step.felt[self.members])
+        given = replace(step, state=step.state[self._index], felt=step.felt[self._index])
         answer = act(self._planner, given, self._state, self._part)
         self._state = answer.plan_state
         return answer
 
     def spread(self, answer: Answer) -> tuple[Tensor, Tensor, Tensor]:
         """Actions, faults and statuses of all episodes; of those that have left, what is harmless."""
-        zeros = torch.zeros(len(self._whole), dtype=torch.int64, device=self.members.device)
+        zeros = torch.zeros(len(self._whole), dtype=torch.int64, device=self._index.device)
         return (
-            standing_actions(self._whole).index_copy(0, self.members, answer.action),
-            zeros.bool().index_copy(0, self.members, answer.faulty),
-            zeros.index_copy(0, self.members, answer.plan.status),
+            standing_actions(self._whole).index_copy(0, self._index, answer.action),
+            zeros.bool().index_copy(0, self._index, answer.faulty),
+            zeros.index_copy(0, self._index, answer.plan.status),
         )
 
 

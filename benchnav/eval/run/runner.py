@@ -18,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import joblib
+import torch
 
+from benchnav.device import find_device
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.changes import changed_options
@@ -72,6 +74,7 @@ class Work:
         keep: what is recorded of episodes, and of which the steps are stored.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         shard: which share of the units is run; None for all.
+        device: where all is computed, "cpu" or "cuda".
     """
 
     suite: Mapping[str, Any]
@@ -79,6 +82,7 @@ class Work:
     keep: Keep
     planner_limit_s: float = 0.0
     shard: Share | None = None
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +112,7 @@ def run_suite(
     say: Say = lambda line: None,
     shard: Share | None = None,
     scheduler: str = "",
+    device: str = "cpu",
 ) -> Iterator[tuple[int, int]]:
     """Runs what is not finished of a suite, yielding (units done, units in all); to be iterated to the end.
 
@@ -120,13 +125,14 @@ def run_suite(
         say: is told what a user should know, a line at a time.
         shard: run this share of the units alone; None for all.
         scheduler: address of a Dask cluster's scheduler, whose workers are used in place of `jobs`.
+        device: where all is computed: "cpu", "cuda", or "auto" for CUDA where there is a GPU.
 
     Raises:
         ConfigError: the folder holds something else or a run of other code, or the suite cannot be run.
         DatasetError: the dataset lacks what the suite asks for.
         BenchnavError: the cluster cannot be reached, or was lost.
     """
-    workers = Workers(jobs=jobs, scheduler=scheduler)
+    workers, found = Workers(jobs=jobs, scheduler=scheduler), find_device(device)
     with sole_writer(folder, str(folder)):
         wanted = check_suite(suite, workers.elsewhere or planner_limit_s > 0, say)
         work = Work(
@@ -135,6 +141,7 @@ def run_suite(
             keep=suite.keep,
             planner_limit_s=planner_limit_s,
             shard=shard,
+            device=found.type,
         )
         yield from run_work(work, folder, workers, overwrite, say)
 
@@ -143,7 +150,11 @@ def run_work(
     work: Work, folder: Path, workers: Workers, overwrite: bool, say: Say
 ) -> Iterator[tuple[int, int]]:
     """Runs what is not finished of some work in a folder that the caller holds; otherwise as `run_suite`."""
-    reached = connected(workers.scheduler, work.planner_limit_s) if workers.scheduler else nullcontext()
+    reached: Any = nullcontext()
+    if workers.scheduler:
+        reached = connected(workers.scheduler, work.planner_limit_s, work.device)
+    if work.device == "cuda":
+        say(f"computing on {torch.cuda.get_device_name()}")
     with reached as cluster:
         if overwrite:
             _drop(folder)
@@ -182,7 +193,9 @@ def run_work(
         write_errors(folder, in_table_order(own, trials), about["run_id"])
 
 
-def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0) -> None:
+def run_unit(
+    unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0, device: str | torch.device = "cpu"
+) -> None:
     """Runs one unit on one thread and writes its file, and before it its recordings and steps.
 
     Args:
@@ -190,18 +203,20 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
         folder: the run folder.
         run_id: of the run that it belongs to.
         planner_limit_s: time limit of each call of the planner; 0 for none.
+        device: where all is computed.
     """
+    place = torch.device(device)
     about: dict[str, Any] = {"run_id": run_id, "traceback": "", "errors": []}
     with one_thread():
         try:
-            problem, simulation = build(unit, run_id)
+            problem, simulation = build(unit, run_id, place)
         except PredictionError as error:
             about |= {"traceback": traceback.format_exc(), "errors": [str(error)]}
             rows = error_rows(unit, time_budgets(unit, run_id), str(error))
             write_unit(folder, unit, rows, about)
             return
         watched = unit.keep.watched(len(unit.instances))
-        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id).terrain, watched)
+        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id, place).terrain, watched)
         watch = recorder.watch if watched else None
         episodes, compiled = simulate(unit, problem, simulation, watch, recorder.every, planner_limit_s)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
@@ -210,7 +225,7 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
     if stored := unit.keep.with_steps(succeeded):
         write_steps(folder, unit, step_table(unit, problem, episodes, stored))
     about |= {"traceback": episodes.traceback, "errors": sorted({e for e in episodes.errors if e})}
-    reference = read_block(unit, run_id).places.reference_time_s.numpy()
+    reference = read_block(unit, run_id).places.reference_time_s.cpu().numpy()
     redrawn = (simulation.attempts - 1).tolist()
     rows = episode_rows(unit, problem, episodes, reference, redrawn, compiled)
     write_unit(folder, unit, rows, about)
@@ -218,9 +233,10 @@ def run_unit(unit: Unit, folder: Path, run_id: str, planner_limit_s: float = 0.0
 
 def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs: int) -> Iterator[None]:
     # Workers may be older than this call, so that they are told where names of files begin.
-    here, target, run_id, limit_s = Path.cwd(), folder.resolve(), about["run_id"], about["planner_limit_s"]
+    here, target = Path.cwd(), folder.resolve()
+    given = about["run_id"], about["planner_limit_s"], about["device"]
     run = partial(_run_in_worker, os.getpid()) if jobs > 1 else _run_at
-    calls = (joblib.delayed(run)(here, unit, target, run_id, limit_s) for unit in missing)
+    calls = (joblib.delayed(run)(here, unit, target, *given) for unit in missing)
     finished = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
     for _ in missing:
         with warnings.catch_warnings():
@@ -242,9 +258,9 @@ def _run_in_worker(parent: int, *given: Any) -> None:
     _run_at(*given)
 
 
-def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: float) -> None:
+def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: float, device: str) -> None:
     with chdir(here):
-        run_unit(unit, folder, run_id, planner_limit_s)
+        run_unit(unit, folder, run_id, planner_limit_s, device)
 
 
 def _drop(folder: Path) -> None:
@@ -333,6 +349,7 @@ def _about(run_id: str, work: Work, trials: Trials, commands: list[str]) -> dict
         "suite": dict(work.suite),
         "trials": entries,
         "planner_limit_s": work.planner_limit_s,
+        "device": work.device,
         **provenance.describe(trials),
         "machine": provenance.describe_machine(),
         "commands": provenance.command_lines(commands),

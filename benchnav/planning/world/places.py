@@ -35,6 +35,14 @@ class Places:
             reference_time_s=self.reference_time_s[members],
         )
 
+    def to(self, device: torch.device | str) -> "Places":
+        """The same on a device."""
+        return Places(
+            start_m=self.start_m.to(device),
+            goal_m=self.goal_m.to(device),
+            reference_time_s=self.reference_time_s.to(device),
+        )
+
 
 def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:
     """Tells in which episodes ground joins start and goal, from cell to cell over shared edges.

@@ -246,9 +246,10 @@ def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
     )
     about = open_run(tmp_path / "run").about
     told = {name: about[name] for name in ("code", "parts", "datasets")}
-    fit = {**told, "threads": 1, "starts_processes": False}
+    fit = {**told, "threads": 1, "starts_processes": False, "has_gpu": False}
     check_worker("tcp://w", fit, about)
     check_worker("tcp://w", {**fit, "starts_processes": True}, {**about, "planner_limit_s": 5.0})
+    check_worker("tcp://w", {**fit, "has_gpu": True}, {**about, "device": "cuda"})
     code, (data,) = about["code"], about["datasets"]
     other_maps = {data: {"maps": {"test/std": ["0", "1"]}}}
     for state, expected in (
@@ -264,3 +265,5 @@ def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
             check_worker("tcp://w", state, about)
     with pytest.raises(ConfigError, match="no-nanny"):
         check_worker("tcp://w", fit, {**about, "planner_limit_s": 5.0})
+    with pytest.raises(ConfigError, match=r"with a GPU .*tcp://w"):
+        check_worker("tcp://w", fit, {**about, "device": "cuda"})

@@ -192,6 +192,7 @@ def change_run(part: Path, change: Callable[[dict], None]) -> None:  # type: ign
         (lambda about: about["code"]["versions"].update(torch="9.9"), r"torch \(.* to 9\.9\)"),
         (lambda about: about["code"].update(processor="ABACUS"), "processor"),
         (lambda about: about.update(planner_limit_s=5.0), "planner_limit_s"),
+        (lambda about: about.update(device="cuda"), r"device \(cpu to cuda\)"),
         (lambda about: about["parts"]["model oracle"].update(digest="0"), "model oracle"),
         (lambda about: next(iter(about["datasets"].values()))["maps"]["test/hs"].reverse(), "maps of .* test/hs"),
         (lambda about: about["shard"].update(of=4), "number of shards"),

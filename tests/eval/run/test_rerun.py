@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
@@ -79,6 +80,25 @@ def test_the_time_limit_of_planners_is_repeated(suite: Suite, tmp_path: Path) ->
     next(steps := rerun(run, tmp_path / "again", HERE))
     steps.close()
     assert open_run(tmp_path / "again").about["planner_limit_s"] == 77.0
+
+
+def test_the_device_is_repeated_and_refused_where_it_is_not(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = finish(suite, tmp_path / "run")
+    about = json.loads((run / "run.json").read_text())
+    assert about["device"] == "cpu"
+    (run / "run.json").write_text(json.dumps({**about, "device": "cuda"}))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="GPU"):
+        next(rerun(run, tmp_path / "again", HERE))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
+    told: list[str] = []
+    next(steps := rerun(run, tmp_path / "again", HERE, say=told.append))
+    steps.close()
+    assert open_run(tmp_path / "again").about["device"] == "cuda"
+    assert "computing on a GPU" in told
 
 
 def test_rows_that_differ_are_counted_and_the_first_named(suite: Suite, tmp_path: Path) -> None:

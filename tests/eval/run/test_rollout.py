@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 
+from benchnav.eval.run import clock as clock_module
 from benchnav.eval.run import rollout
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.straight import steer_toward
@@ -47,7 +48,7 @@ class Slow:
 
 def run(monkeypatch: pytest.MonkeyPatch, **options: int) -> rollout.Episodes:
     clock = Clock()
-    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+    monkeypatch.setattr(clock_module, "time", SimpleNamespace(perf_counter=clock.perf_counter))
     ground, world = torch.full((BATCH, 16, 16), 0.8), World(time_budget_s=0.4)
     problem = factories.problem(ground, time_budget_s=0.4)
     goal = torch.tensor([[6.75, 6.75]] * BATCH)

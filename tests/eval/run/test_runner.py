@@ -24,9 +24,11 @@ from benchnav.eval.folder.folder import open_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.report.playback.files import playback_path
 from benchnav.eval.report.write import write_report
+from benchnav.eval.run import runner
 from benchnav.eval.run.recorder import find_recording
-from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.runner import run_suite, run_unit
 from benchnav.eval.suite import Suite
+from benchnav.eval.unit import Unit
 from tests import factories
 from tests.eval.report.playback.rrd import read_path
 
@@ -285,6 +287,33 @@ def test_a_run_with_another_time_limit_or_compiler_is_refused(
     monkeypatch.setattr(provenance, "can_compile", lambda: None)
     with pytest.raises(ConfigError, match="compiles"):
         finish(suite, tmp_path / "run")
+
+
+def test_every_unit_is_run_on_the_device_that_is_asked_for(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite, given = quick(dataset_path, scenarios=("std",), risks=("mean",)), []
+
+    def run_elsewhere(unit: Unit, folder: Path, run_id: str, limit_s: float, device: str) -> None:
+        given.append(device)
+        run_unit(unit, folder, run_id, limit_s)
+
+    monkeypatch.setattr(runner, "run_unit", run_elsewhere)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
+    finish(suite, tmp_path / "cuda", device="auto")
+    assert set(given) == {"cuda"}
+    assert open_run(tmp_path / "cuda").about["device"] == "cuda"
+    assert open_run(tmp_path / "cuda").about["machine"]["gpu"] == "a GPU"
+    given.clear()
+    with pytest.raises(ConfigError, match=r"device \(cuda to cpu\)"):
+        finish(suite, tmp_path / "cuda", device="cpu")
+    finish(suite, tmp_path / "cpu", device="cpu")
+    assert set(given) == {"cpu"}
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="GPU"):
+        finish(suite, tmp_path / "none", device="cuda")
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_run_of_other_code_or_data_is_refused_and_what_changed_is_named(

@@ -1,0 +1,113 @@
+"""Whatever the device, rows and recordings are the same, and nothing waits for it at every step."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from benchnav.device import find_device
+from benchnav.errors import ConfigError
+from benchnav.eval.keep import Keep
+from benchnav.eval.run.runner import run_unit
+from benchnav.eval.suite import Suite
+from benchnav.eval.trial import trials_of
+from benchnav.eval.unit import Unit
+from tests.elsewhere import elsewhere, waits
+
+SMALL = {"samples": 20, "horizon": 4}
+DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon": 4}}}
+CL_RRT = {"part": "cl_rrt", "options": {"expansions": 50, "edge_time_s": 3.0}}
+MPPI = {"part": "mppi", "options": SMALL}
+GUIDED = {"part": "astar_mppi", "label": "guided", "options": {"mppi": SMALL}}
+
+
+def faulty(fault: str) -> dict[str, Any]:
+    return {"part": "tests.eval.parts:Faulty", "label": "faulty", "options": {"fault": fault}}
+
+
+def unit_of(data: Path | str, **changes: Any) -> Unit:
+    given: dict[str, Any] = {
+        "data": str(data), "model": "oracle", "planners": ("straight",), "risks": ("cvar:0.9",),
+        "scenarios": ("std",), "time_budget_s": 2.5,
+    } | changes  # fmt: skip
+    (trial,) = trials_of(Suite(**given), lambda data: ["std"])
+    return Unit(trial=trial, seed=0, realisation=0, instances=(0, 1), keep=Keep(record="all", steps="all"))
+
+
+def made(folder: Path) -> dict[str, Any]:
+    """All that a unit has written but wall times, by file."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.suffix == ".npz":
+            with np.load(path) as stored:
+                found |= {f"{name} {key}": stored[key] for key in stored.files}
+        elif path.suffix == ".parquet":
+            rows = pd.read_parquet(path)
+            found |= {f"{name} {key}": rows[key].to_numpy() for key in rows if "planning" not in str(key)}
+    return found
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"planners": (DWA,)},
+        {"planners": (MPPI,)},
+        {"planners": (GUIDED,)},
+        {"planners": (CL_RRT,)},
+        {"planners": (faulty("nan"),)},
+        {"planners": (faulty("give up"),)},
+        {"planners": (faulty("raise"),)},
+        {"world": {"noise": "frozen", "immobile": {"below": 0.2, "for_s": 3}}},
+        {"world": {"noise": "stored"}, "model": "ideal"},
+        {"world": {"noise": "frozen"}, "model": "clairvoyant"},
+        {"risks": ("expected-time",)},
+        {"risks": ("var:0.9",)},
+        {"model": "tests.eval.parts:Broken"},
+    ],
+)
+def test_a_unit_is_the_same_on_another_device(
+    changes: dict[str, Any], dataset_path: Path, tmp_path: Path
+) -> None:
+    unit = unit_of(dataset_path, **changes)
+    run_unit(unit, tmp_path / "here", "one")
+    with elsewhere() as device:
+        run_unit(unit, tmp_path / "there", "one", 0.0, device)
+        assert waits, "nothing was computed there"
+    here, there = made(tmp_path / "here"), made(tmp_path / "there")
+    assert len(here) > 10
+    assert here.keys() == there.keys()
+    for name, values in here.items():
+        np.testing.assert_array_equal(values, there[name], err_msg=name)
+
+
+@pytest.mark.parametrize("planner", ["straight", DWA, MPPI, GUIDED], ids=str)
+def test_nothing_waits_for_a_device_at_every_step(planner: Any, dataset_path: Path, tmp_path: Path) -> None:
+    counted = []
+    for budget_s in (2.0, 6.0):  # neither is enough to arrive
+        unit = unit_of(dataset_path, planners=(planner,), time_budget_s=budget_s)
+        unit = replace(unit, keep=Keep(record="none"))
+        with elsewhere() as device:
+            run_unit(unit, tmp_path / f"{budget_s:g}", "one", 0.0, device)
+            counted.append(len(waits))
+        (path,) = tmp_path.glob(f"{budget_s:g}/units/**/*.parquet")
+        assert (pd.read_parquet(path)["end_time_s"] == budget_s).all()
+    # 40 steps more, and a look at every eighth.
+    assert counted[1] - counted[0] <= 40 / 8 + 1
+
+
+def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert find_device("auto") == find_device("cpu") == torch.device("cpu")
+    with pytest.raises(ConfigError, match="GPU"):
+        find_device("cuda")
+    with pytest.raises(ConfigError, match="among auto, cpu, cuda"):
+        find_device("gpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert find_device("auto") == find_device("cuda") == torch.device("cuda")
+    assert find_device("cpu") == torch.device("cpu")
