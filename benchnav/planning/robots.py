@@ -232,6 +232,11 @@ def _drive(state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor) -> tu
     return x + moved * heading.cos(), y + moved * heading.sin(), heading + scale * turn_rate
 
 
+def component_wise(values: Tensor) -> Tensor:
+    """The same states or actions, shape [*B, S], laid out in memory as `Robot` returns them, see `_stack`."""
+    return values.movedim(-1, 0).contiguous().movedim(0, -1)
+
+
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
     # Stacked outermost in memory, each component is contiguous: compiled rollouts are four times faster.
     return torch.stack(torch.broadcast_tensors(*parts)).movedim(0, -1)

@@ -79,6 +79,7 @@ class Fused(Generic[R]):
         return result
 
     def _call(self, args: tuple[Any, ...], signature: tuple[object, ...]) -> R:
+        """Runs what is compiled, for a new signature under the settings of compiling."""
         assert self._fused is not None
         if signature in self._seen:
             try:

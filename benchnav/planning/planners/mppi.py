@@ -1,16 +1,16 @@
 """Model predictive path integral control (MPPI).
 
 Samples K action sequences about the current mean, rolls each out through F under λ̂, and averages them by
-their exponentiated cost. No global path. Source: Williams et al. (2017), "Information theoretic MPC for
-model-based reinforcement learning", algorithms 1 and 2; paper IV-A3. Letters in shapes: B episodes, K
-samples, T horizon steps, S state, A action dimensions.
+their exponentiated cost. No global path. Sources: Williams et al. (2017), "Information theoretic MPC for
+model-based reinforcement learning", algorithm 2; for γ, α and bounds Williams et al. (2018),
+"Information-theoretic model predictive control", algorithms 1 and 2; paper IV-A3. Letters in shapes: B
+episodes, K samples, T horizon steps, S state, A action dimensions; in formulas u is the mean, ε the noise,
+Σ its covariance.
 
-Of the source it differs in one thing: samples are clipped to the action bounds before they are averaged;
-Williams averages them as drawn and clips within F. The control cost weighs the noise as drawn in both,
-since it is a ratio of the densities that the samples were drawn from.
-
-The samples' noise is shared by the episodes of a batch: it is a pure function of the plan state's seed and step
-(see `noise`), so an episode has the same noise alone as in any batch.
+What differs: samples are clipped to the action bounds before they are averaged, where Williams averages them
+as drawn and clips within F. The control cost, a ratio of densities, weighs the noise as drawn in both; it is
+off by default. The mean is not smoothed. Noise is read anew from one bank, a pure function of seed and step
+(`noise`); the episodes of a batch share it, so an episode has the same noise alone as in any batch.
 """
 
 import math
@@ -27,11 +27,12 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, stage_cost, terminal_cost
-from benchnav.planning.robots import Robot
+from benchnav.planning.robots import Robot, component_wise
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
 _WORTH_COMPILING = 2000  # samples
+_OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
 _DRAWN_SAMPLES = 40
 
 
@@ -43,9 +44,9 @@ class MPPIConfig:
         horizon: steps T.
         samples: action sequences K.
         noise: standard deviation of each sampled action; by default for (v, ω) in m/s and rad/s.
-        temperature: scale of cost below which samples count alike.
-        control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the
-            current mean itself as the base distribution (α = 1 in the source).
+        temperature: scale of cost below which samples count alike; λ in the source.
+        control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the current mean
+            itself as the base distribution (α = 1 in the source), `temperature` takes 0 (α = 0).
     """
 
     horizon: int = 50
@@ -97,8 +98,8 @@ class MPPI:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
         samples = self.config.samples
-        self._advance = Fused(advance_chunk, samples, _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
-        self._weigh = Fused(weigh, samples, _WORTH_COMPILING, batched=(0, 1, 2, 6, 7))
+        self._advance = Fused(advance_chunk, samples, _WORTH_COMPILING, batched=_OF_EPISODES)
+        self._weigh = Fused(weigh, samples, _WORTH_COMPILING, batched=_OF_EPISODES)
 
     @property
     def compiled(self) -> bool | None:
@@ -131,20 +132,20 @@ class MPPI:
         self, step: Step, plan_state: MPPIState, target_m: Tensor
     ) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step; see `LocalPlanner`."""
-        problem, config, earlier = plan_state.problem, self.config, plan_state.mean
+        problem, config, mean = plan_state.problem, self.config, plan_state.mean
         noise = plan_state.noise.at(plan_state.step)
-        states, cost = roll_out(problem, step.state, earlier, noise, target_m, self._advance)
+        states, cost = roll_out(problem, step.state, mean, noise, target_m, self._advance)
         if config.control_cost:
-            cost = cost + config.control_cost * control_cost(earlier, noise, plan_state.scale)
-        weights, mean = self._weigh(
-            states, cost, earlier, noise, *problem.action_bounds, problem.padded_ground, target_m[:, None].contiguous(),
-            problem.grid, problem.objective, config.temperature,
+            cost = cost + config.control_cost * control_cost(mean, noise, plan_state.scale)
+        weights, updated = self._weigh(
+            states, cost, mean, noise, *problem.action_bounds, problem.padded_ground,
+            target_m[:, None].contiguous(), problem.grid, problem.objective, config.temperature,
         )  # fmt: skip
-        shifted = torch.cat((mean[:, 1:], mean[:, -1:]), dim=1)
+        shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         plan = Plan.empty(len(problem), step.state.device)
         if step.draw:
-            plan = _drawn(problem, step.state, mean, earlier, noise, weights)
-        return mean[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
+            plan = _drawn(problem, step.state, updated, mean, noise, weights)
+        return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
 
     def took(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
         """Plans on as before; see `LocalPlanner`."""
@@ -199,10 +200,8 @@ def roll_out(
     Returns:
         The last states, shape [B, K, S], and the cost but for theirs, shape [B, K].
     """
-    samples = noise.shape[2]
-    # State dimensions outermost in memory, so that each is contiguous in samples.
-    states = state.T[:, :, None].expand(-1, -1, samples).contiguous().movedim(0, -1)
-    target = target_m[:, None].contiguous()
+    states = component_wise(state[:, None].expand(-1, noise.shape[2], -1))
+    target = target_m[:, None].contiguous()  # as all that is passed on: another layout is compiled for anew
     cost = state.new_zeros(states.shape[:2])
     for first in range(0, mean.shape[1], _CHUNK_STEPS):
         chunk = slice(first, first + _CHUNK_STEPS)
@@ -236,13 +235,13 @@ def advance_chunk(
     states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
     padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Rolls samples out over a chunk of the horizon, adding up their costs."""
+    """Rolls samples out over a chunk of the horizon, adding up their costs; takes a problem in its parts."""
     for step in range(mean.shape[1]):
         action = _perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, action, ground, target)
         states = robot(states, action, ground.abs())
-    return states.movedim(-1, 0).contiguous().movedim(0, -1), cost
+    return component_wise(states), cost
 
 
 def weigh(
@@ -261,20 +260,20 @@ def weigh(
 
 
 def average(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Averages the sampled action sequences by their weights [B, K], shape [B, T, A]."""
+    """Averages the sampled action sequences by their weights w [B, K]: Σ w·clip(u + ε), shape [B, T, A]."""
     return (_perturb(mean[..., None], noise, low, high) * weights[:, None, None]).sum(-1)
 
 
 def _perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Samples actions: mean plus noise within the bounds, control dimension next to last."""
+    """Samples actions: clip(u + ε), within bounds [A], the action dimension next to last."""
     return torch.clamp(mean + noise, low[:, None], high[:, None])
 
 
 def _drawn(
-    problem: Problem, state: Tensor, mean: Tensor, earlier: Tensor, noise: Tensor, weights: Tensor
+    problem: Problem, state: Tensor, updated: Tensor, mean: Tensor, noise: Tensor, weights: Tensor
 ) -> Plan:
-    """The path of the mean and those of the best samples."""
+    """The path of the updated mean, and those of the best samples about the mean before."""
     best = weights.topk(min(_DRAWN_SAMPLES, weights.shape[1]), dim=1).indices
-    samples = _perturb(earlier[..., None], noise[..., best].movedim(2, 0), *problem.action_bounds)
-    paths = rollout_path(problem, state, torch.cat((mean[..., None], samples), dim=3))
+    samples = _perturb(mean[..., None], noise[..., best].movedim(2, 0), *problem.action_bounds)
+    paths = rollout_path(problem, state, torch.cat((updated[..., None], samples), dim=3))
     return Plan.empty(len(problem), state.device, path=paths[:, 0], samples=paths[:, 1:])

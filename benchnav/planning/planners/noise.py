@@ -3,10 +3,10 @@
 Drawing normals costs more than rolling out what they perturb. So a bank of them is drawn when a planner begins, a
 few times as many as a step needs, and each step reads it from other places: the bank has a part for each time step of
 the horizon, and of it every action gets a run that begins at a place of its own. From step to step the parts change
-hands and the places move, by strides that are drawn too. Within a step the numbers of a sample are independent, as no
-two of them lie at one place of the bank; between steps, and between samples, numbers occur again in other company. All
-is a pure function of seed and step, on any device. Letters in shapes: K samples, T horizon steps, A action dimensions,
-N numbers of a part.
+hands and the places move, by strides that are drawn too. Within a step all numbers are independent, as no
+two of them lie at one place of the bank; from step to step numbers occur again, in other company. All is a
+pure function of seed and step, on any device. Letters in shapes: K samples, T horizon steps, A action
+dimensions, N numbers of a part.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav import rng
 
-_RUNS = 4  # of samples that a part holds side by side
+_RUNS = 4  # length N of a part, in runs of K numbers
 
 
 @dataclass(frozen=True)
@@ -39,10 +39,11 @@ class NoiseBank:
         """The noise of a step, shape [T, A, K]."""
         actions, horizon, numbers = self.values.shape
         within = (self.place + step * self.stride) % (numbers - self.samples + 1)
-        # Backward: forward the plan, which shifts by a step as well, would get noise for a moment from one part always.
+        # Parts move backward: forward, with the plan, a moment of it would meet the same part at every step.
         part = (torch.arange(horizon, device=within.device) - step) % horizon
         action = torch.arange(actions, device=within.device)
         begin = (action * horizon + part[:, None]) * numbers + within
+        # Row i of the windows is the run that begins at number i; nothing is copied before the selection.
         windows = self.values.as_strided((self.values.numel() - self.samples + 1, self.samples), (1, 1))
         return windows.index_select(0, begin.flatten()).view(horizon, actions, self.samples)
 
@@ -60,6 +61,6 @@ def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank
     generator = rng.generator(rng.stream_key(seed, "noise"))
     actions, numbers = len(scale), _RUNS * samples
     values = torch.randn((actions, horizon, numbers), generator=generator, dtype=scale.dtype).to(scale.device)
-    runs, shape = numbers - samples + 1, (horizon, actions)
-    place, stride = (torch.randint(runs, shape, generator=generator).to(scale.device) for _ in range(2))
+    places, shape = numbers - samples + 1, (horizon, actions)
+    place, stride = (torch.randint(places, shape, generator=generator).to(scale.device) for _ in range(2))
     return NoiseBank(values=values * scale[:, None, None], place=place, stride=stride, samples=samples)

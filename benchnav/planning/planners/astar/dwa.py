@@ -1,12 +1,12 @@
 """The dynamic window approach (DWA): the best constant (v, ω) within reach of the accelerations.
 
-From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision avoidance", comes the window:
-the velocity pairs that the robot can reach within one step. What is done with them is not theirs: each pair
-is held for the whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by the
-heading that it ends with. There are no admissible velocities by braking distance, no terms for clearance
-and speed; a pair that does not stay on free ground for the whole horizon pays the price of each step off
-it, which is why DWA creeps in narrow places and needs a recovery where it stands. Letters in shapes: B
-episodes, M velocity pairs, T horizon steps, S state dimensions.
+From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision avoidance", come the window,
+the velocity pairs that the robot can reach within one step, and the search for the one whose arc is best.
+How arcs are judged is not theirs: each pair is held for the whole horizon, rolled out through F under λ̂, and
+judged by J toward a way-point and by the heading that it ends with. There are no admissible velocities by
+braking distance, no terms for clearance and speed; a pair that leaves free ground before it arrives pays the
+price of each step off it, which is why DWA creeps in narrow places and needs a recovery where it stands.
+Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
 
 import math
@@ -22,7 +22,7 @@ from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, stage_cost, with_tensors
-from benchnav.planning.robots import Robot, action_limits
+from benchnav.planning.robots import Robot, action_limits, component_wise
 
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10
@@ -41,8 +41,8 @@ class DWAConfig:
         horizon: steps T.
         acceleration: greatest change of linear velocity, m/s², of a robot without limits of its own.
         turn_acceleration: greatest change of angular velocity, rad/s², of a robot without limits of its own.
-        heading_weight: cost of a radian between the last heading and the way-point; it lets a robot
-            turn on the spot, which changes no distance.
+        heading_weight: cost of a radian between the last heading and the direction of the way-point; it lets
+            a robot turn on the spot, which changes no distance.
         arrival_m: a trajectory this near to the way-point has arrived and costs no more, so that a
             near way-point does not slow the robot.
     """
@@ -88,6 +88,7 @@ class DWA:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or DWAConfig()
         pairs = self.config.speeds * self.config.turn_rates
+        # Of the episodes are: states, cost, under_way, pairs, padded_ground, target.
         self._hold = Fused(hold, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5))
 
     @property
@@ -120,13 +121,8 @@ class DWA:
         problem, velocity = plan_state.problem, action
         limits = action_limits(problem.robot)
         if limits is not None:
-            change = [
-                (action[:, axis] - plan_state.velocity[:, axis]).clamp(
-                    -rate * problem.dt_s, rate * problem.dt_s
-                )
-                for axis, rate in enumerate(limits)
-            ]
-            velocity = plan_state.velocity + torch.stack(change, dim=1)
+            reach = action.new_tensor([rate * problem.dt_s for rate in limits])
+            velocity = plan_state.velocity + (action - plan_state.velocity).clamp(-reach, reach)
         return DWAState(problem, velocity)
 
     def select(self, plan_state: DWAState, members: Tensor) -> DWAState:
@@ -192,9 +188,8 @@ def judge(
         Cost of each pair, shape [B, M].
     """
     advance, target = advance or hold, target_m[:, None].contiguous()
-    # State dimensions outermost in memory, so that each is contiguous in pairs.
-    states = state.T[:, :, None].expand(-1, -1, window.shape[1]).contiguous().movedim(0, -1)
-    pairs = window.movedim(-1, 0).contiguous().movedim(0, -1)
+    states = component_wise(state[:, None].expand(-1, window.shape[1], -1))
+    pairs = component_wise(window)
     cost = torch.zeros_like(window[..., 0])
     under_way = torch.ones_like(cost, dtype=torch.bool)
     for first in range(0, config.horizon, _CHUNK_STEPS):
@@ -202,22 +197,23 @@ def judge(
             states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
             problem.objective, config.arrival_m, min(_CHUNK_STEPS, config.horizon - first),
         )  # fmt: skip
-    last = problem.terminal_cost(states, target) + config.heading_weight * _turn_left(state, states, target)
-    return cost + last * under_way
+    terminal = problem.terminal_cost(states, target)
+    heading = config.heading_weight * _heading_error(state, states, target)
+    return cost + (terminal + heading) * under_way
 
 
 def hold(
-    states: Tensor, cost: Tensor, under_way: Tensor, window: Tensor, padded_ground: Tensor, target: Tensor,
+    states: Tensor, cost: Tensor, under_way: Tensor, pairs: Tensor, padded_ground: Tensor, target: Tensor,
     grid: Grid, robot: Robot, objective: Objective, arrival_m: float, steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Holds each pair for some steps, adding up the costs of those that have not arrived."""
+    """Holds each pair for some steps, adding up costs of those under way; takes a problem in its parts."""
     for _ in range(steps):
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
-        cost = cost + stage_cost(objective, states, window, ground, target) * under_way
-        states = robot(states, window, ground.abs())
+        cost = cost + stage_cost(objective, states, pairs, ground, target) * under_way
+        states = robot(states, pairs, ground.abs())
         offset = states[..., :2] - target
         under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
-    return states.movedim(-1, 0).contiguous().movedim(0, -1), cost, under_way
+    return component_wise(states), cost, under_way
 
 
 def held_paths(problem: Problem, state: Tensor, window: Tensor, horizon: int) -> Tensor:
@@ -230,8 +226,8 @@ def held_paths(problem: Problem, state: Tensor, window: Tensor, horizon: int) ->
     return torch.stack(positions, dim=2)
 
 
-def _turn_left(state: Tensor, last: Tensor, target: Tensor) -> Tensor:
-    """Angle by which the last heading misses the way-point, shape [B, M].
+def _heading_error(state: Tensor, last: Tensor, target: Tensor) -> Tensor:
+    """Angle from the last heading to the way-point as seen from where the robot is now, rad, shape [B, M].
 
     It is not wrapped: a turn past the way-point counts as such, else a robot that spins would find
     another round as good as stopping.
