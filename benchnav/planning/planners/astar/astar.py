@@ -47,11 +47,11 @@ def edge_costs(problem: Problem, by_time: bool = False) -> np.ndarray:
     source, target, length = gridgraph.neighbour_pairs(*problem.grid.shape)
     if by_time:
         pace = 1 / (problem.traversability.double() * problem.robot.top_speed_mps)
-        costs = 0.5 * length * resolution * _at_both_ends(pace, source, target)
+        costs = 0.5 * length * resolution * _sum_of_ends(pace, source, target)
     else:
         elevation = problem.elevation_m.double().flatten(1).cpu().numpy()
         costs = np.hypot(length * resolution, elevation[:, target] - elevation[:, source])
-    return costs + 0.5 * length * resolution * _at_both_ends(PRICE * ~problem.free, source, target)
+    return costs + 0.5 * length * resolution * _sum_of_ends(PRICE * ~problem.free, source, target)
 
 
 def search(problem: Problem, by_time: bool = False) -> CostToGo:
@@ -119,6 +119,7 @@ def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) ->
     return torch.cat((state[:, None, :2], points[:, 1:]), dim=1)
 
 
-def _at_both_ends(maps: Tensor, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _sum_of_ends(maps: Tensor, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Adds the values of maps [B, H, W] in the two cells of each edge, shape [B, E]."""
     values = maps.flatten(1).cpu().numpy()
     return np.take(values, source, axis=1) + np.take(values, target, axis=1)

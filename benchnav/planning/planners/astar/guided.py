@@ -126,6 +126,7 @@ class Guided(Generic[Local]):
     def plan(self, step: Step, plan_state: GuidedState[Local]) -> tuple[Tensor, GuidedState[Local], Plan]:
         """Follows the cheapest path; see `Planner`."""
         problem, field, state = plan_state.problem, plan_state.field, step.state
+        # The robot, and as many points as can lie within the look-ahead.
         count = 2 + int(self.guide.lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
         target, straight = choose_waypoint(plan_state.ground, points, self.guide.lookahead_m)

@@ -110,9 +110,10 @@ def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -
     # Only what is within the look-ahead counts, and that spans no more columns or rows than this.
     crossings = math.ceil(lookahead_m / grid.resolution_m) + 1
     costs = line_costs(ground, begin, end, crossings)
-    lines, legs, detour = costs[:, :count], costs[:, count:-2], costs[:, -2:].sum(dim=1, keepdim=True)
+    lines, legs, by_gate = costs.split((count, count - 1, 2), dim=1)
     # The line to a neighbour across a corner may cut a cell that the path does not touch.
-    path = torch.cat((torch.minimum(lines[:, :1], detour), legs), dim=1).cumsum(dim=1)
+    first = torch.minimum(lines[:, :1], by_gate.sum(dim=1, keepdim=True))
+    path = torch.cat((first, legs), dim=1).cumsum(dim=1)
     near = torch.linalg.vector_norm(points_m.diff(dim=1), dim=2).cumsum(dim=1) <= lookahead_m
     rank = torch.arange(count, device=ahead.device)
     worth = lines <= _SHORT_CUT * path
