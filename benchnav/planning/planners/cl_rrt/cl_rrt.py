@@ -8,8 +8,12 @@ references. The best path is the one of least simulated time; J is not read. Sou
 "Real-time motion planning with applications to autonomous urban driving"; paper IV-A2.
 
 Read on in `tree`, whose `search` is one plan, and in `edges`, which simulates and judges. This module is what
-the source calls the execution loop: when to plan, and from what.
+the source calls the execution loop, algorithm 2: when to plan, and from what.
 
+- The source grows one tree all the time, propagates its best path again from the latest state, and stops
+  where there is none that is safe. Here a tree is grown where a plan is due, at the path's end or when the
+  robot has strayed or stalled (paper IV-A2), and not kept. Nodes need not be safe to stop at.
+- References are Dubins paths; the source draws straight lines and takes Dubins lengths for its heuristics.
 - Sampled points carry no heading, so references are the shortest paths to a point with free heading: the
   least over all end headings of the Dubins length, and no random heading makes a detour.
 - A plan without a way to the goal leads along the best partial path, and is tried anew at the next steps with

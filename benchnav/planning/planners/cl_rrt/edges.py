@@ -8,10 +8,10 @@ its time, or where it collides.
   ground, because the truth differs from the prediction, may leave it, and goes on.
 - A loop that may cross does not collide with ground that is not free. How far an edge drives on such
   ground is counted, since a metre of it has a price.
-- Of an edge that collides the nearer half of its free part stays, as the source keeps the safe nodes along
+- Of an edge that collides the nearer half of its free part stays, as the source keeps feasible nodes along
   the way: in tight places no edge of full length is free.
 
-Source: Kuwata et al. (2009), algorithm 1, lines 4–9. Letters in shapes: B episodes, R edges driven at once,
+Source: Kuwata et al. (2009), algorithm 1, lines 4–10. Letters in shapes: B episodes, R edges driven at once,
 T time steps, N points of a reference, P drawn points of an edge, S state dimensions.
 """
 

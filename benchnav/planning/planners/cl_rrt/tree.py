@@ -7,8 +7,9 @@ route. A tree is a value: a table of nodes, of which every round makes a longer 
 - Nodes are chosen by Kuwata's mix of two heuristics: the nearest in Dubins length (explore), or the one
   through which the point is reached soonest (optimise). Before a way to the goal is known 70 % of the
   choices explore, afterwards 30 %, and nodes that cannot improve on the best way are left out.
-- The goal's share of the samples goes to nodes that have not tried it yet, the most promising first: a trial
-  has no chance in it, so that a second one from the same node would be a copy.
+- The goal's share of the edges goes to nodes that have not tried it yet, the most promising first: a trial
+  has no chance in it, so that a second one from the same node would be a copy. The source tries the goal from
+  every new node.
 - A way costs its simulated time, and `PRICE` for each metre of it on ground that is not free.
 
 Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes, R edges of a round,
@@ -184,22 +185,25 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
         min=0
     )
     closed = tree.cost + straight_m / top_mps >= best  # cannot improve on the best way
-    bar = torch.where(closed, math.inf, 0.0)
-    taken_m = torch.where(closed, 0, min(loop.follower.config.speed_mps, top_mps) * tree.time_s)
+    closed_m = torch.where(closed, math.inf, 0.0)
+    # The time of the way to each node, as the length driven in it at the wanted speed.
+    spent_m = torch.where(closed, 0, min(loop.follower.config.speed_mps, top_mps) * tree.time_s)
 
+    # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole way (optimise).
     explore = chance < torch.where(found, _EXPLORE[1], _EXPLORE[0])  # [B, R]
     length_m = dubins_length_to_point(
         tree.at.state[:, None, :, :3], sample_m[:, None], loop.radius_m[:, None, None]
     )
-    before_m = torch.where(explore[..., None], 0, taken_m[:, None]) + bar[:, None]
+    before_m = torch.where(explore[..., None], 0, spent_m[:, None]) + closed_m[:, None]
     node = (length_m + before_m).argmin(dim=-1)
     target_m = sample_m.expand(len(node), -1, -1)
     lanes = min(goal_edges, tree.parent.shape[1])
     if not lanes:
         return Choice(node=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool))
 
+    # Lines 13–20: the goal.
     tried = torch.zeros_like(tree.time_s).scatter_add(1, tree.parent, tree.aimed.to(tree.time_s)) > 0
-    promise_m = tree.to_goal_m + bar + torch.where(found, taken_m, 0)
+    promise_m = tree.to_goal_m + closed_m + torch.where(found, spent_m, 0)
     promise_m, promising = torch.where(tried, math.inf, promise_m).topk(lanes, dim=1, largest=False)
     aimed = torch.nn.functional.pad(promise_m < math.inf, (0, node.shape[1] - lanes))
     promising = torch.nn.functional.pad(promising, (0, node.shape[1] - lanes))
