@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.cai.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import MPPI, advance_chunk, weigh
+from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, advance_chunk, weigh
 from benchnav.planning.planners.planner import Step
 from benchnav.planning.problem import Problem
 
@@ -27,8 +27,8 @@ class ManyTrialsMPPI(MPPI):
     def __init__(self, setup: Setup) -> None:
         """Keeps the settings."""
         super().__init__(setup.mppi)
-        self._advance = Fused(advance_chunk, setup.mppi.samples, _ALWAYS, batched=(0, 1, 2, 6, 7))
-        self._weigh = Fused(WEIGHS[setup.average], setup.mppi.samples, _ALWAYS, batched=(0, 1, 2, 6, 7))
+        self._advance = Fused(advance_chunk, setup.mppi.samples, _ALWAYS, batched=OF_EPISODES)
+        self._weigh = Fused(WEIGHS[setup.average], setup.mppi.samples, _ALWAYS, batched=OF_EPISODES)
 
 
 def average_as_drawn(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ from benchnav.planning.robots import Robot, component_wise
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
 _WORTH_COMPILING = 2000  # samples
-_OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
+OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
 _DRAWN_SAMPLES = 40
 
 
@@ -98,8 +98,8 @@ class MPPI:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or MPPIConfig()
         samples = self.config.samples
-        self._advance = Fused(advance_chunk, samples, _WORTH_COMPILING, batched=_OF_EPISODES)
-        self._weigh = Fused(weigh, samples, _WORTH_COMPILING, batched=_OF_EPISODES)
+        self._advance = Fused(advance_chunk, samples, _WORTH_COMPILING, batched=OF_EPISODES)
+        self._weigh = Fused(weigh, samples, _WORTH_COMPILING, batched=OF_EPISODES)
 
     @property
     def compiled(self) -> bool | None:

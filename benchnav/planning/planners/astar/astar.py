@@ -1,9 +1,9 @@
 """A*: cheapest paths over the cells of a 2.5D map.
 
 λ̂ does not change during an episode, so the exact cost to go h* is found once for every cell, by one
-compiled search backward from the goal, on the host. A* with h* as its heuristic expands the cells of a
-cheapest path alone: replanning from wherever the robot stands is following pointers. Ground that is not
-free costs its price a metre, on the half of an edge that lies in it, so that every cell has a path.
+compiled search, Dijkstra's, backward from the goal, on the host. A* with h* as its heuristic expands the
+cells of a cheapest path alone: replanning from wherever the robot stands is following pointers. Ground that
+is not free costs its price a metre, on the half of an edge that lies in it, so that every cell has a path.
 Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes, H×W cells, N points,
 E edges.
 """

@@ -17,10 +17,11 @@ the source calls the execution loop, algorithm 2: when to plan, and from what.
 - Sampled points carry no heading, so references are the shortest paths to a point with free heading: the
   least over all end headings of the Dubins length, and no random heading makes a detour.
 - A plan without a way to the goal leads along the best partial path, and is tried anew at the next steps with
-  references of half the radius each time, down to the robot's own tightest turn: at full radius a robot
-  that faces ground that is not free has no way at all, and one that can slow down can turn tighter. After
-  `most_failures` such plans a partial path is driven to its end. It is left a little before its end, and not
-  tried anew from ground that is not free: a robot that slid into a wall could leave it on the other side.
+  references of half the radius each time, down to the robot's own tightest turn or the spacing of their
+  points: at full radius a robot that faces ground that is not free has no way at all, and one that can slow
+  down can turn tighter. After `most_failures` such plans a partial path is driven to its end. It is left a
+  little before its end, and not tried anew from ground that is not free: a robot that slid into a wall could
+  leave it on the other side.
 - Where `most_failures` plans in a row found no partial path either, the next ones may cross: their edges go
   on over ground that is not free, at its price a metre, and the cheapest path is driven as a partial one.
   Before that the tree stays on free ground, so that a free way is taken wherever one is found; and once

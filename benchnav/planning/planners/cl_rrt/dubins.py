@@ -103,6 +103,7 @@ def _to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Ten
     y = y.abs()
     power = x * x + y * (y - 2)  # of the point over the left circle, centre (0, 1)
     inside = power < 0
+    # The arc ends where its tangent meets the point.
     straight = power.clamp(min=0).sqrt()
     arc = _wrap(torch.atan2(y - 1, x) + torch.atan2(torch.ones_like(straight), straight))
     # Triangle of the right circle's centre (0, -1), the last circle's centre (2 away) and the point.

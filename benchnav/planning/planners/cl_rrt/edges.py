@@ -132,7 +132,7 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
     path, progress, free, collided, integral, error = _simulate(loop, begin, reference, end_m)
     at_goal = distance(path, problem.goal_m[:, None]) < problem.goal_radius_m
     over = (progress >= end_m) | at_goal
-    over[-1] = True
+    over[-1] = True  # no edge goes on past the log
     last = _first(over)  # the step at which each edge ends
     half = (_first(collided) - 1).clamp(min=0) // 2
     last = torch.where(_at(collided, last), half, last)

@@ -181,12 +181,14 @@ class PathFollower:
             Actions (v, ω) within the bounds, shape [*B, 2], and the next tracking.
         """
         config = self.config
+        # Pure pursuit: the arc through the look-ahead point.
         x, y, heading = state[..., 0], state[..., 1], state[..., 2]
         aim = reference.at(progress_m + self.lookahead_m)
         aim_x, aim_y = aim[..., 0] - x, aim[..., 1] - y
         sideways = aim_y * heading.cos() - aim_x * heading.sin()
         curvature = 2 * sideways / (aim_x * aim_x + aim_y * aim_y + _LEAST_SQUARE_M2)
 
+        # PID: the wanted speed, corrected by the error of the speed over ground.
         moved = state[..., :2] - tracking.position_m
         error = config.speed_mps - torch.hypot(moved[..., 0], moved[..., 1]) * (1 / self.dt_s)
         low, high = self.speed_mps
