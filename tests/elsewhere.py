@@ -17,6 +17,7 @@ backend = pytest.importorskip("torch.utils.backend_registration")
 if not hasattr(backend, "_setup_privateuseone_for_python_backend"):
     pytest.skip("this PyTorch cannot be given a device in Python", allow_module_level=True)
 backend._setup_privateuseone_for_python_backend("elsewhere")
+torch.elsewhere.get_amp_supported_dtype = lambda: [torch.bfloat16]  # type: ignore[attr-defined]
 
 ELSEWHERE = torch.device("elsewhere", 0)
 aten = torch.ops.aten
@@ -70,10 +71,13 @@ def elsewhere() -> Iterator[torch.device]:
     waits.clear()
     # So a module can be moved there: a tensor of the CPU cannot become one of ours in place.
     torch.__future__.set_swap_module_params_on_conversion(True)
+    # Tensors of our kind cannot be made in inference mode.
+    inference_mode, torch.inference_mode = torch.inference_mode, torch.no_grad  # type: ignore[misc, assignment]
     try:
         with _Mode():
             yield ELSEWHERE
     finally:
+        torch.inference_mode = inference_mode  # type: ignore[misc]
         torch.__future__.set_swap_module_params_on_conversion(False)
 
 
@@ -90,7 +94,7 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
     if (func in _WAITING or leaves or by_mask) and far:
         waits.append(str(func))
     result = func(*tree_map(_here, args), **tree_map(_here, kwargs))
-    if func._schema.name.endswith("_"):
+    if func._schema.is_mutable and args and isinstance(args[0], torch.Tensor):
         return args[0]
     return _there(result, goes)
 

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from benchnav.command import INTERRUPTED, Command, run
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
+Device = Literal["auto", "cpu", "cuda"]
 Config = TypeVar("Config", ClassifierConfig, MDNConfig)
 
 
@@ -25,6 +26,7 @@ def train_classifier(
     classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
     members: int = 1,
     seed: int = 0,
+    device: Device = "auto",
     trainer: dict[str, Any] | None = None,
     workers: int = 0,
     in_memory: bool = False,
@@ -40,6 +42,7 @@ def train_classifier(
         classifier: Settings of the classifier.
         members: How many to train, with the seeds SEED, SEED + 1, …; their probabilities are averaged.
         seed: Root seed of weights, order and augmentation.
+        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory, in place of reading them as they are asked for.
@@ -50,7 +53,7 @@ def train_classifier(
     from benchnav.models.training.classifiers import train_members
 
     dataset = _open_dataset(data)
-    classifier, options = _options(out, classifier, trainer, resume, workers, in_memory)
+    classifier, options = _options(out, classifier, device, trainer, resume, workers, in_memory)
     target = _open_target(out, dataset, _members(members), options, overwrite)
     train_members(target, classifier, dataset, members, seed, options, half_precision)
 
@@ -60,7 +63,7 @@ def train_gp(
     out: str,
     gp: LatentGPConfig = _DEFAULT_GP,
     seed: int = 0,
-    trainer: dict[str, Any] | None = None,
+    device: Device = "auto",
     overwrite: bool = False,
 ) -> None:
     """Train the class-wise Gaussian processes.
@@ -72,13 +75,13 @@ def train_gp(
             their class table.
         gp: Settings of the GPs.
         seed: Root seed of the rows of slip logs that are held out to measure on.
-        trainer: Settings of Lightning's trainer, of which the accelerator alone counts.
+        device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
 
-    options = FitOptions(trainer=trainer or {})
+    options = FitOptions(device=device)
     if data.endswith((".csv", ".parquet")):
         train_gps_on_logs(data, out, gp, seed, options, overwrite)
         return
@@ -94,6 +97,7 @@ def train_all(
     gp: LatentGPConfig = _DEFAULT_GP,
     members: int = 1,
     seed: int = 0,
+    device: Device = "auto",
     trainer: dict[str, Any] | None = None,
     workers: int = 0,
     in_memory: bool = False,
@@ -110,7 +114,8 @@ def train_all(
         gp: Settings of the GPs.
         members: How many classifiers to train; their probabilities are averaged.
         seed: Root seed.
-        trainer: Settings of Lightning's trainer for the classifiers; of the GPs' the accelerator.
+        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
+        trainer: Settings of Lightning's trainer for the classifiers.
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory, in place of reading them as they are asked for.
         half_precision: Store the classifiers' weights as float16.
@@ -121,7 +126,7 @@ def train_all(
     from benchnav.models.training.gps import train_gps_on_maps
 
     dataset = _open_dataset(data)
-    classifier, options = _options(out, classifier, trainer, resume, workers, in_memory)
+    classifier, options = _options(out, classifier, device, trainer, resume, workers, in_memory)
     target = _open_target(out, dataset, ["gp", *_members(members)], options, overwrite)
     if not target.holds("gp", asdict(gp), seed, asdict(LatentGPConfig())):
         target.add("gp", train_gps_on_maps(gp, dataset, seed, options))
@@ -133,6 +138,7 @@ def train_mdn(
     out: str,
     mdn: MDNConfig = _DEFAULT_MDN,
     seed: int = 0,
+    device: Device = "auto",
     trainer: dict[str, Any] | None = None,
     workers: int = 0,
     in_memory: bool = False,
@@ -147,6 +153,7 @@ def train_mdn(
         out: Checkpoint folder. Logs go to OUT.training.
         mdn: Settings of the network.
         seed: Root seed of weights, order and augmentation.
+        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory, in place of reading them as they are asked for.
@@ -158,7 +165,7 @@ def train_mdn(
     from benchnav.models.training.mdn import train_mdn_part
 
     dataset = _open_dataset(data)
-    mdn, options = _options(out, mdn, trainer, resume, workers, in_memory)
+    mdn, options = _options(out, mdn, device, trainer, resume, workers, in_memory)
     target = _open_target(out, dataset, [MDN], options, overwrite, model=MDN)
     if not target.holds(MDN, asdict(mdn), seed, asdict(MDNConfig())):
         target.add(MDN, train_mdn_part(mdn, dataset, seed, options, half_precision))
@@ -178,7 +185,13 @@ def _open_dataset(data: str) -> "TerrainDataset":
 
 
 def _options(
-    out: str, config: Config, trainer: dict[str, Any] | None, resume: bool, workers: int, in_memory: bool
+    out: str,
+    config: Config,
+    device: str,
+    trainer: dict[str, Any] | None,
+    resume: bool,
+    workers: int,
+    in_memory: bool,
 ) -> "tuple[Config, FitOptions]":
     """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
     from benchnav.models.checkpoint import training_folder
@@ -189,7 +202,7 @@ def _options(
         config = replace(config, max_epochs=settings.pop("max_epochs"))
     folder = training_folder(out)
     return config, FitOptions(
-        folder=folder, resume=resume, trainer=settings, workers=workers, in_memory=in_memory
+        folder=folder, resume=resume, trainer=settings, workers=workers, in_memory=in_memory, device=device
     )
 
 

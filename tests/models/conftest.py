@@ -26,6 +26,7 @@ def checkpoint_path(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFa
         str(out),
         ClassifierConfig(max_epochs=1, batch_size=5),
         LatentGPConfig(epochs=2, epoch_steps=10),
-        trainer={"precision": "32-true", "accelerator": "cpu"},
+        device="cpu",
+        trainer={"precision": "32-true"},
     )
     return out

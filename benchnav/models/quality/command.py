@@ -4,7 +4,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,6 +28,7 @@ def evaluate(
     maps: int = 3,
     seed: int = 0,
     overwrite: bool = False,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> None:
     """Measure a model on the test splits of a dataset.
 
@@ -40,6 +41,7 @@ def evaluate(
         maps: How many maps of each split the map sheets among the figures show.
         seed: Root seed of the draws that place clipped values within their atoms.
         overwrite: Replace an evaluation that is in `out`.
+        device: Where maps are predicted and measured; auto takes CUDA where there is a GPU.
     """
     from rich.console import Console
 
@@ -56,18 +58,19 @@ def evaluate(
     for split in splits or ():
         dataset.map_count(split)  # refuses an unknown one before the slow imports
 
+    from benchnav.device import find_device
     from benchnav.models.predictor import load_model
     from benchnav.models.quality.baseline import nearest_colour_accuracy
     from benchnav.models.quality.measure import choose_splits
     from benchnav.models.quality.measure import evaluate as evaluate_model
     from benchnav.models.quality.report import quality_csv, quality_json, quality_markdown, quality_table
 
-    model = load_model(checkpoint)
+    place, model = find_device(device), load_model(checkpoint)
     chosen = choose_splits(model, dataset, splits or ())
     qualities: dict[str, Quality] = {}
 
     def steps() -> Iterator[tuple[int, int]]:
-        for split, quality in evaluate_model(model, dataset, chosen, seed):
+        for split, quality in evaluate_model(model, dataset, chosen, seed, place):
             qualities[split] = quality
             yield len(qualities), len(chosen)
 
@@ -85,6 +88,7 @@ def evaluate(
         "model": checkpoint,
         "dataset": {"id": dataset.id, "digest": dataset.digest},
         "seed": seed,
+        "device": place.type,
         "package_version": __version__,
         "nearest_colour_accuracy": by_colour,
     }

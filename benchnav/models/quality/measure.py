@@ -43,6 +43,8 @@ from benchnav.models.quality.twins import TwinQuality, TwinTally
 from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
 from benchnav.terrain import Terrain
 
+CPU = torch.device("cpu")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
@@ -161,7 +163,11 @@ def choose_splits(model: AnyModel, dataset: TerrainDataset, splits: Iterable[str
 
 
 def evaluate(
-    model: AnyModel, dataset: TerrainDataset, splits: Iterable[str] = (), seed: int = 0
+    model: AnyModel,
+    dataset: TerrainDataset,
+    splits: Iterable[str] = (),
+    seed: int = 0,
+    device: torch.device = CPU,
 ) -> Iterator[tuple[str, Quality]]:
     """Measures a model, a split at a time.
 
@@ -170,6 +176,7 @@ def evaluate(
         dataset: the maps.
         splits: which splits; every test split when empty.
         seed: root seed of the draws within atoms.
+        device: where to compute.
 
     Yields:
         Name of the split and the quality on it.
@@ -181,7 +188,8 @@ def evaluate(
     alike = twins(dataset.recipe.classes)
     for split in choose_splits(model, dataset, splits):
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
-        yield split, measure(model, dataset.terrain_chunks(split), generator, alike)
+        chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))
+        yield split, measure(model, chunks, generator, alike)
 
 
 def measure(

@@ -46,20 +46,21 @@ def fit_classifier(
     )
     model = TerrainClassifier(config, len(dataset.recipe.classes), *data.colour_statistics(), seed)
     metrics = fit_network(model, part, config, data, seed, options, half_precision, measure_classifier)
-    model.temperature = fit_temperature(*sample_logits(model, data.valid, seed))
-    return model, metrics
+    model.temperature = fit_temperature(*sample_logits(model, data.valid, seed, options.place))
+    return model.cpu(), metrics
 
 
 def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, float]:
     """Measures a classifier as training does: `valid_loss`, `valid_accuracy` and `valid_miou`.
 
     Args:
-        model: in evaluation, on the CPU.
+        model: in evaluation, on any device.
         maps: with `rgb` and `class_id`.
     """
-    loss, right, cells, miou = 0.0, 0, 0, MulticlassJaccardIndex(model.class_count, ignore_index=UNLABELLED)
+    device, loss, right, cells = next(model.parameters()).device, 0.0, 0, 0
+    miou = MulticlassJaccardIndex(model.class_count, ignore_index=UNLABELLED).to(device)
     with torch.inference_mode():
-        for indices, some in maps.chunks():
+        for indices, some in maps.chunks(device):
             logits, class_id = model(some["rgb"]), some["class_id"].long()
             loss += float(model.loss(logits, class_id)) * len(indices)
             chosen = logits.argmax(1)
@@ -87,7 +88,7 @@ def train_members(
         part = member_name(index)
         if not target.holds(part, asdict(config), seed + index, asdict(ClassifierConfig())):
             target.add(part, _train_member(config, dataset, seed + index, options, part, half_precision))
-    _calibrate_pool(target, dataset, seed)
+    _calibrate_pool(target, dataset, seed, options.place)
 
 
 def _train_member(
@@ -115,7 +116,7 @@ def _train_member(
     )
 
 
-def _calibrate_pool(target: Target, dataset: TerrainDataset, seed: int) -> None:
+def _calibrate_pool(target: Target, dataset: TerrainDataset, seed: int, device: torch.device) -> None:
     """Fits the temperature of the pool of all classifiers that are there, as they are kept."""
     there = target.checkpoint
     parts = [there.part(name) for name in member_names(there)]
@@ -126,6 +127,6 @@ def _calibrate_pool(target: Target, dataset: TerrainDataset, seed: int) -> None:
         TerrainClassifier.from_tensors(part.config, classes, as_stored(part.tensors, part.half_precision))
         for part in parts
     ]
-    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), seed)
+    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), seed, device)
     say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)

@@ -21,6 +21,7 @@ from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 from benchnav.errors import ConfigError, DatasetError
 
 TRAIN, VALID = "train", "valid"
+CPU = torch.device("cpu")
 
 _SYMMETRIES = tuple(range(8))  # of the square: four rotations, each as it is or mirrored
 _SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
@@ -58,12 +59,12 @@ class MapDataset(Dataset[Batch]):
         batch = {name: _turn(values, symmetry) for name, values in self.read(index.tolist()).items()}
         return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
 
-    def chunks(self) -> Iterator[tuple[range, Batch]]:
-        """All maps as they are, in order, some at a time, with their indices."""
+    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
+        """All maps as they are, in order, some at a time, with their indices; on a device."""
         step = max(1, CHUNK_CELLS // (self.shape[0] * self.shape[1]))
         for first in range(0, self.count, step):
             indices = range(first, min(first + step, self.count))
-            yield indices, self.read(indices)
+            yield indices, {name: values.to(device) for name, values in self.read(indices).items()}
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:

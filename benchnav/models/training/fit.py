@@ -26,6 +26,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from benchnav.device import find_device
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.files import sole_writer, write_text
 from benchnav.models.checkpoint import as_stored
@@ -34,13 +35,19 @@ from benchnav.models.training.callbacks import History, KeepBest, Progress, Whol
 from benchnav.models.training.data import MapData, MapDataset
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
-ACCELERATORS = ("auto", "cpu", "cuda", "gpu")
 
 Network = TypeVar("Network", bound=lightning.LightningModule)
 
 _OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "barebones", "fast_dev_run"}
 _OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps"}
-_OWN |= {"use_distributed_sampler", "inference_mode", "enable_autolog_hparams", "model_registry", "profiler"}
+_OWN |= {
+    "accelerator",
+    "use_distributed_sampler",
+    "inference_mode",
+    "enable_autolog_hparams",
+    "model_registry",
+    "profiler",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +61,11 @@ class FitOptions:
         trainer: settings of Lightning's trainer by name.
         in_memory: hold all maps in memory, in place of reading them as they are asked for.
         workers: processes that read maps ahead; the outcome is the same for any number.
+        device: where networks are trained, calibrated and measured: "cpu", "cuda", or "auto" for CUDA where there is
+            a GPU.
 
     Raises:
-        ConfigError: `workers` is below 0; the trainer has no such setting, or it is set here.
+        ConfigError: `workers` is below 0; there is no such device; the trainer has no such setting, or it is set here.
     """
 
     folder: Path | None = None
@@ -64,29 +73,28 @@ class FitOptions:
     trainer: Mapping[str, Any] = field(default_factory=dict)
     in_memory: bool = False
     workers: int = 0
+    device: str = "auto"
 
     def __post_init__(self) -> None:
         """Checks the settings by name."""
         if self.workers < 0:
             raise ConfigError(f"Expected `workers` ≥ 0, got {self.workers}.")
+        if "accelerator" in self.trainer:
+            raise ConfigError("Expected no `trainer.accelerator`, which is now `device`: auto, cpu or cuda.")
         known = sorted(set(inspect.signature(lightning.Trainer.__init__).parameters) - _OWN)
         unknown = sorted(set(self.trainer) - set(known))
         if unknown:
             raise ConfigError(f"Expected settings of `trainer` among {', '.join(known)}, got {unknown[0]!r}.")
-        accelerator = self.trainer.get("accelerator", "auto")
-        if accelerator not in ACCELERATORS:
-            raise ConfigError(
-                f"Expected `trainer.accelerator` among {', '.join(ACCELERATORS)}, got {accelerator!r}."
-            )
         devices, processors = self.trainer.get("devices", 1), os.cpu_count() or 1
-        if not torch.cuda.is_available() and isinstance(devices, int) and not 1 <= devices <= processors:
+        if self.place.type == "cpu" and isinstance(devices, int) and not 1 <= devices <= processors:
             raise ConfigError(
                 f"Expected `trainer.devices` in 1–{processors}, as many as there are processors, got {devices}."
             )
-        if accelerator in ("cuda", "gpu") and not torch.cuda.is_available():
-            raise ConfigError(
-                f"Expected a CUDA device for `trainer.accelerator` {accelerator}, got none. Use cpu or auto."
-            )
+
+    @property
+    def place(self) -> torch.device:
+        """The device."""
+        return find_device(self.device)
 
 
 def fit(
@@ -120,7 +128,7 @@ def fit(
     """
     folder = options.folder / part if options.folder else None
     chosen: dict[str, Any] = {"devices": 1, **trainer, **options.trainer}
-    chosen["accelerator"] = _accelerator(chosen.get("accelerator", "auto"))
+    chosen["accelerator"] = options.place.type
     chosen.setdefault("precision", default_precision(chosen["accelerator"]))
     callbacks = [*callbacks, Progress(part)]
     with _quiet():
@@ -154,7 +162,7 @@ def fit_network(
     half_precision: bool,
     measure: Callable[[Network, MapDataset], dict[str, float]],
 ) -> dict[str, float]:
-    """Trains a network in place until the split `valid` no longer gains, and leaves it on the CPU.
+    """Trains a network in place until the split `valid` no longer gains, and leaves it on the device it was trained on.
 
     Args:
         network: what to train.
@@ -179,7 +187,7 @@ def fit_network(
         {"datamodule": data},
         max_epochs=config.max_epochs,
     )
-    network.cpu().eval()
+    network.to(options.place).eval()
     if half_precision:
         network.load_state_dict(as_stored(network.state_dict(), half_precision))
         metrics = {**metrics, **measure(network, data.valid)}
@@ -260,11 +268,6 @@ def _run(
         raise CheckpointError(
             f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
         ) from error
-
-
-def _accelerator(name: str) -> str:
-    # Where it is left open: CUDA or CPU, since the Gaussian processes need float64.
-    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 
 def _trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:

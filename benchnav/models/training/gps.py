@@ -30,7 +30,7 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFA
     Args:
         config: what to train.
         sums: of the cells of all classes, from maps or from a robot's logs.
-        options: how to train; of the trainer's settings the accelerator alone counts.
+        options: how to train, of which the device alone counts.
 
     Returns:
         The GPs, on the CPU.
@@ -41,11 +41,10 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFA
         soft, share = find_soft_modes(sums)
         bins = main_bins(sums, soft, share) if soft else bins
     model = LatentGPs(config, len(sums.count), sums.steepest_deg, soft)
-    accelerator = {name: value for name, value in options.trainer.items() if name == "accelerator"}
     fit(
         model,
         GP,
-        FitOptions(trainer=accelerator),
+        FitOptions(device=options.device),
         {},
         [],
         {"train_dataloaders": load_batches(config, bins)},

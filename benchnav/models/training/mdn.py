@@ -45,19 +45,19 @@ def fit_mdn(
     scale = (torch.as_tensor(squares) / cells).sqrt().clamp(min=1).float()
     network = MixtureDensityNetwork(config, *data.colour_statistics(), scale, seed)
     metrics = fit_network(network, MDN, config, data, seed, options, half_precision, measure_network)
-    return network, metrics
+    return network.cpu(), metrics
 
 
 def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[str, float]:
     """Measures a network as training does: `valid_loss` and `valid_rmse`.
 
     Args:
-        network: in evaluation, on the CPU.
+        network: in evaluation, on any device.
         maps: with `rgb`, `slope_deg` and `traversability`.
     """
-    loss, squares, cells = 0.0, 0.0, 0
+    device, loss, squares, cells = next(network.parameters()).device, 0.0, 0.0, 0
     with torch.inference_mode():
-        for _, some in maps.chunks():
+        for _, some in maps.chunks(device):
             log_weights, means, stds = network(some["rgb"], some["slope_deg"])
             observed = some["traversability"]
             seen = observed.isfinite()

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from benchnav import rng
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import DatasetError
-from benchnav.models.training.data import MapDataset
+from benchnav.models.training.data import CPU, MapDataset
 
 _MOST_CELLS = 200_000
 _LARGEST = 20.0
@@ -40,31 +40,37 @@ def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
     return float(np.exp(minimize_scalar(loss, bounds=(-reach, reach), method="bounded").x))
 
 
-def fit_pool_temperature(members: Sequence[nn.Module], maps: MapDataset, seed: int = 0) -> float:
+def fit_pool_temperature(
+    members: Sequence[nn.Module], maps: MapDataset, seed: int = 0, device: torch.device = CPU
+) -> float:
     """Finds the temperature of the average of several classifiers' probabilities, for `probabilities.sharpen`.
 
     Args:
         members: each calibrated by itself, from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         maps: with `rgb` and `class_id`.
         seed: root seed of the cells to fit to.
+        device: where to compute, to which the classifiers are moved.
     """
-    average, class_id = torch.zeros(()), torch.zeros(0, dtype=torch.int64)
+    average, class_id = torch.zeros((), device=device), torch.zeros(0, dtype=torch.int64)
     for member in members:
-        logits, class_id = sample_logits(member, maps, seed)
+        logits, class_id = sample_logits(member, maps, seed, device)
         average = average + logits.double().softmax(1) / len(members)
     return fit_temperature(average.log(), class_id)
 
 
-def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tuple[Tensor, Tensor]:
+def sample_logits(
+    classifier: nn.Module, maps: MapDataset, seed: int = 0, device: torch.device = CPU
+) -> tuple[Tensor, Tensor]:
     """Classifies maps and keeps at most 200 000 cells, the same share of every map.
 
     Args:
         classifier: from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         maps: with `rgb` and `class_id`.
         seed: root seed of the draw.
+        device: where to compute, to which the classifier is moved.
 
     Returns:
-        Logits [N, C] and true classes [N], int64, of the cells whose class is known.
+        Logits [N, C] and true classes [N], int64, of the cells whose class is known, on that device.
 
     Raises:
         DatasetError: there is no such cell.
@@ -72,12 +78,12 @@ def sample_logits(classifier: nn.Module, maps: MapDataset, seed: int = 0) -> tup
     cells = maps.shape[0] * maps.shape[1]
     kept = min(cells, max(1, _MOST_CELLS // len(maps)))
     key = rng.stream_key(seed, "models", "temperature")
-    found = []
+    found, classifier = [], classifier.to(device)
     with torch.inference_mode():
-        for indices, some in maps.chunks():
+        for indices, some in maps.chunks(device):
             logits, class_id = classifier(some["rgb"]).float().flatten(2), some["class_id"].flatten(1).long()
             for place, which in enumerate(indices):
-                order = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0])
+                order = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0]).to(device)
                 drawn = order[class_id[place, order] != UNLABELLED][:kept]
                 found.append((logits[place][:, drawn].T.clone(), class_id[place, drawn]))
     logits, class_id = (torch.cat(parts) for parts in zip(*found, strict=True))

@@ -12,7 +12,7 @@ from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.training.classifiers import fit_classifier, measure_classifier
 from benchnav.models.training.fit import FitOptions, KeepBest
 
-CPU = FitOptions(trainer={"precision": "32-true", "accelerator": "cpu"})
+CPU = FitOptions(device="cpu", trainer={"precision": "32-true"})
 MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
 
 

@@ -37,7 +37,7 @@ from benchnav.terrain import Observation, Terrain
 from tests.factories import normal
 from tests.models.support import make_terrain
 
-CPU = {"precision": "32-true", "accelerator": "cpu"}
+EXACT = {"precision": "32-true"}
 SMALL = MDNConfig(encoder="mobilenet_v2", hidden=16, max_epochs=3, batch_size=5, jitter=0.2)
 QUICK = ["--mdn.encoder", "mobilenet_v2", "--mdn.batch_size", "5", "--trainer.precision", "32-true"]
 
@@ -329,27 +329,34 @@ class KillInTheThirdEpoch(KeepBest):
 def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, metrics = fit_mdn(SMALL, dataset, 3, FitOptions(trainer=CPU))
+    whole, metrics = fit_mdn(SMALL, dataset, 3, FitOptions(device="cpu", trainer=EXACT))
     assert set(metrics) == {"train_loss", "valid_loss", "valid_rmse", "epoch"}
     with monkeypatch.context() as patch:
         patch.setattr(fit_module, "KeepBest", KillInTheThirdEpoch)
         with pytest.raises(Killed):
-            fit_mdn(SMALL, dataset, 3, FitOptions(folder=tmp_path, trainer=CPU))
+            fit_mdn(SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, trainer=EXACT))
     torch.manual_seed(99)  # what the global generator holds must not matter
-    again, resumed = fit_mdn(SMALL, dataset, 3, FitOptions(folder=tmp_path, resume=True, trainer=CPU))
+    again, resumed = fit_mdn(
+        SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT)
+    )
     measured = ("valid_loss", "valid_rmse", "epoch")
     assert [resumed[name] for name in measured] == [metrics[name] for name in measured]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, again.state_dict()[name]), name
     with pytest.raises(CheckpointError, match="to resume it"):
         fit_mdn(
-            replace(SMALL, components=2), dataset, 3, FitOptions(folder=tmp_path, resume=True, trainer=CPU)
+            replace(SMALL, components=2),
+            dataset,
+            3,
+            FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT),
         )
 
 
 def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: TerrainDataset) -> None:
-    network, metrics = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU), True)
-    whole, before = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU))
+    network, metrics = fit_mdn(
+        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT), True
+    )
+    whole, before = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT))
     for name, value in as_stored(whole.state_dict(), True).items():
         assert torch.equal(value, network.state_dict()[name]), name
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
@@ -371,7 +378,7 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
             jitters.append(self.jitter)
 
     monkeypatch.setattr(mdn_training, "MapData", Watched)
-    network, _ = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(trainer=CPU))
+    network, _ = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT))
     assert jitters == [SMALL.jitter]
     slopes = torch.from_numpy(dataset.read("train", fields=["slope_deg"])["slope_deg"])
     torch.testing.assert_close(network.slope_scale_deg, slopes.square().mean().sqrt())

@@ -26,7 +26,7 @@ from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, default_precision, fit
 from benchnav.models.training.temperature import fit_temperature, sample_logits
 
-CPU = {"precision": "32-true", "accelerator": "cpu"}
+EXACT = {"precision": "32-true"}
 SMALL = ClassifierConfig(encoder="mobilenet_v2", max_epochs=4, batch_size=4, jitter=0.2)
 
 
@@ -47,7 +47,7 @@ class KillIn(KeepBest):
 def train(
     dataset: TerrainDataset, folder: Path, resume: bool = False, **trainer: object
 ) -> TerrainClassifier:
-    options = FitOptions(folder=folder, resume=resume, trainer={**CPU, **trainer})
+    options = FitOptions(device="cpu", folder=folder, resume=resume, trainer={**EXACT, **trainer})
     return fit_classifier(SMALL, dataset, 1, options)[0]
 
 
@@ -110,7 +110,7 @@ def test_the_best_epoch_before_a_kill_is_kept_when_it_is_resumed(tmp_path: Path)
     data = {"train_dataloaders": loader, "val_dataloaders": loader}
 
     def run(module: Counting, resume: bool, *callbacks: Callback) -> dict[str, float]:
-        options = FitOptions(folder=tmp_path, resume=resume, trainer=CPU)
+        options = FitOptions(device="cpu", folder=tmp_path, resume=resume, trainer=EXACT)
         return fit(module, "x", options, {}, [KeepBest(), *callbacks], data, max_epochs=4)
 
     with pytest.raises(Killed):
@@ -144,7 +144,7 @@ def test_settings_of_the_optimiser_reach_it(dataset: TerrainDataset) -> None:
     data = MapData(dataset, 4, 0)
     config = replace(SMALL, weight_decay=0.123, learning_rate=0.045)
     model = TerrainClassifier(config, 10, *data.colour_statistics())
-    options = FitOptions(trainer={**CPU, "limit_train_batches": 1})
+    options = FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(0.123, 0.045)]
 
@@ -168,8 +168,8 @@ def test_a_training_of_other_settings_is_not_gone_on_with(
     dataset: TerrainDataset, cut: Path, other: object
 ) -> None:
     config = replace(SMALL, **other) if isinstance(other, dict) else SMALL
-    trainer = {**CPU, "precision": "bf16-mixed"} if other == "precision" else CPU
-    options = FitOptions(folder=cut, resume=True, trainer=trainer)
+    trainer = {**EXACT, "precision": "bf16-mixed"} if other == "precision" else EXACT
+    options = FitOptions(device="cpu", folder=cut, resume=True, trainer=trainer)
     with pytest.raises(CheckpointError, match="to resume it"):
         fit_classifier(config, dataset, 2 if other == "seed" else 1, options)
 
@@ -192,14 +192,16 @@ def test_one_process_at_a_time_trains_in_a_folder(dataset: TerrainDataset, tmp_p
 def test_a_new_training_drops_what_an_old_one_left(dataset: TerrainDataset, cut: Path) -> None:
     (cut / "classifier/.last.ckpt.1.partial").write_text("half")
     before = {path.name for path in (cut / "classifier").glob("events*")}
-    fit_classifier(replace(SMALL, max_epochs=1), dataset, 1, FitOptions(folder=cut, trainer=CPU))
+    fit_classifier(
+        replace(SMALL, max_epochs=1), dataset, 1, FitOptions(device="cpu", folder=cut, trainer=EXACT)
+    )
     assert list(pd.read_csv(cut / "classifier/metrics.csv")["epoch"]) == [1]
     assert not before & {path.name for path in (cut / "classifier").glob("events*")}
     assert not list((cut / "classifier").glob(".*partial"))
 
 
 def test_nothing_to_resume_begins_anew(dataset: TerrainDataset, tmp_path: Path) -> None:
-    options = FitOptions(folder=tmp_path, resume=True, trainer=CPU)
+    options = FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT)
     fit_classifier(replace(SMALL, max_epochs=1), dataset, 1, options)
     assert list(pd.read_csv(tmp_path / "classifier/metrics.csv")["epoch"]) == [1]
 
@@ -207,7 +209,7 @@ def test_nothing_to_resume_begins_anew(dataset: TerrainDataset, tmp_path: Path) 
 @pytest.mark.parametrize("name", ["callbacks", "logger", "device"])
 def test_settings_that_the_trainer_does_not_take_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match=f"got '{name}'"):
-        FitOptions(trainer={name: 1})
+        FitOptions(device="cpu", trainer={name: 1})
 
 
 def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
@@ -217,13 +219,15 @@ def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
         def on_train_end(self, trainer, module) -> None:  # type: ignore[no-untyped-def]
             seen.append((trainer.num_training_batches, trainer.accumulate_grad_batches))
 
-    options = FitOptions(trainer={**CPU, "limit_train_batches": 1, "accumulate_grad_batches": 2})
+    options = FitOptions(
+        device="cpu", trainer={**EXACT, "limit_train_batches": 1, "accumulate_grad_batches": 2}
+    )
     data = MapData(dataset, 4, 0)
     model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
     fit(model, "x", options, {}, [KeepBest(), Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(1, 2)]
     with pytest.raises(ConfigError, match="Lightning takes"):
-        fit(model, "x", FitOptions(trainer={"precision": "8-tiny"}), {}, [], {})
+        fit(model, "x", FitOptions(device="cpu", trainer={"precision": "8-tiny"}), {}, [], {})
 
 
 def test_bfloat16_is_chosen_where_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,7 +255,7 @@ def test_the_precision_is_that_of_what_is_trained_on(
     monkeypatch.setattr(fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed")
     data = MapData(dataset, 4, 0)
     model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
-    options = FitOptions(trainer={"accelerator": "cpu", "limit_train_batches": 1})
+    options = FitOptions(device="cpu", trainer={"limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert asked == ["cpu"]
     assert seen == ["bf16-mixed"]
@@ -268,8 +272,16 @@ def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) ->
     data = MapData(dataset, 4, 0)
     for settings in ({}, {"gradient_clip_val": 1e-3}):
         model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
-        trainer = {**CPU, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
-        fit(model, "x", FitOptions(trainer=trainer), {}, [Watch()], {"datamodule": data}, max_epochs=1)
+        trainer = {**EXACT, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
+        fit(
+            model,
+            "x",
+            FitOptions(device="cpu", trainer=trainer),
+            {},
+            [Watch()],
+            {"datamodule": data},
+            max_epochs=1,
+        )
     free, clipped = norms
     assert free > 0.01
     assert clipped == pytest.approx(1e-3, rel=1e-3)
@@ -280,7 +292,7 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
 ) -> None:
     command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
     command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--seed", "1"]
-    command += ["--trainer.precision", "32-true", "--trainer.accelerator", "cpu", "--half-precision", "false"]
+    command += ["--trainer.precision", "32-true", "--device", "cpu", "--half-precision", "false"]
     settings = json.loads(json.dumps(vars(SMALL)))
     command += [f"--classifier.{name}={value}" for name, value in settings.items()]
     environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}
@@ -305,7 +317,7 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
 def test_two_processes_train_one_classifier(dataset: TerrainDataset, tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
     command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--trainer.strategy", "ddp_fork"]
-    command += ["--trainer.accelerator", "cpu", "--trainer.devices", "2", "--trainer.max_epochs", "2"]
+    command += ["--device", "cpu", "--trainer.devices", "2", "--trainer.max_epochs", "2"]
     command += ["--trainer.precision", "32-true", "--classifier.encoder", "mobilenet_v2"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert [line for line in done.stderr.splitlines() if line.startswith("classifier: epoch 2/2")]
@@ -322,7 +334,7 @@ def test_two_processes_train_one_classifier(dataset: TerrainDataset, tmp_path: P
 
 def test_no_more_processes_than_processors_are_started(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    FitOptions(trainer={"devices": os.cpu_count()})
+    FitOptions(device="cpu", trainer={"devices": os.cpu_count()})
     for devices in (0, (os.cpu_count() or 1) + 1):
         with pytest.raises(ConfigError, match=r"trainer\.devices"):
-            FitOptions(trainer={"devices": devices})
+            FitOptions(device="cpu", trainer={"devices": devices})

@@ -1,0 +1,181 @@
+"""What models are measured and calibrated on is the device that is asked for, and the numbers are the same."""
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.errors import ConfigError
+from benchnav.models import cli
+from benchnav.models.checkpoint import load_checkpoint
+from benchnav.models.config import MDNConfig
+from benchnav.models.fused import FusedModel
+from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
+from benchnav.models.predictor import Ideal, Oracle
+from benchnav.models.quality import measure as measure_module
+from benchnav.models.quality.measure import evaluate
+from benchnav.models.training import fit as fit_module
+from benchnav.models.training.classifiers import measure_classifier
+from benchnav.models.training.data import VALID, read_maps
+from benchnav.models.training.fit import FitOptions
+from benchnav.models.training.mdn import measure_network
+from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from tests.elsewhere import elsewhere, waits
+
+
+def network() -> MixtureDensityNetwork:
+    mean, std = torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30])
+    config = MDNConfig(encoder="mobilenet_v2", hidden=16)
+    return MixtureDensityNetwork(config, mean, std, torch.tensor(10.0), 0).eval()
+
+
+def pair(checkpoint_path: Path) -> FusedModel:
+    """Two members that differ."""
+    checkpoint = load_checkpoint(checkpoint_path)
+    model = FusedModel.from_checkpoint(checkpoint)
+    part = checkpoint.part("classifier")
+    other = {name: value * 1.1 if value.ndim > 1 else value for name, value in part.tensors.items()}
+    second = TerrainClassifier.from_tensors(part.config, len(checkpoint.class_names), other)
+    return FusedModel((*model.classifiers, second), model.table, model.class_names, 1.5)
+
+
+def assert_close(found: Any, expected: Any) -> None:
+    """Compares nested numbers."""
+    assert type(found) is type(expected)
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            assert_close(found[name], value)
+    elif isinstance(expected, tuple) and expected and isinstance(expected[0], dict):
+        for one, other in zip(found, expected, strict=True):
+            assert_close(one, other)
+    elif expected is not None:
+        np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["oracle", "ideal", "mdn", "pair"])
+def test_a_model_is_measured_on_another_device_as_here(
+    name: str, dataset: TerrainDataset, checkpoint_path: Path
+) -> None:
+    model: Any = {
+        "oracle": Oracle,
+        "ideal": Ideal,
+        "mdn": lambda: MixtureDensityModel(network()),
+        "pair": lambda: pair(checkpoint_path),
+    }[name]()
+    here = dict(evaluate(model, dataset))
+    with elsewhere() as device:
+        there = dict(evaluate(model, dataset, device=device))
+        assert waits, "nothing was computed there"
+    for split, quality in here.items():
+        assert_close(asdict(there[split]), asdict(quality))
+
+
+def test_temperatures_are_fitted_on_another_device_as_here(
+    dataset: TerrainDataset, checkpoint_path: Path
+) -> None:
+    maps, members = read_maps(dataset, VALID), pair(checkpoint_path).classifiers
+    here = fit_temperature(*sample_logits(members[0], maps, 3)), fit_pool_temperature(members, maps, 3)
+    with elsewhere() as device:
+        logits, class_id = sample_logits(members[0], maps, 3, device)
+        assert logits.device == class_id.device == device
+        there = fit_temperature(logits, class_id), fit_pool_temperature(members, maps, 3, device)
+        assert {value.device for member in members for value in member.parameters()} == {device}
+        for member in members:
+            member.cpu()
+    np.testing.assert_allclose(there, here, rtol=1e-6)
+
+
+def test_networks_are_measured_in_training_on_another_device_as_here(
+    dataset: TerrainDataset, checkpoint_path: Path
+) -> None:
+    classifier, mdn = pair(checkpoint_path).classifiers[0], network()
+    maps, all_maps = read_maps(dataset, VALID), read_maps(dataset, VALID, ("slope_deg", "traversability"))
+    here = measure_classifier(classifier, maps) | measure_network(mdn, all_maps)
+    with elsewhere() as device:
+        there = measure_classifier(classifier.to(device), maps) | measure_network(mdn.to(device), all_maps)
+        assert waits
+    assert_close(there, here)
+
+
+@pytest.mark.parametrize("command", ["classifier", "gp", "all", "mdn", "evaluate"])
+def test_each_command_uses_the_device_that_it_is_given(
+    command: str,
+    dataset: TerrainDataset,
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Asked for a GPU, all that is computed is asked of it; there is none, so that each ends with the first."""
+    asked: list[torch.device] = []
+
+    class Enough(Exception):
+        pass
+
+    def begin(*given: Any, **named: Any) -> Any:
+        asked.append(next(value.place for value in given if isinstance(value, FitOptions)))
+        raise Enough
+
+    def measure(model: Any, dataset: Any, splits: Any, seed: int, device: torch.device) -> Any:
+        asked.append(device)
+        raise Enough
+
+    for module in ("classifiers", "gps", "mdn"):
+        name = "fit" if module == "gps" else "fit_network"
+        monkeypatch.setattr(f"benchnav.models.training.{module}.{name}", begin)
+    monkeypatch.setattr(measure_module, "evaluate", measure)
+    cpu, cuda = ("--device", "cpu"), ("--device", "cuda")
+    for there, words, expected in (
+        (True, (), "cuda"),
+        (True, cpu, "cpu"),
+        (True, cuda, "cuda"),
+        (False, (), "cpu"),
+    ):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        out = str(tmp_path / f"{len(asked)}")
+        where = (str(checkpoint_path),) if command == "evaluate" else ("--out", out)
+        monkeypatch.setattr(
+            sys, "argv", ["benchnav-train", command, *where, "--data", str(dataset.path), *words]
+        )
+        with pytest.raises(Enough):
+            cli.main()
+        assert asked[-1].type == expected
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    sys.argv = [*sys.argv, "--device", "cuda"]
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "GPU" in capfd.readouterr().err
+    assert len(asked) == 4
+
+
+def test_the_accelerator_is_the_device_and_has_no_second_name() -> None:
+    with pytest.raises(ConfigError, match="now `device`"):
+        FitOptions(trainer={"accelerator": "cpu"})
+    assert FitOptions(device="cpu").place == torch.device("cpu")
+
+
+def test_lightning_trains_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[str] = []
+
+    class Enough(Exception):
+        pass
+
+    def begin(callbacks: Any, **settings: Any) -> Any:
+        given.append(settings["accelerator"])
+        raise Enough
+
+    monkeypatch.setattr(fit_module, "_trainer", begin)
+    monkeypatch.setattr(fit_module, "default_precision", lambda accelerator: "32-true")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for device in ("cpu", "cuda", "auto"):
+        with pytest.raises(Enough):
+            fit_module.fit(network(), "x", FitOptions(device=device), {}, [], {})
+    assert given == ["cpu", "cuda", "cuda"]
