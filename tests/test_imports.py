@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval/report": (
         *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
         "planning",
-        "models.quality.report",  # how scenarios are named that make a ladder
+        "models.quality.ladders",  # how scenarios are named that make a ladder
     ),
 }
 

@@ -145,7 +145,7 @@ def _check_targets(out: str, json: str, overwrite: bool) -> None:
 
 def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
     """Says which figures do not apply, and why."""
-    from benchnav.models.quality.report import find_ladders
+    from benchnav.models.quality.ladders import find_ladders
 
     lines = []
     if not all(quality.classes for quality in qualities.values()):
@@ -189,7 +189,7 @@ def _figures(
     from functools import partial
 
     from benchnav.models.quality import figures, map_sheet
-    from benchnav.models.quality.report import find_ladders
+    from benchnav.models.quality.ladders import find_ladders
     from benchnav.models.quality.words import sheet_name
 
     by_class = {split: item for split, quality in qualities.items() for item in quality.classes}

@@ -1,27 +1,19 @@
-"""A model's quality in words and numbers: rows of a table, Markdown, CSV and JSON.
-
-A split is a rung of a ladder of shifts where its name ends in the severity: in hundredths after a dash
-(`test/hg-050`), or as a number after an @ (`test/hg@0.5`). What stands before is the scenario; the split
-`std` of the same folder is severity 0 of each, and a split of the scenario's own name (`test/hg`) severity 1. Every
-other split stands by itself.
-"""
+"""A model's quality in words and numbers: rows of a table, Markdown, CSV and JSON."""
 
 import csv
 import io
 import json
 import math
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import PurePath
 from typing import Any
 
 from rich.table import Table
 
+from benchnav.models.quality.ladders import find_ladders
 from benchnav.models.quality.measure import Quality
 from benchnav.models.quality.words import COLUMNS, caption
-
-Ladders = dict[str, list[tuple[float, str]]]
 
 # Headings of the numbers of ClassQuality and TraversabilityQuality, in two lines.
 HEADINGS = {
@@ -51,35 +43,6 @@ _FILES_ONLY = (
     "twin_miou",
     "twin_share_error",
 )  # for which the terminal is too narrow
-
-_RUNG = re.compile(r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))")
-
-
-def find_ladders(splits: Iterable[str]) -> Ladders:
-    """Finds the ladders of shifts among splits by their names.
-
-    Args:
-        splits: names of splits.
-
-    Returns:
-        By scenario, its rungs as (severity, split), ascending, with `std` at severity 0 and the scenario itself at 1
-        where they are there; scenarios with fewer than two rungs are left out.
-    """
-    splits = list(splits)
-    ladders: Ladders = {}
-    for split in splits:
-        if named := _RUNG.fullmatch(split):
-            hundredths = named["hundredths"]
-            severity = int(hundredths) / 100 if hundredths else float(named["severity"])
-            ladders.setdefault(named["scenario"], []).append((severity, split))
-    for scenario, rungs in ladders.items():
-        folder, slash, _ = scenario.rpartition("/")
-        if f"{folder}{slash}std" in splits and all(severity > 0 for severity, _ in rungs):
-            rungs.append((0.0, f"{folder}{slash}std"))
-        if scenario in splits and all(severity != 1 for severity, _ in rungs):
-            rungs.append((1.0, scenario))
-        rungs.sort()
-    return {scenario: rungs for scenario, rungs in ladders.items() if len(rungs) > 1}
 
 
 def quality_table(title: str, qualities: Mapping[str, Quality]) -> Table:

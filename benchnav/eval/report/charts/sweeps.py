@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav.models.quality.report import find_ladders
+from benchnav.models.quality.ladders import find_ladders
 
 SEVERITY = "severity"
 LEAST_VALUES = 3
