@@ -6,6 +6,7 @@ from typing import Any
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 # Inches of two columns of a page, and points as printed.
 PAGE_WIDTH_IN = 7.2
@@ -36,7 +37,28 @@ def thin_ticks(panel: Axes, **style: Any) -> None:
     panel.spines[:].set_linewidth(0.5)
 
 
-def save(figure: Figure, path: Path, kind: str, dpi: float | str = "figure", trim: bool = False) -> None:
+def settle(figure: Figure, dpi: float) -> None:
+    """Lays a figure out for good, so that each file of it is drawn alike, and no layout is made twice.
+
+    Args:
+        figure: what was drawn, with an engine of layout.
+        dpi: dots an inch, from now on its own.
+    """
+    figure.set_dpi(dpi)
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+
+
+def trimmed(figure: Figure) -> Bbox:
+    """The part of a figure that is not its white borders, in inches, with a little space around it."""
+    return Bbox(figure.get_tightbbox()).padded(matplotlib.rcParams["savefig.pad_inches"])
+
+
+def save(
+    figure: Figure, path: Path, kind: str, dpi: float | str = "figure", part: Bbox | None = None
+) -> None:
     """Writes a figure with its fonts embedded.
 
     Args:
@@ -44,7 +66,7 @@ def save(figure: Figure, path: Path, kind: str, dpi: float | str = "figure", tri
         path: file to write.
         kind: png, pdf, svg or jpg.
         dpi: dots an inch; those of the figure where not given.
-        trim: cut away white borders.
+        part: what of it is written, in inches; all where not given.
     """
     with matplotlib.rc_context(_SAVED):
-        figure.savefig(path, format=kind, dpi=dpi, bbox_inches="tight" if trim else None)
+        figure.savefig(path, format=kind, dpi=dpi, bbox_inches=part)

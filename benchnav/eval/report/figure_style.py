@@ -78,6 +78,8 @@ def save(figure: Figure, path: Path, trim: bool = True) -> None:
         trim: cut away white borders; a figure made for a column keeps its width without.
     """
     dpi = min(_DPI, _MOST_PIXELS / figure.get_figwidth())
+    drawing.settle(figure, dpi)
+    part = drawing.trimmed(figure) if trim else None
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
-            drawing.save(figure, partial, suffix[1:], dpi, trim)
+            drawing.save(figure, partial, suffix[1:], dpi, part)
