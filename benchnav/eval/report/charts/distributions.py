@@ -1,5 +1,7 @@
 """The figure of distributions: time and λ̄ of every episode of each trial."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -25,8 +27,7 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
     names = list(_QUANTITIES)
     for place, (panel, rows) in enumerate(layout.panels):
         name = names[place % len(names)]
-        for height, row in layout.rows(rows):
-            _draw(panel, height, groups[row["trial"]], name)
+        _draw(panel, [(height, groups[row["trial"]]) for height, row in layout.rows(rows)], name)
     layout.panels[0][0].set_xlim(left=0)
     layout.panels[1][0].set_xlim(0, 1)
     handles = [
@@ -40,16 +41,22 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
     return layout.figure
 
 
-def _draw(panel: Axes, height: float, rows: pd.DataFrame, name: str) -> None:
-    values = rows[name].to_numpy(dtype=float)
-    known = ~np.isnan(values)
-    if not known.any():
+def _draw(panel: Axes, rows: Sequence[tuple[float, pd.DataFrame]], name: str) -> None:
+    """Draws a quantity of the episodes of several trials, each trial at its height; all dots at once."""
+    dots, middles = [], []
+    for height, episodes in rows:
+        values = episodes[name].to_numpy(dtype=float)
+        known = ~np.isnan(values)
+        if not known.any():
+            continue
+        shift = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, len(values))
+        colours = np.where(episodes["success"].to_numpy(dtype=bool), _SUCCESS, _FAILURE)
+        dots.append((values[known], height + shift[known], colours[known]))
+        middles.append((height, *np.percentile(values[known], (25, 50, 75))))
+    if not dots:
         return
-    shift = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, len(values))
-    colours = np.where(rows["success"].to_numpy(dtype=bool), _SUCCESS, _FAILURE)
-    panel.scatter(
-        values[known], height + shift[known], s=2.5, c=colours[known], alpha=0.35, lw=0, rasterized=True
-    )
-    low, median, high = np.percentile(values[known], (25, 50, 75))
-    panel.plot([low, high], [height, height], color="black", lw=1.2, solid_capstyle="butt")
-    panel.plot(median, height, "|", color="black", ms=6, mew=1.4)
+    across, up, colours = (np.concatenate(part) for part in zip(*dots, strict=True))
+    panel.scatter(across, up, s=2.5, c=colours, alpha=0.35, lw=0, rasterized=True)
+    heights, low, median, high = np.transpose(middles)
+    panel.plot([low, high], [heights, heights], color="black", lw=1.2, solid_capstyle="butt")
+    panel.plot(median, heights, "|", color="black", ms=6, mew=1.4)
