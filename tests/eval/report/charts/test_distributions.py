@@ -7,12 +7,20 @@ from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 
-def dots(panel: Axes) -> list[np.ndarray]:
-    return [np.sort(np.asarray(group.get_offsets())[:, 0]) for group in panel.collections]
-
-
 def medians(panel: Axes) -> list[float]:
-    return [float(np.asarray(line.get_xdata())[0]) for line in panel.lines if line.get_marker() == "|"]
+    return [float(x) for x, _ in places(panel)]
+
+
+def places(panel: Axes) -> np.ndarray:
+    """Median and height of each trial."""
+    return np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() == "|"])
+
+
+def dots(panel: Axes) -> list[np.ndarray]:
+    """Values of each trial, sorted."""
+    (group,) = panel.collections
+    values, up = np.asarray(group.get_offsets()).T
+    return [np.sort(values[np.abs(up - height) < 0.5]) for _, height in places(panel)]
 
 
 def test_every_episode_is_a_dot_under_its_quantity_and_its_trial() -> None:
