@@ -113,9 +113,10 @@ def _draw(panel: Axes, line: Shown, place: int) -> None:
     panel.imshow(
         ground.predicted[place], origin="lower", extent=extent, cmap=TRAVERSABILITY_COLOURS, vmin=0, vmax=1
     )
-    held = np.zeros((*ground.holding.shape[1:], 4))
-    held[ground.holding[place]] = [*(value / 255 for value in HOLDING), 0.75]
-    panel.imshow(held, origin="lower", extent=extent)
+    if ground.holding[place].any():
+        held = np.zeros((*ground.holding.shape[1:], 4))
+        held[ground.holding[place]] = [*(value / 255 for value in HOLDING), 0.75]
+        panel.imshow(held, origin="lower", extent=extent)
     track = line.tracks[place]
     for colour, thick in (("white", 2.4), ("black", 1.1)):
         panel.plot(*track.T, color=colour, lw=thick, solid_capstyle="round")

@@ -133,8 +133,9 @@ def _draw_predicted(panel: Axes, snapshot: Snapshot) -> None:
     panel.set_title(
         "E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner", fontsize=9
     )
-    closed = np.where(snapshot.free, np.nan, 1.0)
-    panel.imshow(closed, origin="lower", extent=extent, cmap=ListedColormap([_CLOSED]))
+    if not snapshot.free.all():
+        closed = np.where(snapshot.free, np.nan, 1.0)
+        panel.imshow(closed, origin="lower", extent=extent, cmap=ListedColormap([_CLOSED]))
 
 
 def _extent(snapshot: Snapshot) -> tuple[float, float, float, float]:
