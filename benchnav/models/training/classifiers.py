@@ -57,7 +57,7 @@ def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, 
         model: in evaluation, on any device.
         maps: with `rgb` and `class_id`.
     """
-    device, loss, right, cells = next(model.parameters()).device, 0.0, 0, 0
+    device, loss, right, cells = model.device, 0.0, 0, 0
     miou = MulticlassJaccardIndex(model.class_count, ignore_index=UNLABELLED).to(device)
     with torch.inference_mode():
         for indices, some in maps.chunks(device):

@@ -55,7 +55,7 @@ def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[st
         network: in evaluation, on any device.
         maps: with `rgb`, `slope_deg` and `traversability`.
     """
-    device, loss, squares, cells = next(network.parameters()).device, 0.0, 0.0, 0
+    device, loss, squares, cells = network.device, 0.0, 0.0, 0
     with torch.inference_mode():
         for _, some in maps.chunks(device):
             log_weights, means, stds = network(some["rgb"], some["slope_deg"])

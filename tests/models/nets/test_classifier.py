@@ -281,11 +281,11 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
         def __len__(self) -> int:
             return 2
 
-        def chunks(self) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
+        def chunks(self, device: torch.device) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
             return [([0, 1], self.some)]
 
     class Colour(torch.nn.Module):
-        class_count = 4
+        class_count, device = 4, torch.device("cpu")
 
         def __init__(self) -> None:
             super().__init__()
