@@ -113,6 +113,9 @@ class Unit:
 def units(trials: Mapping[str, tuple[Trial, Extent]], keep: Keep) -> list[Unit]:
     """Cuts trials into units of work, those that share a prediction next to one another.
 
+    Those that look at no prediction are the shortest and come last of their block: a worker's memory is measured
+    after its first unit, and one whose memory grows much thereafter is replaced, which takes long.
+
     Args:
         trials: by id, with how often each is run.
         keep: what is kept beside rows.
@@ -127,7 +130,7 @@ def units(trials: Mapping[str, tuple[Trial, Extent]], keep: Keep) -> list[Unit]:
     return sorted(
         made,
         key=lambda u: (
-            u.trial.data, u.trial.scenario, u.block, u.trial.model.part, u.seed, u.realisation,
+            u.trial.data, u.trial.scenario, u.block, u.trial.blind, u.trial.model.part, u.seed, u.realisation,
             order[u.trial.id],
         ),
     )  # fmt: skip

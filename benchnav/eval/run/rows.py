@@ -47,25 +47,22 @@ def episode_rows(
         commanded turn rate; wall times of planning as of `planning_times`; `redrawn`; `compiled`; `error`.
         What an episode that ended at once does not have is NaN.
     """
-    top_speed = problem.robot.top_speed_mps
-    rows = []
+    top_speed, rows = problem.robot.top_speed_mps, []
+    named = {"trial": unit.trial.id, **unit.trial.labels, "seed": unit.seed, "realisation": unit.realisation}
     for b, instance in enumerate(unit.instances):
         steps = int(episodes.steps[b])
         outcome = Outcome(int(episodes.outcome[b]))
-        met = episodes.traversability[b, :steps].double().cpu().numpy()
+        met = episodes.traversability[b, :steps].double().numpy()
         # Compared in the tensor's own precision, as the planners do.
         stuck = episodes.traversability[b, :steps] <= problem.task.rules.free_space.above
-        track = episodes.states[b, : steps + 1, :2].double().cpu().numpy()
-        turn = episodes.turn_rate_radps[b, :steps].double().cpu().numpy()
+        track = episodes.states[b, : steps + 1, :2].double().numpy()
+        turn = episodes.turn_rate_radps[b, :steps].double().numpy()
         success = outcome is Outcome.SUCCESS
         end_time_s = steps * problem.dt_s
         reference = float(reference_time_s[b]) / top_speed
         rows.append(
             {
-                "trial": unit.trial.id,
-                **unit.trial.labels,
-                "seed": unit.seed,
-                "realisation": unit.realisation,
+                **named,
                 "instance": instance,
                 "outcome": outcome.name.lower(),
                 "success": success,
@@ -134,10 +131,10 @@ def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
     steps = int(episodes.steps[member])
     own = 1e3 * (episodes.planning_s / episodes.planned)[:steps].numpy()
     begin_ms = 1e3 * episodes.begin_s / len(episodes.steps)
-    warm = own[1:]
+    middle, high = np.percentile(own[1:], (50, 95)) if len(own) > 1 else (np.nan, np.nan)
     return {
-        "planning_ms": float(np.median(warm)) if len(warm) else np.nan,
-        "planning_ms_p95": float(np.percentile(warm, 95)) if len(warm) else np.nan,
+        "planning_ms": float(middle),
+        "planning_ms_p95": float(high),
         "planning_start_ms": begin_ms + float(own[0]) if len(own) else np.nan,
     }
 
@@ -176,7 +173,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes, members: Sequen
         """One value a row; NaN at the last state of each episode where it has none."""
         rows = []
         for member, count in zip(members, counts, strict=True):
-            own = values[member, : count if extra else count - 1].cpu().numpy().astype(np.float32)
+            own = values[member, : count if extra else count - 1].numpy().astype(np.float32)
             rows.append(own if extra else np.append(own, np.float32(np.nan)))
         return np.concatenate(rows)
 

@@ -1,0 +1,65 @@
+"""What a unit of a suite costs beside planning and driving: 36 cells of 200 episodes, in units of 50.
+
+    benchnav-datagen create full-v1
+    python benchmarks/units.py [DATASET]
+
+The cells are the straight line and A*+DWA, on three scenarios, under six seeds; the oracle predicts, and the risk
+setting is the mean. One process runs them one after another, as a worker of `benchnav-eval run` does. Told of each
+planner: the median time of a unit, that of its overhead (reading and predicting maps, risk maps, drawing luck, tables
+and files), and the most memory that the process has held. About five minutes.
+"""
+
+import resource
+import sys
+import time
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from benchnav.eval.keep import Keep
+from benchnav.eval.run import runner
+from benchnav.eval.suite import Suite
+from benchnav.eval.trial import trials_of
+from benchnav.eval.unit import Extent, units
+
+SCENARIOS, PLANNERS, SEEDS, MAPS = ("std", "hg", "hs"), ("straight", "astar_dwa"), 6, 200
+
+
+def main() -> None:
+    data = sys.argv[1] if len(sys.argv) > 1 else "full-v1"
+    suite = Suite(data=data, model="oracle", planners=PLANNERS, risks=("mean",), scenarios=SCENARIOS)
+    extent = Extent.product(range(SEEDS), 1, MAPS)
+    trials = {trial.id: (trial, extent) for trial in trials_of(suite, lambda data: list(SCENARIOS))}
+    driving: list[float] = []
+    simulate = runner.simulate
+
+    def timed(*given: Any, **options: Any) -> Any:
+        start = time.perf_counter()
+        answer = simulate(*given, **options)
+        driving.append(time.perf_counter() - start)
+        return answer
+
+    runner.simulate = timed
+    whole: dict[str, list[float]] = {}
+    overhead: dict[str, list[float]] = {}
+    with TemporaryDirectory() as folder:
+        for unit in units(trials, Keep(record="none")):
+            start = time.perf_counter()
+            runner.run_unit(unit, Path(folder), "benchmark")
+            took, label = time.perf_counter() - start, unit.trial.labels["planner"]
+            whole.setdefault(label, []).append(took)
+            overhead.setdefault(label, []).append(took - driving[-1])
+    table = Table("planner", "units", "a unit, s", "its overhead, ms", "most memory, GiB")
+    held = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    for label, times in whole.items():
+        row = f"{median(times):.2f}", f"{1e3 * median(overhead[label]):.0f}", f"{held:.2f}"
+        table.add_row(label, str(len(times)), *row)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
