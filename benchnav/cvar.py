@@ -16,8 +16,8 @@ The last form is a maximum over v, so it is flat at the VaR: at a v that is off 
 enough, or d cannot be told since the density changes on the way, the search goes on in float64.
 
 The root is sought by Newton's method on the log odds of F, which are straighter than F, between bounds that close
-in. Where a step leaves the bounds they are halved; in float64 also at every other step after the first few, so that
-every cell gets there. On the CPU a cell that has its root leaves the search, so that none waits for the worst; on
+in. Where a step leaves the bounds they are halved; in float32 also at the last step, where it is still long, and in
+float64 at every other step after the first few, so that every cell gets there. On the CPU a cell that has its root leaves the search, so that none waits for the worst; on
 other devices all cells take all steps, so that nothing waits for the device.
 
 Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional value-at-risk".
@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_SHORT_SEARCH, _LONG_SEARCH = 6, 80  # steps in float32, and most in float64
+_SHORT_SEARCH, _LONG_SEARCH = 4, 80  # steps in float32, and most in float64
 _FREE_STEPS = 6  # of Newton's method, after which every other step halves the bounds
 _VAR_ERROR, _CVAR_ERROR = 1e-10, 1e-9  # at which a search ends
 _SHARE_ERROR = 1e-9  # of F, as a share of the tail
@@ -73,16 +73,30 @@ class Cells:
         """F of the weighted sum of `below`."""
         return total / 2 if self.deep else (total + 1) / 2
 
-    def shortfall(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def integral(self, value: Tensor | float) -> Tensor:
+        """G at values, shape [N]."""
+        return self._added_integral(*self._terms(value))
+
+    def around(self, value: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """F, its density, the standard deviation of the components that make it up there, and G; each of shape [N]."""
-        z = (value - self.means) * self.scales
-        below, density = self.below(z), (-z * z).exp() / math.sqrt(math.pi)
-        # G is the sum of w (z (1 + below) / 2 + density / 2) / scale.
-        integral = torch.addcmul(density, z, below if self.deep else below + 1) / (2 * self.scales)
-        share, slope, mass, total = (
-            added(self.weights * term) for term in (below, density * self.scales, density, integral)
+        z, below, density = self._terms(value)
+        share, slope, mass = (added(self.weights * term) for term in (below, density * self.scales, density))
+        return (
+            self.share(share),
+            slope,
+            math.sqrt(0.5) * mass / slope,
+            self._added_integral(z, below, density),
         )
-        return self.share(share), slope, math.sqrt(0.5) * mass / slope, total
+
+    def _terms(self, value: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:
+        """z, `below(z)` and exp(−z²) / √π of each component, shape [K, N]."""
+        z = (value - self.means) * self.scales
+        return z, self.below(z), (-z * z).exp() / math.sqrt(math.pi)
+
+    def _added_integral(self, z: Tensor, below: Tensor, density: Tensor) -> Tensor:
+        """G, the sum of w (z (1 + below) / 2 + density / 2) / scale, shape [N]."""
+        terms = torch.addcmul(density, z, below if self.deep else below + 1) / (2 * self.scales)
+        return added(self.weights * terms)
 
     def select(self, which: Tensor) -> "Cells":
         """Keeps some cells, by index."""
@@ -96,7 +110,7 @@ class Cells:
 
 def mean(cells: Cells) -> Tensor:
     """Computes E[λ], with its gradient in the parameters, shape [N]."""
-    return 1 - (_integral(cells, 1.0) - _integral(cells, 0.0))
+    return 1 - (cells.integral(1.0) - cells.integral(0.0))
 
 
 @torch.no_grad()
@@ -127,20 +141,15 @@ def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
         return excess.abs() < _SHARE_ERROR * tail
 
     value = _first_root(cells, tail)
-    share, density, std, shortfall = cells.shortfall(value)
+    share, density, std, integral = cells.around(value)
     with torch.no_grad():
         excess = share - tail
         off = excess / density
         is_near = ((excess * off).abs() < _CVAR_ERROR * tail) & (off.abs() < _STRAIGHT * std)
         far = ~(is_near | _at_an_end(value, excess))
         value = _replaced(value, far, lambda some, p, x: _root(some, p, x, near), cells, tail, value)
-    shortfall = _replaced(shortfall, far, lambda some, x: some.shortfall(x)[3], cells, value)
-    return (value - (shortfall - _integral(cells, 0.0)) / tail).clamp(min=0).minimum(value)
-
-
-def _integral(cells: Cells, value: float) -> Tensor:
-    """G at one value, shape [N]."""
-    return cells.shortfall(torch.full_like(cells.means[0], value))[3]
+    integral = _replaced(integral, far, Cells.integral, cells, value)
+    return (value - (integral - cells.integral(0.0)) / tail).clamp(min=0).minimum(value)
 
 
 def _may_wait(values: Tensor) -> bool:
@@ -176,7 +185,7 @@ def _first_root(cells: Cells, tail: Tensor) -> Tensor:
     low, high, slopes = torch.zeros_like(value), torch.ones_like(value), short.weights * short.scales
     for count in range(_SHORT_SEARCH):
         _, _, value, low, high = _move(
-            short, slopes, p, odds, value, low, high, halve=count % 3 == 2, settle=True
+            short, slopes, p, odds, value, low, high, halve=count == _SHORT_SEARCH - 1, settle=True
         )
     return value.to(tail)
 
