@@ -1,8 +1,9 @@
 """What models are measured and calibrated on is the device that is asked for, and the numbers are the same."""
 
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,18 +14,19 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import ConfigError
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.config import MDNConfig
+from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
+from benchnav.models.training import classifiers
 from benchnav.models.training import fit as fit_module
-from benchnav.models.training.classifiers import measure_classifier
-from benchnav.models.training.data import VALID, read_maps
+from benchnav.models.training.classifiers import fit_classifier, measure_classifier
+from benchnav.models.training.data import CPU, VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.mdn import measure_network
+from benchnav.models.training.mdn import fit_mdn, measure_network
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
 from tests.elsewhere import elsewhere, waits
 
@@ -179,3 +181,51 @@ def test_lightning_trains_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None
         with pytest.raises(Enough):
             fit_module.fit(network(), "x", FitOptions(device=device), {}, [], {})
     assert given == ["cpu", "cuda", "cuda"]
+
+
+def test_what_was_trained_is_measured_and_calibrated_where_it_was(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[torch.device] = []
+    chunks = MapDataset.chunks
+
+    def watched(maps: MapDataset, device: torch.device = CPU) -> Any:
+        read.append(device)
+        return chunks(maps, device)
+
+    monkeypatch.setattr(MapDataset, "chunks", watched)
+    monkeypatch.setattr(fit_module, "fit", lambda *given, **named: {"epoch": 1.0})
+    with elsewhere() as device:
+        monkeypatch.setattr(FitOptions, "place", device)
+        for train, config in (
+            (fit_classifier, ClassifierConfig(encoder="mobilenet_v2", batch_size=5)),
+            (fit_mdn, MDNConfig(encoder="mobilenet_v2", hidden=16, batch_size=5)),
+        ):
+            trained, _ = train(config, dataset, 0, FitOptions(device="cpu"), half_precision=True)  # type: ignore[operator]
+            assert {value.device for value in trained.parameters()} == {CPU}
+    # The classifier is measured and calibrated, the other network measured; before, colours are read on the CPU.
+    assert [place for place in read if place != CPU] == [device] * 3
+
+
+def test_a_pool_is_calibrated_on_the_device(
+    dataset: TerrainDataset, checkpoint_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = load_checkpoint(checkpoint_path)
+    part = there.part("classifier")
+    both = replace(there, parts={**there.parts, "classifier-1": part})
+    given: list[torch.device] = []
+
+    def fit_pool(members: Any, maps: Any, seed: int, device: torch.device) -> float:
+        given.append(device)
+        return 1.5
+
+    monkeypatch.setattr(classifiers, "fit_pool_temperature", fit_pool)
+    monkeypatch.setattr(classifiers, "member_names", lambda checkpoint: ("classifier", "classifier-1"))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    target = SimpleNamespace(
+        checkpoint=both, holds=lambda *words: True, set_pool_temperature=lambda value: None
+    )
+    for device in ("cpu", "cuda"):
+        options = FitOptions(device=device)
+        classifiers.train_members(target, ClassifierConfig(), dataset, 2, 0, options, True)  # type: ignore[arg-type]
+    assert [place.type for place in given] == ["cpu", "cuda"]

@@ -7,9 +7,11 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
+import torch
 
 from benchnav import cluster as dask
 from benchnav.errors import BenchnavError, ConfigError
@@ -17,9 +19,12 @@ from benchnav.eval import cli
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.folder.steps import read_steps
+from benchnav.eval.keep import Keep
+from benchnav.eval.run import cluster
 from benchnav.eval.run.cluster import check_worker
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
+from benchnav.eval.unit import units
 
 distributed = pytest.importorskip("distributed")
 
@@ -267,3 +272,22 @@ def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
         check_worker("tcp://w", fit, {**about, "planner_limit_s": 5.0})
     with pytest.raises(ConfigError, match=r"with a GPU .*tcp://w"):
         check_worker("tcp://w", fit, {**about, "device": "cuda"})
+
+
+def test_a_worker_runs_units_on_the_device_of_the_run(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = suite_on(dataset_path, tmp_path / "log", scenarios=("std",), seeds=(0,))
+    list(run_suite(suite, tmp_path / "run"))
+    run = open_run(tmp_path / "run")
+    unit = next(iter(units(run.trials, Keep())))
+    worker = SimpleNamespace(
+        address="tcp://w", local_directory=str(tmp_path), state=SimpleNamespace(nthreads=1)
+    )
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    given: list[object] = []
+    for device in ("cpu", "cuda"):
+        about = cluster._subset({**run.about, "device": device}, unit)
+        cluster._make(lambda *words: given.append(words[-1]), tmp_path, unit, "one", about)
+    assert given == ["cpu", "cuda"]

@@ -12,10 +12,17 @@ import torch
 from benchnav.device import find_device
 from benchnav.errors import ConfigError
 from benchnav.eval.keep import Keep
+from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_unit
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Unit
+from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.problem import Problem
+from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import World
+from tests import factories
 from tests.elsewhere import elsewhere, waits
 
 SMALL = {"samples": 20, "horizon": 4}
@@ -99,6 +106,38 @@ def test_nothing_waits_for_a_device_at_every_step(planner: Any, dataset_path: Pa
         assert (pd.read_parquet(path)["end_time_s"] == budget_s).all()
     # 40 steps more, and a look at every eighth.
     assert counted[1] - counted[0] <= 40 / 8 + 1
+
+
+class Late:
+    """Stands still; raises at a step when all episodes have ended and nobody has looked yet."""
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        return problem
+
+    def plan(self, step: Step, plan_state: Problem) -> Any:
+        if step.time_s > 1.15:
+            raise RuntimeError("nobody is left")
+        return torch.zeros_like(step.state[:, :2]), plan_state, Plan.empty(len(step.state), step.state.device)
+
+
+def test_steps_beyond_the_last_end_harm_nobody() -> None:
+    ground, goal = torch.full((2, 16, 16), 0.8), torch.tensor([[6.75, 6.75]] * 2)
+    problem = factories.problem(ground, time_budget_s=1.0)
+    world = World(time_budget_s=1.0)
+    with elsewhere() as device:
+        simulation = Simulation(
+            factories.terrain(ground).to(device),
+            factories.task(),
+            world,
+            factories.places(goal).to(device),
+            0,
+            range(2),
+        )
+        episodes = run_episodes(Late(), problem.to(device), simulation, torch.Generator())
+    assert episodes.steps.tolist() == [10, 10]
+    assert episodes.outcome.tolist() == [Outcome.STALLED] * 2
+    assert episodes.actions.shape[1] == 12
+    assert (episodes.errors, episodes.traceback) == (("", ""), "")
 
 
 def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
