@@ -17,8 +17,9 @@ enough, or d cannot be told since the density changes on the way, the search goe
 
 The root is sought by Newton's method on the log odds of F, which are straighter than F, between bounds that close
 in. Where a step leaves the bounds they are halved; in float32 also at the last step, where it is still long, and in
-float64 at every other step after the first few, so that every cell gets there. On the CPU a cell that has its root leaves the search, so that none waits for the worst; on
-other devices all cells take all steps, so that nothing waits for the device.
+float64 at every other step after the first few, so that every cell gets there. On the CPU a cell that has its root
+leaves the search, so that none waits for the worst; on other devices all cells take all steps, so that nothing waits
+for the device.
 
 Sources: equation (1) of the paper; Rockafellar and Uryasev (2000), "Optimization of conditional value-at-risk".
 Letters in shapes: K components, N cells.

@@ -32,6 +32,7 @@ _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 _QUADRATURE_NODES = 24
 _DEEP_TAIL = 1e-6  # under which F has to be exact to its own last bits
 _NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
+_NUMBERS_ON_A_GPU = 2**24  # where few large pieces are quicker than many small ones
 
 
 @dataclass(frozen=True)
@@ -257,7 +258,8 @@ class TraversabilityMixture:
         parameters = [values.movedim(-3, 0).flatten(1) for values in (self.weights, self.means, self.stds)]
         flat = [layer.flatten() for layer in layers]
         count, total = parameters[0].shape
-        size = max(1, _NUMBERS_AT_ONCE // count)
+        numbers = _NUMBERS_AT_ONCE if parameters[0].device.type == "cpu" else _NUMBERS_ON_A_GPU
+        size = max(1, numbers // count)
         done = []
         for start in range(0, max(1, total), size):
             piece = slice(start, start + size)

@@ -23,7 +23,9 @@ ELSEWHERE = torch.device("elsewhere", 0)
 aten = torch.ops.aten
 _COPIES = (aten._to_copy.default, aten.copy_.default)
 _TAKE_INDICES_OF_THE_CPU = (aten.index.Tensor, aten.index_put_.default)
-_WAITING = (aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default)
+_WAITING = {
+    "_local_scalar_dense", "nonzero", "masked_select", "equal", "bincount", "_unique2", "unique_consecutive",
+}  # fmt: skip
 
 waits: list[str] = []  # what a program has waited for
 
@@ -85,13 +87,18 @@ def _compute(func: Any, args: Any, kwargs: Any) -> Any:
     tensors = [value for value in tree_leaves((args, kwargs)) if isinstance(value, torch.Tensor)]
     far = [value for value in tensors if isinstance(value, Far)]
     near = [value for value in tensors if not isinstance(value, Far) and value.dim()]
-    if far and near and func not in (*_COPIES, *_TAKE_INDICES_OF_THE_CPU):
+    if func in _TAKE_INDICES_OF_THE_CPU and isinstance(args[0], Far):
+        near = [value for value in near if value.dtype not in (torch.int64, torch.bool)]
+    if far and near and func not in _COPIES:
         raise RuntimeError(f"Expected all tensors on one device, got two in {func}.")
     asked = kwargs.get("device")
     goes = bool(far) if asked is None else torch.device(asked).type == ELSEWHERE.type
-    leaves = func in _COPIES and bool(far) != goes
+    generator = kwargs.get("generator")
+    if goes and generator is not None and generator.device.type == "cpu":
+        raise RuntimeError(f"Expected a generator of the device, got one of the CPU in {func}.")
+    crosses = func in _COPIES and bool(far) != goes
     by_mask = func in _TAKE_INDICES_OF_THE_CPU and any(value.dtype == torch.bool for value in tensors[1:])
-    if (func in _WAITING or leaves or by_mask) and far:
+    if crosses or (far and (func._schema.name.removeprefix("aten::") in _WAITING or by_mask)):
         waits.append(str(func))
     result = func(*tree_map(_here, args), **tree_map(_here, kwargs))
     if func._schema.is_mutable and args and isinstance(args[0], torch.Tensor):
@@ -117,6 +124,7 @@ def _empty(size: Any, stride: Any, dtype: Any = None, **_: Any) -> Far:
 
 
 def _copy(source: torch.Tensor, target: torch.Tensor, non_blocking: bool = False) -> torch.Tensor:
+    waits.append("copy")
     _here(target).copy_(_here(source))
     return target
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from benchnav import registry
+from benchnav.device import exact_convolutions
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import (
@@ -272,7 +273,8 @@ def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
     if isinstance(model, PRIVILEGED):
         return model.predict_terrain(terrain)
     own: Any = model
-    mixture: Any = own.predict(terrain.observe())
+    with exact_convolutions():
+        mixture: Any = own.predict(terrain.observe())
     shape = (len(terrain), *terrain.grid.shape)
     if not isinstance(mixture, TraversabilityMixture) or _cell_shape(mixture.weights) != shape:
         got = (

@@ -106,7 +106,7 @@ def test_networks_are_measured_in_training_on_another_device_as_here(
     assert_close(there, here)
 
 
-@pytest.mark.parametrize("command", ["classifier", "gp", "all", "mdn", "evaluate"])
+@pytest.mark.parametrize("command", ["classifier", "gp", "gp on logs", "all", "mdn", "evaluate"])
 def test_each_command_uses_the_device_that_it_is_given(
     command: str,
     dataset: TerrainDataset,
@@ -133,6 +133,8 @@ def test_each_command_uses_the_device_that_it_is_given(
         name = "fit" if module == "gps" else "fit_network"
         monkeypatch.setattr(f"benchnav.models.training.{module}.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
+    (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)
+    data = str(tmp_path / "logs.csv") if command == "gp on logs" else str(dataset.path)
     cpu, cuda = ("--device", "cpu"), ("--device", "cuda")
     for there, words, expected in (
         (True, (), "cuda"),
@@ -144,7 +146,7 @@ def test_each_command_uses_the_device_that_it_is_given(
         out = str(tmp_path / f"{len(asked)}")
         where = (str(checkpoint_path),) if command == "evaluate" else ("--out", out)
         monkeypatch.setattr(
-            sys, "argv", ["benchnav-train", command, *where, "--data", str(dataset.path), *words]
+            sys, "argv", ["benchnav-train", command.split()[0], *where, "--data", data, *words]
         )
         with pytest.raises(Enough):
             cli.main()

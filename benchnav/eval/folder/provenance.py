@@ -40,8 +40,7 @@ def describe_code() -> dict[str, Any]:
 
 def describe_machine() -> dict[str, Any]:
     """The machine, for people."""
-    about = {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
-    return {**about, "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None}
+    return {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
 
 
 def describe_command() -> str:
@@ -107,11 +106,8 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
             changed.append(f"{name} ({earlier['code'][name]} to {now['code'][name]})")
     if earlier["planner_limit_s"] != now["planner_limit_s"]:
         changed.append(f"planner_limit_s ({earlier['planner_limit_s']:g} to {now['planner_limit_s']:g})")
-    before, after = (
-        about.get("device", "cpu") for about in (earlier, now)
-    )  # none in runs before it could be chosen
-    if before != after:
-        changed.append(f"device ({before} to {after})")
+    if _device(earlier) != _device(now):
+        changed.append(f"device ({_device(earlier)} to {_device(now)})")
     changed += [
         name for name, identity in earlier["parts"].items() if now["parts"].get(name, identity) != identity
     ]
@@ -122,6 +118,11 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
             if any(before != after for before, after in pairs):
                 changed.append(f"maps of {data} {split}")
     return changed
+
+
+def _device(about: Mapping[str, Any]) -> str:
+    """What a run is computed on; the CPU where a run of earlier versions does not say."""
+    return about.get("gpu") or about.get("device", "cpu")
 
 
 def _map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:

@@ -81,6 +81,7 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
     lines += [(f"version of {name}", str(version)) for name, version in versions.items()]
     lines.append(("processor", f"{machine.get('processor', '')} {code.get('processor', '')}".strip()))
     lines += [("cores", str(machine["cores"]))] if "cores" in machine else []
+    lines += [("device", f"{about['device']} {about.get('gpu') or ''}".strip())] if "device" in about else []
     lines += [("compiler", "yes" if code["compiles"] else "no")] if "compiles" in code else []
     for data, known in about.get("datasets", {}).items():
         maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())

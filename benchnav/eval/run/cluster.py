@@ -17,6 +17,7 @@ import joblib
 import torch
 
 from benchnav import cluster
+from benchnav.device import gpu_name
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.unit import Extent, Unit
@@ -44,6 +45,7 @@ def connected(scheduler: str, planner_limit_s: float, device: str) -> Iterator[A
             "parts": {},
             "planner_limit_s": planner_limit_s,
             "device": device,
+            "gpu": gpu_name(device),
         }
         for address, state in client.run(describe_worker, on_error="return").items():
             check_worker(address, state, own)
@@ -84,7 +86,7 @@ def describe_worker(dask_worker: Any) -> dict[str, Any]:
         "code": _code(),
         "threads": dask_worker.state.nthreads,
         "starts_processes": not multiprocessing.current_process().daemon,
-        "has_gpu": torch.cuda.is_available(),
+        "gpu": gpu_name("cuda") if torch.cuda.is_available() else None,
     }
 
 
@@ -114,13 +116,14 @@ def check_worker(address: str, state: Mapping[str, Any] | BaseException, about: 
             f"Expected workers that may start processes, which `planner_limit_s` needs, got {address}. Start them "
             "with `dask worker … --no-nanny`, or with DASK_DISTRIBUTED__WORKER__DAEMON=False."
         )
-    if about["device"] == "cuda" and not state["has_gpu"]:
+    if about["device"] == "cuda" and not state["gpu"]:
         raise ConfigError(
             f"Expected workers with a GPU for `device` cuda, got {address} without. Pass --device cpu, or start "
             "workers on machines that have one."
         )
     given = {name: about[name] for name in ("planner_limit_s", "device")}
-    now = {"datasets": {}, "parts": {}, **given, **state}
+    now = {"datasets": {}, "parts": {}, **state, **given}
+    now["gpu"] = state["gpu"] if about["device"] == "cuda" else None
     changed = provenance.differences(about, now)
     if changed:
         raise ConfigError(
@@ -171,6 +174,7 @@ def _subset(about: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
         "parts": about["parts"],
         "planner_limit_s": about["planner_limit_s"],
         "device": about["device"],
+        "gpu": about["gpu"],
         "datasets": {trial.data: {"id": dataset["id"], "maps": maps}},
     }
 

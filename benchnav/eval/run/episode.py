@@ -15,6 +15,7 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.device import GPU_FAULTS, DeviceError
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
@@ -77,6 +78,7 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
 
     Raises:
         PredictionError: the model or the risk measure failed.
+        DeviceError: the GPU failed.
         BenchnavError: the data cannot be read, or are not enough for the world.
     """
     trial = unit.trial
@@ -86,6 +88,8 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
     try:
         mixture = _predict(unit, run_id, device, simulation.field)
         risk_map = risk.apply(trial.make_risk(), mixture)
+    except GPU_FAULTS as error:
+        raise DeviceError(error) from error
     except (Exception, SystemExit) as error:
         raise PredictionError(fault(error)) from error
     problem = pose_problem(

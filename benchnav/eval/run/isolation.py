@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from benchnav.device import GPU_FAULTS, DeviceError
 from benchnav.errors import BenchnavError
 from benchnav.eval.trial import Trial
 from benchnav.planning.planners.planner import Plan, Step
@@ -85,6 +86,8 @@ class IsolatedPlanner:
             raise TimeLimitError(
                 f"The planner's process ended in `{what}` with status {self._child.exitcode}."
             ) from error
+        if kind == "lost":
+            raise DeviceError(RuntimeError(value))
         if kind == "raised":
             raised = ChildError(value.strip().splitlines()[-1])
             raised.add_note(value)
@@ -125,6 +128,8 @@ def _serve(connection: Connection, trial: Trial) -> None:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, getattr(planner, "compiled", None)
             text = pickle.dumps(("answer", answer))
+        except GPU_FAULTS as error:
+            text = pickle.dumps(("lost", str(error)))
         except (Exception, SystemExit):
             text = pickle.dumps(("raised", traceback.format_exc()))
         connection.send_bytes(text)

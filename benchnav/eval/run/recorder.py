@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchnav.device import device_of_run
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.report.playback.files import playback_path, write_playback
@@ -115,7 +116,7 @@ def find_recording(folder: Path, unit: Unit, member: int) -> Recording:
         member: which of the unit's episodes.
 
     Raises:
-        ConfigError: the run has no row of the episode.
+        ConfigError: the run has no row of the episode, or the device that it was computed on is not there.
         BenchnavError: the unit did not repeat what the run holds.
     """
     stored = playback_path(folder, unit.stem(member), ".npz")
@@ -123,9 +124,10 @@ def find_recording(folder: Path, unit: Unit, member: int) -> Recording:
         return Recording.load(stored)
     row = _row(folder, unit, unit.instances[member])
     with one_thread():
-        run_id = open_run(folder).about["run_id"]
-        problem, simulation = build(unit, run_id)
-        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id).terrain, [member])
+        about = open_run(folder).about
+        run_id, device = about["run_id"], device_of_run(about)
+        problem, simulation = build(unit, run_id, device)
+        recorder = Recorder(unit, problem, simulation, read_block(unit, run_id, device).terrain, [member])
         episodes, _ = simulate(unit, problem, simulation, recorder.watch, recorder.every)
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):

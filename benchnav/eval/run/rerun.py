@@ -14,7 +14,7 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.device import find_device
+from benchnav.device import device_of_run
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, RUN, Run, open_run, read_table
@@ -80,7 +80,7 @@ def rerun(
         trials=run.trials,
         keep=Keep(),
         planner_limit_s=run.about["planner_limit_s"],
-        device=find_device(run.about.get("device", "cpu")).type,
+        device=device_of_run(run.about).type,
     )
     with sole_writer(folder, str(folder)):
         yield from run_work(work, folder, workers, overwrite, say)

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchnav.device import GPU_FAULTS, DeviceError
 from benchnav.errors import BenchnavError
 from benchnav.eval.run.clock import Clock
 from benchnav.options import one_line
@@ -75,15 +76,14 @@ class _Log:
         self.clock = Clock(start.state.device)  # what is prepared, then each plan
         self.planned: list[int] = []
         self._reasons: list[str] = []
-        self._fault = torch.full_like(
-            start.outcome, -1
-        )  # the first reason of each episode, by its place in the list
+        # The reason of each episode, by its place in the list.
+        self._fault = torch.full_like(start.outcome, -1)
 
     def blame(self, which: Tensor, reason: str) -> None:
-        """Notes what ended some episodes, bool [B]; those that have a reason keep it."""
+        """Notes what ends some running episodes, bool [B]."""
         if reason not in self._reasons:
             self._reasons.append(reason)
-        self._fault = torch.where(which & (self._fault < 0), self._reasons.index(reason), self._fault)
+        self._fault = torch.where(which, self._reasons.index(reason), self._fault)
 
     def add(self, before: Tensor, after: SimulationState, action: Tensor, met: Tensor, free: Tensor) -> None:
         self.states.append(after.state)
@@ -139,6 +139,10 @@ def run_episodes(
 
     Returns:
         What happened.
+
+    Raises:
+        RobotError: the robot's F failed in the simulation.
+        DeviceError: the GPU failed.
     """
     now = simulation.init(problem.start)
     log = _Log(now, problem.dt_s)
@@ -169,8 +173,10 @@ def run_episodes(
             before = now.state
             now, felt, free = _move(simulation, now, action)
             log.add(before, now, action, felt, free)
-    except RobotError:
+    except (RobotError, DeviceError):
         raise
+    except GPU_FAULTS as error:
+        raise DeviceError(error) from error
     except (Exception, SystemExit) as error:
         trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
@@ -234,6 +240,8 @@ def _move(
     try:
         free = simulation.unhindered(now, action)
         return *simulation.step(now, action), free
+    except GPU_FAULTS as error:
+        raise DeviceError(error) from error
     except Exception as error:
         robot = type(simulation.robot).__name__
         raise RobotError(f"Robot {robot} failed in the simulation: {fault(error)}") from error

@@ -20,7 +20,7 @@ from typing import Any
 import joblib
 import torch
 
-from benchnav.device import find_device
+from benchnav.device import find_device, gpu_name
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.changes import changed_options
@@ -154,7 +154,7 @@ def run_work(
     if workers.scheduler:
         reached = connected(workers.scheduler, work.planner_limit_s, work.device)
     if work.device == "cuda":
-        say(f"computing on {torch.cuda.get_device_name()}")
+        say(f"computing on {gpu_name(work.device)}")
     with reached as cluster:
         if overwrite:
             _drop(folder)
@@ -225,7 +225,7 @@ def run_unit(
     if stored := unit.keep.with_steps(succeeded):
         write_steps(folder, unit, step_table(unit, problem, episodes, stored))
     about |= {"traceback": episodes.traceback, "errors": sorted({e for e in episodes.errors if e})}
-    reference = read_block(unit, run_id).places.reference_time_s.cpu().numpy()
+    reference = read_block(unit, run_id, place).places.reference_time_s.cpu().numpy()
     redrawn = (simulation.attempts - 1).tolist()
     rows = episode_rows(unit, problem, episodes, reference, redrawn, compiled)
     write_unit(folder, unit, rows, about)
@@ -299,7 +299,8 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
     if changed:
         raise ConfigError(
             f"Expected `out` to be new or a run of the same code and data, but since {folder} was begun these "
-            f"changed: {'; '.join(changed)}. Choose another `out`, or pass --overwrite."
+            f"changed: {'; '.join(changed)}. Choose another `out`{_or_its_device(earlier.about, now)}, or pass "
+            "--overwrite."
         )
     if trials != earlier.trials:
         new = len(trials) - len(earlier.trials)
@@ -308,6 +309,11 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
         write_text(folder / RUN, json.dumps(now, indent=1))
     return now, trials
+
+
+def _or_its_device(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    device = earlier.get("device", "cpu")
+    return "" if device == now["device"] else f", pass --device {device}"
 
 
 def _share(shard: Share | None) -> str:
@@ -350,6 +356,7 @@ def _about(run_id: str, work: Work, trials: Trials, commands: list[str]) -> dict
         "trials": entries,
         "planner_limit_s": work.planner_limit_s,
         "device": work.device,
+        "gpu": gpu_name(work.device),
         **provenance.describe(trials),
         "machine": provenance.describe_machine(),
         "commands": provenance.command_lines(commands),

@@ -22,6 +22,7 @@ from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import twins
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.device import exact_convolutions
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
@@ -244,12 +245,14 @@ def _predict(model: AnyModel, terrain: Terrain) -> tuple[TraversabilityMixture, 
     """The prediction, and the class probabilities of M members, shape [M, B, C, H, W], M = 0 where there are none."""
     if isinstance(model, FusedModel):
         observation = terrain.observe()
-        members = model.member_probabilities(observation)
+        with exact_convolutions():
+            members = model.member_probabilities(observation)
         return model.fuse(members, observation), members
     mixture = predict(model, terrain)
     members = torch.zeros(0)
     if isinstance(model, EnsembleModel):
-        members = model.member_probabilities(terrain.observe())
+        with exact_convolutions():
+            members = model.member_probabilities(terrain.observe())
     return mixture, members
 
 

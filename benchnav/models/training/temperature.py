@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from benchnav import rng
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.device import exact_convolutions
 from benchnav.errors import DatasetError
 from benchnav.models.training.data import CPU, MapDataset
 
@@ -79,7 +80,7 @@ def sample_logits(
     kept = min(cells, max(1, _MOST_CELLS // len(maps)))
     key = rng.stream_key(seed, "models", "temperature")
     found, classifier = [], classifier.to(device)
-    with torch.inference_mode():
+    with torch.inference_mode(), exact_convolutions():
         for indices, some in maps.chunks(device):
             logits, class_id = classifier(some["rgb"]).float().flatten(2), some["class_id"].flatten(1).long()
             for place, which in enumerate(indices):

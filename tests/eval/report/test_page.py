@@ -88,6 +88,8 @@ def test_provenance_of_a_run() -> None:
         "run_id": "r1",
         "code": {"sources": "abc", "versions": {"torch": "2.0"}, "processor": "AVX2", "compiles": False},
         "machine": {"processor": "x86_64", "cores": 2},
+        "device": "cuda",
+        "gpu": "a GPU",
         "datasets": {"paper-v1": {"id": "paper-v1", "maps": {"test/std": ["d"] * 20}}},
         "parts": {
             "model m": {"files": {"a.bin": "1f"}},
@@ -98,7 +100,8 @@ def test_provenance_of_a_run() -> None:
     }
     assert provenance_lines(about) == [
         ("run", "r1"), ("sources of benchnav", "abc"), ("version of torch", "2.0"), ("processor", "x86_64 AVX2"),
-        ("cores", "2"), ("compiler", "no"), ("dataset paper-v1", "paper-v1; maps: test/std 20"),
+        ("cores", "2"), ("device", "cuda a GPU"), ("compiler", "no"), ("dataset paper-v1", "paper-v1; maps: test/std 20"),
         ("model m", "a.bin 1f"), ("risk r.py:f", "r.py; 9e"), ("x", "y"), ("seeds", "0, 7"),
     ]  # fmt: skip
+    assert provenance_lines({"device": "cpu", "gpu": None}) == [("device", "cpu")]
     assert provenance_lines({}) == []

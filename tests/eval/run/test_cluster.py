@@ -251,10 +251,12 @@ def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
     )
     about = open_run(tmp_path / "run").about
     told = {name: about[name] for name in ("code", "parts", "datasets")}
-    fit = {**told, "threads": 1, "starts_processes": False, "has_gpu": False}
+    fit = {**told, "threads": 1, "starts_processes": False, "gpu": None}
     check_worker("tcp://w", fit, about)
     check_worker("tcp://w", {**fit, "starts_processes": True}, {**about, "planner_limit_s": 5.0})
-    check_worker("tcp://w", {**fit, "has_gpu": True}, {**about, "device": "cuda"})
+    on_gpu = {**about, "device": "cuda", "gpu": "a GPU"}
+    check_worker("tcp://w", {**fit, "gpu": "a GPU"}, on_gpu)
+    check_worker("tcp://w", {**fit, "gpu": "a GPU"}, about)
     code, (data,) = about["code"], about["datasets"]
     other_maps = {data: {"maps": {"test/std": ["0", "1"]}}}
     for state, expected in (
@@ -271,7 +273,9 @@ def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
     with pytest.raises(ConfigError, match="no-nanny"):
         check_worker("tcp://w", fit, {**about, "planner_limit_s": 5.0})
     with pytest.raises(ConfigError, match=r"with a GPU .*tcp://w"):
-        check_worker("tcp://w", fit, {**about, "device": "cuda"})
+        check_worker("tcp://w", fit, on_gpu)
+    with pytest.raises(ConfigError, match="a GPU to another"):
+        check_worker("tcp://w", {**fit, "gpu": "another"}, on_gpu)
 
 
 def test_a_worker_runs_units_on_the_device_of_the_run(
@@ -286,8 +290,10 @@ def test_a_worker_runs_units_on_the_device_of_the_run(
     )
     monkeypatch.setattr("distributed.get_worker", lambda: worker)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
     given: list[object] = []
     for device in ("cpu", "cuda"):
-        about = cluster._subset({**run.about, "device": device}, unit)
+        gpu = "a GPU" if device == "cuda" else None
+        about = cluster._subset({**run.about, "device": device, "gpu": gpu}, unit)
         cluster._make(lambda *words: given.append(words[-1]), tmp_path, unit, "one", about)
     assert given == ["cpu", "cuda"]

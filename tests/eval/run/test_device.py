@@ -1,5 +1,6 @@
 """Whatever the device, rows and recordings are the same, and nothing waits for it at every step."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,19 +10,23 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav.device import find_device
+from benchnav.device import DeviceError, find_device
 from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import open_run
 from benchnav.eval.keep import Keep
+from benchnav.eval.run import episode, recorder, runner
 from benchnav.eval.run.rollout import run_episodes
-from benchnav.eval.run.runner import run_unit
+from benchnav.eval.run.runner import run_suite, run_unit
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
-from benchnav.eval.unit import Unit
+from benchnav.eval.unit import Unit, units
+from benchnav.models.predictor import Oracle, predict
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
+from benchnav.terrain import Terrain
 from tests import factories
 from tests.elsewhere import elsewhere, waits
 
@@ -79,12 +84,21 @@ def made(folder: Path) -> dict[str, Any]:
     ],
 )
 def test_a_unit_is_the_same_on_another_device(
-    changes: dict[str, Any], dataset_path: Path, tmp_path: Path
+    changes: dict[str, Any], dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     unit = unit_of(dataset_path, **changes)
+    used: set[torch.device] = set()
+
+    def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any) -> Any:
+        used.update(value.device for value in (problem.start, problem.risk_map, simulation.steps))
+        return episode.simulate(unit, problem, simulation, *given)
+
+    monkeypatch.setattr(runner, "simulate", simulate)
     run_unit(unit, tmp_path / "here", "one")
     with elsewhere() as device:
+        used.clear()
         run_unit(unit, tmp_path / "there", "one", 0.0, device)
+        assert used <= {device}
         assert waits, "nothing was computed there"
     here, there = made(tmp_path / "here"), made(tmp_path / "there")
     assert len(here) > 10
@@ -93,11 +107,14 @@ def test_a_unit_is_the_same_on_another_device(
         np.testing.assert_array_equal(values, there[name], err_msg=name)
 
 
+@pytest.mark.parametrize("robot", ["unicycle", "differential_drive"])
 @pytest.mark.parametrize("planner", ["straight", DWA, MPPI, GUIDED], ids=str)
-def test_nothing_waits_for_a_device_at_every_step(planner: Any, dataset_path: Path, tmp_path: Path) -> None:
+def test_nothing_waits_for_a_device_at_every_step(
+    planner: Any, robot: str, dataset_path: Path, tmp_path: Path
+) -> None:
     counted = []
     for budget_s in (2.0, 6.0):  # neither is enough to arrive
-        unit = unit_of(dataset_path, planners=(planner,), time_budget_s=budget_s)
+        unit = unit_of(dataset_path, planners=(planner,), robots=(robot,), time_budget_s=budget_s)
         unit = replace(unit, keep=Keep(record="none"))
         with elsewhere() as device:
             run_unit(unit, tmp_path / f"{budget_s:g}", "one", 0.0, device)
@@ -106,6 +123,83 @@ def test_nothing_waits_for_a_device_at_every_step(planner: Any, dataset_path: Pa
         assert (pd.read_parquet(path)["end_time_s"] == budget_s).all()
     # 40 steps more, and a look at every eighth.
     assert counted[1] - counted[0] <= 40 / 8 + 1
+
+
+class Exhausted:
+    """Finds no memory left on its GPU."""
+
+    def __init__(self, at: str = "plan") -> None:
+        self.at = at
+
+    def init(self, problem: Problem, generator: torch.Generator) -> Problem:
+        if self.at == "init":
+            raise torch.OutOfMemoryError("no memory left\nwhatever else it says")
+        return problem
+
+    def plan(self, step: Step, plan_state: Problem) -> Any:
+        raise torch.OutOfMemoryError("no memory left\nwhatever else it says")
+
+
+class Large(Oracle):
+    """A model that finds no memory left."""
+
+    def predict_terrain(self, terrain: Terrain) -> Any:
+        raise torch.AcceleratorError("device-side assert")
+
+
+HERE = "tests.eval.run.test_device"
+
+
+@pytest.mark.parametrize(
+    ("changes", "limit_s", "said"),
+    [
+        ({"planners": (f"{HERE}:Exhausted",)}, 0.0, "no memory left What was"),
+        ({"planners": ({"part": f"{HERE}:Exhausted", "options": {"at": "init"}},)}, 0.0, "no memory left"),
+        ({"planners": (f"{HERE}:Exhausted",)}, 60.0, "no memory left"),
+        ({"model": f"{HERE}:Large", "planners": (DWA,)}, 0.0, "device-side assert"),
+    ],
+)
+def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
+    changes: dict[str, Any], limit_s: float, said: str, dataset_path: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(DeviceError, match=said):
+        run_unit(unit_of(dataset_path, **changes), tmp_path, "one", limit_s)
+    assert not list(tmp_path.rglob("*.parquet"))
+
+
+def test_an_episode_is_replayed_on_the_device_of_its_run(
+    dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = Suite(
+        data=str(dataset_path), model="oracle", planners=("straight",), risks=("mean",), scenarios=("std",),
+        instances=1, time_budget_s=2.0, record="none",
+    )  # fmt: skip
+    for _ in run_suite(suite, tmp_path / "run"):
+        pass
+    about = json.loads((tmp_path / "run" / "run.json").read_text())
+    (tmp_path / "run" / "run.json").write_text(json.dumps({**about, "device": "cuda"}))
+    (unit,) = units(open_run(tmp_path / "run").trials, Keep())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="GPU, on which this run was computed"):
+        recorder.find_recording(tmp_path / "run", unit, 0)
+    with elsewhere() as device:
+        monkeypatch.setattr(recorder, "device_of_run", lambda about: device)
+        assert recorder.find_recording(tmp_path / "run", unit, 0).about["instance"] == "0"
+        assert waits
+
+
+def test_a_gpu_convolves_as_the_cpu_does() -> None:
+    seen = []
+
+    class Network:
+        def predict(self, observation: Any) -> Any:
+            cudnn = torch.backends.cudnn
+            seen.append((cudnn.allow_tf32, cudnn.deterministic, cudnn.benchmark))
+            raise RuntimeError("enough")
+
+    with pytest.raises(RuntimeError, match="enough"):
+        predict(Network(), factories.terrain(torch.full((1, 8, 8), 0.5)))
+    assert seen == [(False, True, False)]
 
 
 class Late:

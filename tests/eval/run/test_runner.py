@@ -304,12 +304,16 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     finish(suite, tmp_path / "cuda", device="auto")
     assert set(given) == {"cuda"}
     assert open_run(tmp_path / "cuda").about["device"] == "cuda"
-    assert open_run(tmp_path / "cuda").about["machine"]["gpu"] == "a GPU"
+    assert open_run(tmp_path / "cuda").about["gpu"] == "a GPU"
     given.clear()
-    with pytest.raises(ConfigError, match=r"device \(cuda to cpu\)"):
+    with pytest.raises(ConfigError, match=r"device \(a GPU to cpu\).*--device cuda"):
         finish(suite, tmp_path / "cuda", device="cpu")
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another")
+    with pytest.raises(ConfigError, match=r"device \(a GPU to another\)"):
+        finish(suite, tmp_path / "cuda", device="cuda")
     finish(suite, tmp_path / "cpu", device="cpu")
     assert set(given) == {"cpu"}
+    assert open_run(tmp_path / "cpu").about["gpu"] is None
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU"):
         finish(suite, tmp_path / "none", device="cuda")

@@ -121,8 +121,11 @@ class DWA:
         problem, velocity = plan_state.problem, action
         limits = action_limits(problem.robot)
         if limits is not None:
-            reach = action.new_tensor([rate * problem.dt_s for rate in limits])
-            velocity = plan_state.velocity + (action - plan_state.velocity).clamp(-reach, reach)
+            changes = (action - plan_state.velocity).unbind(dim=1)
+            reached = [
+                c.clamp(-r * problem.dt_s, r * problem.dt_s) for c, r in zip(changes, limits, strict=True)
+            ]
+            velocity = plan_state.velocity + torch.stack(reached, dim=1)
         return DWAState(problem, velocity)
 
     def select(self, plan_state: DWAState, members: Tensor) -> DWAState:
