@@ -41,7 +41,7 @@ def evaluate(
         maps: How many maps of each split the map sheets among the figures show.
         seed: Root seed of the draws that place clipped values within their atoms.
         overwrite: Replace an evaluation that is in `out`.
-        device: Where maps are predicted and measured; auto takes CUDA where there is a GPU.
+        device: Where the model is measured; auto takes CUDA where there is a GPU. Figures are made on the CPU.
     """
     from rich.console import Console
 

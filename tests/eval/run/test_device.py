@@ -76,11 +76,11 @@ def made(folder: Path) -> dict[str, Any]:
         {"planners": (faulty("give up"),)},
         {"planners": (faulty("raise"),)},
         {"world": {"noise": "frozen", "immobile": {"below": 0.2, "for_s": 3}}},
-        {"world": {"noise": "stored"}, "model": "ideal"},
-        {"world": {"noise": "frozen"}, "model": "clairvoyant"},
-        {"risks": ("expected-time",)},
-        {"risks": ("var:0.9",)},
-        {"model": "tests.eval.parts:Broken"},
+        {"planners": (DWA,), "world": {"noise": "stored"}, "model": "ideal"},
+        {"planners": (DWA,), "world": {"noise": "frozen"}, "model": "clairvoyant"},
+        {"planners": (DWA,), "risks": ("expected-time",)},
+        {"planners": (DWA,), "risks": ("var:0.9",)},
+        {"planners": (DWA,), "model": "tests.eval.parts:Broken"},
     ],
 )
 def test_a_unit_is_the_same_on_another_device(
