@@ -100,7 +100,8 @@ def test_provenance_of_a_run() -> None:
     }
     assert provenance_lines(about) == [
         ("run", "r1"), ("sources of benchnav", "abc"), ("version of torch", "2.0"), ("processor", "x86_64 AVX2"),
-        ("cores", "2"), ("device", "cuda a GPU"), ("compiler", "no"), ("dataset paper-v1", "paper-v1; maps: test/std 20"),
+        ("cores", "2"), ("device", "cuda a GPU"), ("compiler", "no"),
+        ("dataset paper-v1", "paper-v1; maps: test/std 20"),
         ("model m", "a.bin 1f"), ("risk r.py:f", "r.py; 9e"), ("x", "y"), ("seeds", "0, 7"),
     ]  # fmt: skip
     assert provenance_lines({"device": "cpu", "gpu": None}) == [("device", "cpu")]
