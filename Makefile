@@ -52,8 +52,9 @@ bench: $(STAMP)
 	$(BIN)/python benchmarks/datasets.py
 	$(BIN)/python benchmarks/gps.py
 	$(BIN)/python benchmarks/training.py
-	$(BIN)/python benchmarks/engine.py
+	$(BIN)/python benchmarks/engine.py bench.json
 	$(BIN)/python benchmarks/rollouts.py
+	$(BIN)/python benchmarks/risk_parts.py
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
