@@ -70,3 +70,18 @@ def test_a_shard_is_read_as_it_is_written() -> None:
     for text in ("2", "0/5", "6/5", "1/0", "-1/5", "a/b", "2/5/7", "1.5/2"):
         with pytest.raises(ConfigError, match="shard"):
             read_share(text)
+
+
+def test_units_that_predict_nothing_come_last_of_their_block() -> None:
+    suite = Suite(model="oracle", planners=("straight", "astar_dwa"), risks=("mean", "var"))
+    extent = Extent.product(seeds=(0, 1), realisations=1, instances=100)
+    made = units(
+        {trial.id: (trial, extent) for trial in trials_of(suite, lambda data: ["std", "hg"])}, Keep()
+    )
+    by_block: dict[tuple[str, int], list[bool]] = {}
+    for unit in made:
+        by_block.setdefault((unit.trial.scenario, unit.block), []).append(unit.trial.blind)
+    # Two risk settings and one blind trial, each under two seeds.
+    assert by_block == {(s, b): [False] * 4 + [True] * 2 for s in ("std", "hg") for b in (0, 1)}
+    # What is of one block stands together.
+    assert [*dict.fromkeys((unit.trial.scenario, unit.block) for unit in made)] == list(by_block)
