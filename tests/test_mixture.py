@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from benchnav import mixture
-from benchnav.cvar import Cells
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
 
@@ -343,23 +341,3 @@ def test_rows_at_a_time_change_no_bit(shape: tuple[int, ...], monkeypatch: pytes
         monkeypatch.setattr("benchnav.mixture._NUMBERS_AT_ONCE", numbers)
         for found, wanted in zip((mixture.cvar(0.7), mixture.var(0.6), mixture.mean()), whole, strict=True):
             assert torch.equal(found, wanted)
-
-
-def test_a_gpu_takes_all_cells_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.elsewhere import elsewhere  # which old versions of PyTorch skip
-
-    made, pieces, search = random_mixture(cells=40), [], mixture.value_at_risk
-
-    def counted(cells: Cells, tail: torch.Tensor) -> torch.Tensor:
-        pieces.append(len(tail))
-        return search(cells, tail)
-
-    monkeypatch.setattr(mixture, "_NUMBERS_AT_ONCE", 32)
-    monkeypatch.setattr(mixture, "value_at_risk", counted)
-    here = made.var(0.9)
-    assert len(pieces) > 1
-    pieces.clear()
-    with elsewhere() as device:
-        there = made.to(device).var(0.9).cpu()
-    assert pieces == [here.numel()]
-    assert torch.allclose(here, there, rtol=0, atol=1e-9)

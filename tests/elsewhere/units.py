@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 import torch
 
+from benchnav import mixture
+from benchnav.cvar import Cells
 from benchnav.device import DeviceError, find_device
 from benchnav.errors import ConfigError
 from benchnav.eval.folder.folder import open_run
@@ -28,7 +30,8 @@ from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
 from benchnav.terrain import Terrain
 from tests import factories
-from tests.elsewhere import elsewhere, waits
+from tests.elsewhere.device import elsewhere, waits
+from tests.test_mixture import random_mixture
 
 SMALL = {"samples": 20, "horizon": 4}
 DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon": 4}}}
@@ -147,7 +150,7 @@ class Large(Oracle):
         raise torch.AcceleratorError("device-side assert")
 
 
-HERE = "tests.eval.run.test_device"
+HERE = "tests.elsewhere.units"
 
 
 @pytest.mark.parametrize(
@@ -244,3 +247,21 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert find_device("auto") == find_device("cuda") == torch.device("cuda")
     assert find_device("cpu") == torch.device("cpu")
+
+
+def test_a_gpu_takes_all_cells_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, pieces, search = random_mixture(cells=40), [], mixture.value_at_risk
+
+    def counted(cells: Cells, tail: torch.Tensor) -> torch.Tensor:
+        pieces.append(len(tail))
+        return search(cells, tail)
+
+    monkeypatch.setattr(mixture, "_NUMBERS_AT_ONCE", 32)
+    monkeypatch.setattr(mixture, "value_at_risk", counted)
+    here = made.var(0.9)
+    assert len(pieces) > 1
+    pieces.clear()
+    with elsewhere() as device:
+        there = made.to(device).var(0.9).cpu()
+    assert pieces == [here.numel()]
+    assert torch.allclose(here, there, rtol=0, atol=1e-9)

@@ -28,7 +28,11 @@ from benchnav.models.training.data import CPU, VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.mdn import fit_mdn, measure_network
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
-from tests.elsewhere import elsewhere, waits
+from tests.elsewhere.device import elsewhere, waits
+from tests.models.conftest import checkpoint_path as _checkpoint_path
+from tests.models.conftest import dataset as _dataset
+
+checkpoint_path, dataset = _checkpoint_path, _dataset  # fixtures
 
 
 def network() -> MixtureDensityNetwork:

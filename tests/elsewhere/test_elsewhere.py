@@ -1,0 +1,22 @@
+"""Cases on another device, in processes of their own.
+
+Once PyTorch has a device that is not there (`device`), the GPUs that other tests pretend to have no longer work.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.parametrize("cases", ["units", "models"])
+def test_cases_on_another_device(cases: str) -> None:
+    here = Path(__file__).parent
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(here / f"{cases}.py")]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    done = subprocess.run(command, cwd=here.parents[1], env=environment, capture_output=True, text=True)
+    if done.returncode == pytest.ExitCode.NO_TESTS_COLLECTED:
+        pytest.skip("this PyTorch cannot be given a device in Python")
+    assert done.returncode == 0, done.stdout
