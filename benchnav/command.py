@@ -11,13 +11,15 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from benchnav.arguments import Known, explain, know, spell
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.options import hint
 
 INTERRUPTED = 130
+
+Device = Literal["auto", "cpu", "cuda"]  # of the flag --device; see `benchnav.device`
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ import torch
 
 from benchnav.errors import BenchnavError, ConfigError
 
+CPU = torch.device("cpu")
+
 # What PyTorch raises where a GPU, and not the code that it runs, has failed.
 GPU_FAULTS = (torch.OutOfMemoryError, torch.AcceleratorError)
 
@@ -15,13 +17,13 @@ GPU_FAULTS = (torch.OutOfMemoryError, torch.AcceleratorError)
 class DeviceError(BenchnavError):
     """A GPU failed; nothing that was computed there is to be believed."""
 
-    def __init__(self, error: BaseException) -> None:
-        """Tells in one line what PyTorch said."""
-        said = str(error).strip().splitlines()[0]
-        super().__init__(
-            f"The GPU failed: {said} What was finished is kept: give the same command again, if need be with fewer "
-            "`jobs`."
-        )
+
+def gpu_failed(said: object) -> DeviceError:
+    """Tells in one line that a GPU failed, and what PyTorch said of it."""
+    line = str(said).strip().splitlines()[0]
+    return DeviceError(
+        f"The GPU failed: {line} What was finished is kept: give the same command again, if need be with fewer `jobs`."
+    )
 
 
 def find_device(name: str) -> torch.device:

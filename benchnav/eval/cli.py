@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from benchnav.command import INTERRUPTED, Command, run, tell
+from benchnav.command import INTERRUPTED, Command, Device, run, tell
 from benchnav.eval.replay import program, replay
 from benchnav.eval.suite import RENAMED, Suite
 
@@ -26,7 +26,7 @@ def run_command(
     shard: str = "",
     backend: Literal["local", "dask"] = "local",
     scheduler: str = "",
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: Device = "auto",
 ) -> int:
     """Run a suite into a folder, going on with or extending the run that is there.
 

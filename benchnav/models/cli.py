@@ -3,9 +3,9 @@
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from benchnav.command import INTERRUPTED, Command, run
+from benchnav.command import INTERRUPTED, Command, Device, run
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig
 from benchnav.models.quality.command import evaluate
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
-Device = Literal["auto", "cpu", "cuda"]
 Config = TypeVar("Config", ClassifierConfig, MDNConfig)
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.device import CPU
 from benchnav.errors import ConfigError
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
@@ -24,7 +25,7 @@ from benchnav.models.quality.measure import evaluate
 from benchnav.models.training import classifiers
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training.classifiers import fit_classifier, measure_classifier
-from benchnav.models.training.data import CPU, VALID, MapDataset, read_maps
+from benchnav.models.training.data import VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.mdn import fit_mdn, measure_network
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits

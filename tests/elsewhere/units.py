@@ -1,6 +1,7 @@
 """Whatever the device, rows and recordings are the same, and nothing waits for it at every step."""
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 
 from benchnav import mixture
 from benchnav.cvar import Cells
-from benchnav.device import DeviceError, find_device
+from benchnav.device import DeviceError, find_device, gpu_failed
 from benchnav.errors import ConfigError
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.keep import Keep
@@ -168,6 +169,12 @@ def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
     with pytest.raises(DeviceError, match=said):
         run_unit(unit_of(dataset_path, **changes), tmp_path, "one", limit_s)
     assert not list(tmp_path.rglob("*.parquet"))
+
+
+def test_what_a_gpu_said_comes_back_from_a_worker_as_it_is() -> None:
+    failed = gpu_failed(torch.OutOfMemoryError("no memory left.\nwhatever else it says"))
+    assert str(failed).startswith("The GPU failed: no memory left. What was")
+    assert str(pickle.loads(pickle.dumps(failed))) == str(failed)
 
 
 def test_an_episode_is_replayed_on_the_device_of_its_run(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.device import GPU_FAULTS, DeviceError
+from benchnav.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
@@ -29,8 +29,6 @@ from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
 from benchnav.terrain import Terrain
-
-CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +87,7 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
         mixture = _predict(unit, run_id, device, simulation.field)
         risk_map = risk.apply(trial.make_risk(), mixture)
     except GPU_FAULTS as error:
-        raise DeviceError(error) from error
+        raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
         raise PredictionError(fault(error)) from error
     problem = pose_problem(

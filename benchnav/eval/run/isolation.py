@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from benchnav.device import GPU_FAULTS, DeviceError
+from benchnav.device import GPU_FAULTS, gpu_failed
 from benchnav.errors import BenchnavError
 from benchnav.eval.trial import Trial
 from benchnav.planning.planners.planner import Plan, Step
@@ -87,7 +87,7 @@ class IsolatedPlanner:
                 f"The planner's process ended in `{what}` with status {self._child.exitcode}."
             ) from error
         if kind == "lost":
-            raise DeviceError(RuntimeError(value))
+            raise gpu_failed(value)
         if kind == "raised":
             raised = ChildError(value.strip().splitlines()[-1])
             raised.add_note(value)

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.device import GPU_FAULTS, DeviceError
+from benchnav.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.errors import BenchnavError
 from benchnav.eval.run.clock import Clock
 from benchnav.options import one_line
@@ -176,7 +176,7 @@ def run_episodes(
     except (RobotError, DeviceError):
         raise
     except GPU_FAULTS as error:
-        raise DeviceError(error) from error
+        raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
         trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
@@ -241,7 +241,7 @@ def _move(
         free = simulation.unhindered(now, action)
         return *simulation.step(now, action), free
     except GPU_FAULTS as error:
-        raise DeviceError(error) from error
+        raise gpu_failed(error) from error
     except Exception as error:
         robot = type(simulation.robot).__name__
         raise RobotError(f"Robot {robot} failed in the simulation: {fault(error)}") from error

@@ -22,7 +22,7 @@ from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import twins
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.device import exact_convolutions
+from benchnav.device import CPU, exact_convolutions
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
@@ -43,8 +43,6 @@ from benchnav.models.quality.scores import (
 from benchnav.models.quality.twins import TwinQuality, TwinTally
 from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
 from benchnav.terrain import Terrain
-
-CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,10 @@ from torchvision.transforms.v2 import functional as photometry
 
 from benchnav import rng
 from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
+from benchnav.device import CPU
 from benchnav.errors import ConfigError, DatasetError
 
 TRAIN, VALID = "train", "valid"
-CPU = torch.device("cpu")
 
 _SYMMETRIES = tuple(range(8))  # of the square: four rotations, each as it is or mirrored
 _SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are

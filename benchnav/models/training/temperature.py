@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from benchnav import rng
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.device import exact_convolutions
+from benchnav.device import CPU, exact_convolutions
 from benchnav.errors import DatasetError
-from benchnav.models.training.data import CPU, MapDataset
+from benchnav.models.training.data import MapDataset
 
 _MOST_CELLS = 200_000
 _LARGEST = 20.0
