@@ -160,4 +160,4 @@ def choose_objective(setup: Setup) -> Objective:
     """J of a setup."""
     if setup.objective == "theirs":
         return TimeAndDistance(setup.distance_power)
-    return registry.make("objective", setup.objective, robot=ROVER)
+    return registry.make("objective", setup.objective, robot=ROVER, goal_radius_m=GOAL_RADIUS_M)

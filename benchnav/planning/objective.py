@@ -2,8 +2,8 @@
 
 An objective is any object with `stage` and `terminal`. `target` is the goal, or a local planner's
 way-point; traversability is read at the state before the move. Ground that is not free is no concern of
-J: the `Problem` adds its price. An objective whose constructor has a parameter `robot` is given the
-task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading dimensions, S state and A action
+J: the `Problem` adds its price. An objective whose constructor has a parameter `robot` or `goal_radius_m` is
+given the task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading dimensions, S state and A action
 dimensions.
 """
 
@@ -57,25 +57,25 @@ class TravelTime:
 
     Args:
         robot: gives time step and top speed.
-        arrival_m: a state this near to the target has arrived.
+        goal_radius_m: a state this near to the target has arrived.
     """
 
     robot: Robot
-    arrival_m: float = 0.5
+    goal_radius_m: float
 
     def __post_init__(self) -> None:
         """Refuses a distance at which nothing arrives."""
-        if not self.arrival_m > 0:
-            raise ConfigError(f"Expected `arrival_m` > 0, got {self.arrival_m}.")
+        if not self.goal_radius_m > 0:
+            raise ConfigError(f"Expected `goal_radius_m` > 0, got {self.goal_radius_m}.")
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step; see `Objective`."""
         away = distance(state, target)
-        return self.robot.dt_s * (away > self.arrival_m).to(away.dtype)
+        return self.robot.dt_s * (away > self.goal_radius_m).to(away.dtype)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
-        return (distance(state, target) - self.arrival_m).clamp(min=0) / self.robot.top_speed_mps
+        return (distance(state, target) - self.goal_radius_m).clamp(min=0) / self.robot.top_speed_mps
 
 
 def distance(state: Tensor, target: Tensor) -> Tensor:
