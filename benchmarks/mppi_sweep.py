@@ -59,7 +59,9 @@ def on_open_ground(planner: Planner[object], objective: str, seed: int) -> float
 def on_maps(options: dict[str, object], objective: str, scenario: str, seed: int, maps: int) -> float:
     """Mean time on shipped maps over both risk settings."""
     planner = {"part": "mppi", "options": options}
-    suite = Suite(data="paper-v1-test", planners=(planner,), risks=("mean", "cvar:0.9"), objectives=(objective,))
+    suite = Suite(
+        data="paper-v1-test", planners=(planner,), risks=("mean", "cvar:0.9"), objectives=(objective,)
+    )
     times = []
     for trial in trials_of(suite, lambda data: [scenario]):
         unit = Unit(trial=trial, seed=seed, realisation=0, instances=tuple(range(maps)))

@@ -14,7 +14,7 @@ from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda
 
-SMALL = MPPIConfig(samples=256, horizon=20)
+SMALL = MPPIConfig(samples=256, horizon_s=2)
 
 
 def test_rollout_cost_equals_a_loop_over_samples() -> None:
@@ -85,7 +85,7 @@ def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
     robot = Unicycle(speed_mps=(-9, 9), turn_rate_radps=(-9, 9))
     ground = torch.full((1, 99, 99), 0.5)
     problem = factories.problem(ground, (24, 24), (30, 30), robot, Free())
-    config = MPPIConfig(horizon=2, samples=200_000, temperature=0.7)
+    config = MPPIConfig(horizon_s=0.2, samples=200_000, temperature=0.7)
     mean = torch.tensor([[[0.4, -0.3], [-0.2, 0.5]]])
     for share in (1.0, 0.5):
         planner = MPPI(replace(config, control_cost=share * 0.7))
@@ -100,7 +100,7 @@ def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
 
 def test_noise_has_the_scale_that_is_set_and_is_another_for_each_seed() -> None:
     problem = factories.problem(torch.full((3, 16, 16), 0.8))
-    planner = MPPI(MPPIConfig(horizon=30, noise=(0.2, 0.7)))
+    planner = MPPI(MPPIConfig(horizon_s=3, noise=(0.2, 0.7)))
     state = planner.init(problem, generator())
     noise = state.noise.at(0)
     assert noise.shape == (30, 2, 5000)
@@ -140,7 +140,7 @@ def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
 
 def test_it_drives_at_the_target_that_it_is_given() -> None:
     problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(7.0, 4.0))
-    planner = MPPI(replace(SMALL, samples=1900, horizon=40, temperature=0.1))
+    planner = MPPI(replace(SMALL, samples=1900, horizon_s=4, temperature=0.1))
     state = planner.init(problem, generator())
     aside = torch.tensor([[4.0, 7.0]])
     turns = [
@@ -155,7 +155,7 @@ def test_it_drives_at_the_target_that_it_is_given() -> None:
 @pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
 def test_it_drives_robots_of_two_actions(robot) -> None:  # type: ignore[no-untyped-def]
     problem = factories.problem(torch.full((2, 16, 16), 0.85), robot=robot)
-    driven = drive(MPPI(replace(SMALL, horizon=30)), problem, time_budget_s=25)
+    driven = drive(MPPI(replace(SMALL, horizon_s=3)), problem, time_budget_s=25)
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
 
 

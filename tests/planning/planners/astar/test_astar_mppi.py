@@ -13,7 +13,7 @@ from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, first, generator
 
-SMALL = MPPIConfig(samples=256, horizon=30)
+SMALL = MPPIConfig(samples=256, horizon_s=3)
 
 
 def trap(robot: Unicycle | Bicycle) -> Problem:
