@@ -7,7 +7,7 @@ given the task's. Source: paper III-C and IV-A. Letters in shapes: *B any leadin
 dimensions.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -15,6 +15,8 @@ from torch import Tensor
 
 from benchnav.errors import ConfigError
 from benchnav.planning.robots import Robot
+
+_WAYPOINT_M = 0.2  # a robot this near to a way-point has reached it
 
 
 class Objective(Protocol):
@@ -76,6 +78,16 @@ class TravelTime:
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
         return (distance(state, target) - self.goal_radius_m).clamp(min=0) / self.robot.top_speed_mps
+
+
+def toward_waypoints(objective: Objective) -> Objective:
+    """J of a local planner: a way-point is reached at the point itself, not within the goal's radius of it.
+
+    Else a way-point that is nearer than that radius, as in narrow places, would draw no robot.
+    """
+    if not isinstance(objective, TravelTime):
+        return objective
+    return replace(objective, goal_radius_m=min(objective.goal_radius_m, _WAYPOINT_M))
 
 
 def distance(state: Tensor, target: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.planning.objective import toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
@@ -115,11 +116,12 @@ class Guided(Generic[Local]):
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
         by_time = self.guide.by_time
+        task = replace(problem.task, objective=toward_waypoints(problem.objective))
         return GuidedState(
             problem=problem,
             field=astar.search(problem, by_time),
             ground=ground_costs(problem, by_time),
-            local=self.local.init(problem, generator),
+            local=self.local.init(replace(problem, task=task), generator),
             recovery=Recovery.none(problem.start),
         )
 
