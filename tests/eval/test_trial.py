@@ -24,6 +24,12 @@ def one(**changes: object) -> Trial:
     return trial
 
 
+def test_travel_time_ends_where_the_tasks_goal_begins() -> None:
+    for changes, radius_m in (({}, 1.0), ({"task": {"goal_radius_m": 0.3}}, 0.3)):
+        task = one(objectives=("travel_time",), **changes).make_task()
+        assert (task.objective.goal_radius_m, task.rules.goal_radius_m) == (radius_m, radius_m)
+
+
 def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
     trial = one()
     assert one().id == trial.id

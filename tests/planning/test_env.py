@@ -177,12 +177,11 @@ def test_an_objectives_reward_is_minus_its_stage_cost(dataset_path: Path) -> Non
 
 
 def test_an_objective_is_taken_by_name_with_options_and_the_robot(dataset_path: Path) -> None:
-    far = {"part": "travel_time", "options": {"arrival_m": 500.0}}
     slow = {"part": "unicycle", "options": {"dt_s": 0.5}}
     near = make(dataset_path, objective="travel_time", robot=slow)
     near.reset(seed=0)
     assert near.step(AHEAD)[1] == pytest.approx(-0.5)
-    arrived = make(dataset_path, objective=far, robot=slow)
+    arrived = make(dataset_path, objective="travel_time", robot=slow, goal_radius_m=500.0)
     arrived.reset(seed=0)
     assert arrived.step(AHEAD)[1] == 0
     made = make(dataset_path, objective=TravelTime(Unicycle(dt_s=0.25), 1.0))
