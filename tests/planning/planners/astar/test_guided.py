@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.planning.objective import TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
 from benchnav.planning.planners.astar.waypoint import choose_waypoint, ground_costs
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
-from benchnav.planning.robots import Bicycle
+from benchnav.planning.robots import Bicycle, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, step_at, with_start
@@ -38,6 +39,21 @@ class Constant:
 
     def took(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
         return (*plan_state, action)
+
+
+def test_under_travel_time_a_way_point_within_the_goals_radius_still_draws_the_local_planner() -> None:
+    seen: list[Problem] = []
+
+    class Noting(Constant):
+        def init(self, problem: Problem, generator: torch.Generator) -> tuple[Tensor, ...]:
+            seen.append(problem)
+            return ()
+
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), objective=TravelTime(Unicycle(), 1.0))
+    Guided(GuideConfig(), Noting((0.0, 0.0))).init(problem, generator())
+    near = torch.tensor([[2.0, 2.0, 0.0]])
+    cost = seen[0].objective.stage(near, torch.zeros(1, 2), torch.ones(1), torch.tensor([[2.5, 2.0]]))
+    assert cost.item() == pytest.approx(0.1)
 
 
 # --- With the recovery.
