@@ -1,12 +1,14 @@
 """Objectives J: what a planner minimises.
 
-An objective is any object with `stage` and `terminal`. `target` is the goal, or a local planner's
+An objective is any object with `stage` and `terminal`; with `path_cost` it also tells what a metre of a
+path costs, which planners that search paths minimise. `target` is the goal, or a local planner's
 way-point; traversability is read at the state before the move. Ground that is not free is no concern of
 J: the `Problem` adds its price. An objective whose constructor has a parameter `robot` is given the
 task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading dimensions, S state and A action
 dimensions.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,9 +18,18 @@ from torch import Tensor
 from benchnav.errors import ConfigError
 from benchnav.planning.robots import Robot
 
+# Cost of a metre of path from λ̂ and grade, see `Objective`.
+PathCost = Callable[[Tensor, Tensor], Tensor]
+
 
 class Objective(Protocol):
-    """The contract of a cost J, summed over a trajectory. Shapes broadcast over *B."""
+    """The contract of a cost J, summed over a trajectory. Shapes broadcast over *B.
+
+    It may also have `path_cost(traversability, grade)`: what a horizontal metre of a path costs, from the λ̂
+    that motion is planned with, and from the grade, the rise of that metre, negative downhill; each of
+    shape [*B], as the cost, which is finite and above 0. A path's cost is the sum over its pieces. An
+    objective without it has that of `path_length`.
+    """
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step.
@@ -50,6 +61,10 @@ class GoalDistance:
         """Cost of the last state; see `Objective`."""
         return distance(state, target)
 
+    def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
+        """Metres in 3D, which the paper's A* minimises; see `Objective`. Source: paper IV-A1."""
+        return path_length(traversability, grade)
+
 
 @dataclass(frozen=True)
 class TravelTime:
@@ -76,6 +91,20 @@ class TravelTime:
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
         return (distance(state, target) - self.arrival_m).clamp(min=0) / self.robot.top_speed_mps
+
+    def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
+        """Seconds at top speed under λ̂; see `Objective`. Grade costs nothing: robots drive in the plane."""
+        return 1 / (traversability * self.robot.top_speed_mps)
+
+
+def path_cost_of(objective: Objective) -> PathCost:
+    """What a metre of path costs under an objective: its `path_cost`, else `path_length`."""
+    return getattr(objective, "path_cost", path_length)
+
+
+def path_length(traversability: Tensor, grade: Tensor) -> Tensor:
+    """Length in 3D of a horizontal metre, from grades [*B], shape [*B]; λ̂ changes nothing."""
+    return torch.sqrt(1 + grade * grade)
 
 
 def distance(state: Tensor, target: Tensor) -> Tensor:
