@@ -55,11 +55,14 @@ def test_it_is_given_the_way_points_that_dwa_is_given(monkeypatch: pytest.Monkey
 
 
 def test_its_settings_are_its_own_and_those_of_mppi() -> None:
-    part = {"part": "astar_mppi", "options": {"by_time": True, "mppi": {"samples": 300, "noise": [0.4, 0.3]}}}
+    part = {
+        "part": "astar_mppi",
+        "options": {"lookahead_m": 3, "mppi": {"samples": 300, "noise": [0.4, 0.3]}},
+    }
     made = registry.make("planner", part)
-    assert made.config == AStarMPPIConfig(by_time=True, mppi=MPPIConfig(samples=300, noise=(0.4, 0.3)))
+    assert made.config == AStarMPPIConfig(lookahead_m=3.0, mppi=MPPIConfig(samples=300, noise=(0.4, 0.3)))
     assert made.local.config.samples == 300
-    assert made.follows == "travel time (A*), J (MPPI)"
+    assert made.follows == "path cost of J (A*), J (MPPI)"
     with pytest.raises(ConfigError, match="lookahead_m"):
         registry.make("planner", {"part": "astar_mppi", "options": {"lookahead_m": 0.0}})
 
