@@ -23,7 +23,7 @@ from benchnav.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem, stage_cost, with_tensors
+from benchnav.planning.problem import Problem, motion_traversability, stage_cost, with_tensors
 from benchnav.planning.robots import Robot, action_limits, component_wise
 
 # A chunk of the horizon compiles in seconds.
@@ -207,7 +207,7 @@ def judge(
     for first in range(0, steps, _CHUNK_STEPS):
         states, cost, under_way = advance(
             states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
-            problem.objective, config.arrival_m, min(_CHUNK_STEPS, steps - first),
+            problem.objective, problem.task.rules.slowest, config.arrival_m, min(_CHUNK_STEPS, steps - first),
         )  # fmt: skip
     terminal = problem.terminal_cost(states, target)
     weight = config.heading_weight * standing_cost(problem, state, target_m, steps)
@@ -227,20 +227,20 @@ def standing_cost(problem: Problem, state: Tensor, target_m: Tensor, steps: int)
         Its size, for a J may be negative, shape [B].
     """
     standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
-    traversability = problem.traversability_at(state)
+    traversability = problem.ground_at(state).abs()
     stage = problem.objective.stage(state, standing, traversability, target_m)
     return (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
 
 
 def hold(
     states: Tensor, cost: Tensor, under_way: Tensor, pairs: Tensor, padded_ground: Tensor, target: Tensor,
-    grid: Grid, robot: Robot, objective: Objective, arrival_m: float, steps: int,
+    grid: Grid, robot: Robot, objective: Objective, slowest: float, arrival_m: float, steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Holds each pair for some steps, adding up costs of those under way; takes a problem in its parts."""
     for _ in range(steps):
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, pairs, ground, target) * under_way
-        states = robot(states, pairs, ground.abs())
+        states = robot(states, pairs, motion_traversability(ground, slowest))
         offset = states[..., :2] - target
         under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
     return component_wise(states), cost, under_way
