@@ -70,7 +70,8 @@ __all__ = [
 
 KINDS = ("planner", "model", "risk", "robot", "objective")
 
-_GIVEN = ("robot",)  # parameters that the program gives, so no options
+# Parameters that the program gives, so no options.
+_GIVEN: Mapping[str, tuple[str, ...]] = {"objective": ("robot", "goal_radius_m")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +197,7 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     Args:
         kind: one of `KINDS`.
         part: which, in any form that `read_part` reads.
-        given: what the part is made for, such as `robot`; passed on where a parameter bears the name.
+        given: what the part is made for, such as an objective's `robot`; passed on where a parameter bears the name.
 
     Returns:
         The object; of a risk measure a function of the mixture alone.
@@ -209,7 +210,7 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     target = find(kind, part.part).target
     complete(kind, part)
     arguments = _typed_options(kind, part, target)
-    config = config_class(target, _GIVEN)
+    config = config_class(target, _GIVEN.get(kind, ()))
     if config:
         arguments = {"config": call(f"options of {owner}", config, arguments)}
     arguments |= {name: value for name, value in given.items() if name in parameters(target)}
@@ -248,9 +249,10 @@ def find(kind: str, source: str) -> Found:
 def options_of(kind: str, target: Any) -> dict[str, Option]:
     """Lists the options of a class or function, in order, by name.
 
-    Parameters that are given by the caller (`robot`, and a risk measure's mixture) are none.
+    Parameters that are given by the caller (an objective's `robot` and `goal_radius_m`, a risk measure's mixture)
+    are none.
     """
-    skipped: tuple[str, ...] = _GIVEN
+    skipped = _GIVEN.get(kind, ())
     if kind == "risk" and not inspect.isclass(target):
         skipped += tuple(parameters(target))[:1]
     return list_options(target, skipped)
@@ -290,7 +292,7 @@ def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
 
 def _typed_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
     owner, known = f"{kind} {part.part!r}", options_of(kind, target)
-    refuse_unknown(owner, part.options, known, gone=gone_options(target, _GIVEN))
+    refuse_unknown(owner, part.options, known, gone=gone_options(target, _GIVEN.get(kind, ())))
     return {name: typed(owner, name, known[name], value) for name, value in part.options.items()}
 
 

@@ -64,8 +64,9 @@ class EnvBatch:
         """Loads the maps of the split."""
         self._world = world if isinstance(world, World) else read_world(world)[0]
         made: Any = _part("robot", robot)
-        self._objective: Any = _part("objective", objective, robot=made) if objective else None
         rules = Rules(goal_radius_m=goal_radius_m)
+        made_for = {"robot": made, "goal_radius_m": goal_radius_m}
+        self._objective: Any = _part("objective", objective, **made_for) if objective else None
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
         dataset = TerrainDataset(find_dataset(data))
         split = split or _default_split(dataset)

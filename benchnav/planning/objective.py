@@ -5,12 +5,12 @@ path costs, which planners that search paths minimise. `target` is the goal, or 
 traversability is read at the state before the move, as the risk setting gives it: the least λ̂ that motion
 is given does not bound it. In the Gymnasium environment J is given the λ that the robot met.
 Ground that is not free is no concern of J: the `Problem` adds its penalty. An objective whose constructor
-has a parameter `robot` is given the task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading
-dimensions, S state and A action dimensions.
+has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper III-C and IV-A. Letters in
+shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -21,6 +21,8 @@ from benchnav.planning.robots import Robot
 
 # Cost of a metre of path from λ̂ and grade, see `Objective`.
 PathCost = Callable[[Tensor, Tensor], Tensor]
+
+_WAYPOINT_M = 0.2  # a robot this near to a way-point has reached it
 
 
 class Objective(Protocol):
@@ -73,29 +75,39 @@ class TravelTime:
 
     Args:
         robot: gives time step and top speed.
-        arrival_m: a state this near to the target has arrived.
+        goal_radius_m: a state this near to the target has arrived.
     """
 
     robot: Robot
-    arrival_m: float = 0.5
+    goal_radius_m: float
 
     def __post_init__(self) -> None:
         """Refuses a distance at which nothing arrives."""
-        if not self.arrival_m > 0:
-            raise ConfigError(f"Expected `arrival_m` > 0, got {self.arrival_m}.")
+        if not self.goal_radius_m > 0:
+            raise ConfigError(f"Expected `goal_radius_m` > 0, got {self.goal_radius_m}.")
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step; see `Objective`."""
         away = distance(state, target)
-        return self.robot.dt_s * (away > self.arrival_m).to(away.dtype)
+        return self.robot.dt_s * (away > self.goal_radius_m).to(away.dtype)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
-        return (distance(state, target) - self.arrival_m).clamp(min=0) / self.robot.top_speed_mps
+        return (distance(state, target) - self.goal_radius_m).clamp(min=0) / self.robot.top_speed_mps
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
         """Seconds at top speed under λ̂; see `Objective`. Grade costs nothing: robots drive in the plane."""
         return 1 / (traversability * self.robot.top_speed_mps)
+
+
+def toward_waypoints(objective: Objective) -> Objective:
+    """J of a local planner: a way-point is reached at the point itself, not within the goal's radius of it.
+
+    Else a way-point that is nearer than that radius, as in narrow places, would draw no robot.
+    """
+    if not isinstance(objective, TravelTime):
+        return objective
+    return replace(objective, goal_radius_m=min(objective.goal_radius_m, _WAYPOINT_M))
 
 
 def path_cost_of(objective: Objective) -> PathCost:

@@ -34,7 +34,7 @@ from tests import factories
 from tests.elsewhere.device import elsewhere, waits
 from tests.test_mixture import random_mixture
 
-SMALL = {"samples": 20, "horizon": 4}
+SMALL = {"samples": 20, "horizon_s": 0.4}
 DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon": 4}}}
 CL_RRT = {"part": "cl_rrt", "options": {"expansions": 50, "edge_time_s": 3.0}}
 MPPI = {"part": "mppi", "options": SMALL}

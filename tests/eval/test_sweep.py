@@ -61,14 +61,14 @@ def test_mappings_are_expanded_at_any_depth() -> None:
 
 def test_a_suite_sweeps_levels_planners_worlds_and_tasks() -> None:
     found = trials(
-        planners=[{"part": "mppi", "options": {"horizon": [10, 20]}}],
+        planners=[{"part": "mppi", "options": {"horizon_s": [1.0, 2.0]}}],
         risks=["mean", {"part": "cvar", "options": {"level": [0.5, 0.9]}}],
         world={"preset": "stakes", "correlation_m": [1.0, 2.0]},
         task={"slowest": [0.05, 0.1]},
     )
     assert len(found) == 2 * 3 * 2 * 2
     values = {
-        (t.planner.options["horizon"], t.risk.label, t.world.correlation_m, t.rules.slowest) for t in found
+        (t.planner.options["horizon_s"], t.risk.label, t.world.correlation_m, t.rules.slowest) for t in found
     }
     assert len(values) == len(found)
     assert {t.world_label for t in found} == {

@@ -185,7 +185,7 @@ def test_an_objective_is_taken_by_name_with_options_and_the_robot(dataset_path: 
     arrived = make(dataset_path, objective=far, robot=slow)
     arrived.reset(seed=0)
     assert arrived.step(AHEAD)[1] == 0
-    made = make(dataset_path, objective=TravelTime(Unicycle(dt_s=0.25)))
+    made = make(dataset_path, objective=TravelTime(Unicycle(dt_s=0.25), 1.0))
     made.reset(seed=0)
     assert made.step(AHEAD)[1] == pytest.approx(-0.25)
 

@@ -96,7 +96,7 @@ def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path:
     place = run(dataset_path, tmp_path / "run", planners=PLANNERS[:1], risks=("mean",), seeds=(0,))
     run(
         dataset_path, place, risks=("mean",), seeds=(0,), robots=("bicycle",),
-        planners=({"part": "mppi", "options": {"samples": 4, "horizon": 3}},),
+        planners=({"part": "mppi", "options": {"samples": 4, "horizon_s": 0.3}},),
     )  # fmt: skip
     steps = pd.read_parquet(place / "steps")
     assert {"speed_mps", "turn_rate_radps", "steering_rad"} <= set(steps.columns)

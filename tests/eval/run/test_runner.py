@@ -32,7 +32,7 @@ from benchnav.eval.unit import Unit
 from tests import factories
 from tests.eval.report.playback.rrd import read_path
 
-BUDGETS = {"mppi": {"samples": 64, "horizon": 20}, "cl_rrt": {"expansions": 50}}
+BUDGETS = {"mppi": {"samples": 64, "horizon_s": 2.0}, "cl_rrt": {"expansions": 50}}
 PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")
 KEYS = ["scenario", "planner", "risk", "seed", "realisation", "instance"]
 # What a wall clock says is no result.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.objective import path_cost_of, path_length
+from benchnav.planning.objective import path_cost_of, path_length, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
@@ -118,11 +118,12 @@ class Guided(Generic[Local]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
+        task = replace(problem.task, objective=toward_waypoints(problem.objective))
         return GuidedState(
             problem=problem,
             field=astar.search(problem),
             ground=ground_costs(problem),
-            local=self.local.init(problem, generator),
+            local=self.local.init(replace(problem, task=task), generator),
             recovery=Recovery.none(problem.start),
         )
 

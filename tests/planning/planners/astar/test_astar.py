@@ -20,7 +20,7 @@ def random_problem(seed: int, robot: Unicycle, by_time: bool = False) -> Problem
     generator = torch.Generator().manual_seed(seed)
     maps = 0.15 + torch.rand(3, 16, 12, generator=generator)
     elevation = 2 * torch.rand(3, 16, 12, generator=generator)
-    objective = TravelTime(robot) if by_time else GoalDistance()
+    objective = TravelTime(robot, 1.0) if by_time else GoalDistance()
     return factories.problem(maps.clamp(max=1), (1.25, 1.25), (4.25, 6.75), robot, objective, None, elevation)
 
 
@@ -68,7 +68,7 @@ def test_time_cost_prefers_the_quick_way_round() -> None:
     slow = torch.full((1, 16, 20), 1.0)
     slow[0, 6:14, 5:11] = 0.31
     crossing = []
-    for objective in (GoalDistance(), TravelTime(Unicycle())):
+    for objective in (GoalDistance(), TravelTime(Unicycle(), 1.0)):
         problem = factories.problem(slow, start=(1.25, 4.0), goal=(6.75, 4.0), objective=objective)
         cells = astar.path_cells(astar.search(problem), torch.tensor([8 * 20 + 2]), 40)[0]
         crossing.append(bool((problem.traversability[0].flatten()[cells] < 0.5).any()))

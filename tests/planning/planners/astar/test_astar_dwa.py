@@ -36,7 +36,7 @@ def longest_stand_s(driven: Drive) -> float:
 
 @pytest.mark.parametrize(
     ("robot", "objective"),
-    [(Unicycle(), GoalDistance()), (DifferentialDrive(), TravelTime(DifferentialDrive()))],
+    [(Unicycle(), GoalDistance()), (DifferentialDrive(), TravelTime(DifferentialDrive(), 1.0))],
 )
 def test_it_finds_the_gap_in_a_wall(robot: Unicycle, objective: Objective) -> None:
     ground = torch.full((2, 24, 30), 0.85)
@@ -60,7 +60,7 @@ def cornered(objective: Objective) -> Problem:
     return factories.problem(ground, start=(2.0, 4.0), goal=(11.5, 4.2), objective=objective)
 
 
-@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle())])
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
 def test_it_does_not_stand_beside_a_corner(objective: Objective) -> None:
     driven = drive(AStarDWA(), cornered(objective))
     assert driven.outcome.tolist() == [SUCCESS] * 4
@@ -91,13 +91,16 @@ def test_it_leaves_ground_that_is_predicted_to_hold_it() -> None:
     assert driven.steps.max() < 350
 
 
-def test_it_drives_across_where_no_way_is_free() -> None:
-    ground = torch.full((2, 16, 20), 0.85)
-    ground[0, 7:9] = 0.2
-    ground[1, 9:, 12:] = 0.2
-    problem = factories.problem(ground, goal=(8.5, 6.5))
-    driven = drive(AStarDWA(), problem)
-    assert driven.outcome.tolist() == [SUCCESS] * 2
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
+def test_it_drives_across_where_no_way_is_free(objective: Objective) -> None:
+    # A wall of 1.5 m across the map, either way, and a goal in a closed corner.
+    ground = torch.full((3, 16, 20), 0.85)
+    ground[0, 7:10] = 0.1
+    ground[1, :, 9:12] = 0.1
+    ground[2, 9:, 12:] = 0.2
+    problem = factories.problem(ground, goal=(8.5, 6.5), objective=objective)
+    driven = drive(AStarDWA(), problem, ground.clamp(min=0.4))
+    assert driven.outcome.tolist() == [SUCCESS] * 3
 
 
 def test_a_robot_turned_away_turns_round() -> None:
@@ -176,7 +179,7 @@ class Bare:
 def test_it_tells_where_no_risk_setting_moves_its_path(by: str) -> None:
     rules = Rules(free_space=FreeSpace(by=by))
     for objective, moves in (
-        (GoalDistance(), False), (TravelTime(Unicycle()), True), (Own(0.0), False), (Own(0.5), True)
+        (GoalDistance(), False), (TravelTime(Unicycle(), 1.0), True), (Own(0.0), False), (Own(0.5), True)
     ):  # fmt: skip
         remarks = AStarDWA().remarks(factories.task(objective=objective, rules=rules))
         if moves or by == "risk":

@@ -215,7 +215,7 @@ class Scaled:
         return self.scale * self.other.terminal(*given)
 
 
-@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle())])
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
 def test_the_heading_weighs_alike_in_whatever_unit_an_objective_counts(objective: Objective) -> None:
     ground = torch.full((3, 16, 16), 0.8)
     target = torch.tensor([[6.0, 5.0], [2.0, 6.0], [7.0, 7.0]])

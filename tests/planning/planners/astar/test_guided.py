@@ -147,7 +147,7 @@ def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
     for config, objective in (
         (GuideConfig(), GoalDistance()),
         (GuideConfig(lookahead_m=2.0), GoalDistance()),
-        (GuideConfig(), TravelTime(Unicycle())),
+        (GuideConfig(), TravelTime(Unicycle(), 1.0)),
     ):
         problem = factories.problem(slow, (1.75, 3.25), (10.25, 3.25), objective=objective)
         local = Constant((0.5, 0.0))
@@ -178,7 +178,7 @@ def test_it_says_whose_objectives_it_follows() -> None:
         GuideConfig(lookahead_m=0)
 
 
-@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Bicycle())])
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Bicycle(), 1.0)])
 def test_no_tensor_is_made_on_another_device_but_by_the_search(
     monkeypatch: pytest.MonkeyPatch, objective: Objective
 ) -> None:

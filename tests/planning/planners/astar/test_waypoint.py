@@ -24,7 +24,7 @@ def problem(seed: int = 0, by_time: bool = False) -> Problem:
     maps = 0.1 + torch.rand(3, *GRID.shape, generator=generator(seed))
     elevation = torch.rand(3, *GRID.shape, generator=generator(seed + 1))
     robot = Unicycle(speed_mps=(0, 1.5))
-    objective = TravelTime(robot) if by_time else GoalDistance()
+    objective = TravelTime(robot, 1.0) if by_time else GoalDistance()
     return factories.problem(maps.clamp(max=1), (1.25, 1.25), (5.25, 3.25), robot, objective, None, elevation)
 
 
@@ -230,7 +230,7 @@ def test_by_time_no_line_cuts_through_slow_ground() -> None:
     slow[0, 3:9, 5:8] = 0.31
     ends: Any = {"start": (1.75, 3.25), "goal": (6.25, 3.25)}
     by_length = factories.problem(slow, **ends)
-    by_time = factories.problem(slow, **ends, objective=TravelTime(Unicycle()))
+    by_time = factories.problem(slow, **ends, objective=TravelTime(Unicycle(), 1.0))
     points = astar.path_points(by_time, astar.search(by_time), by_time.start, 20)
     farthest = [choose_waypoint(ground_costs(given), points, 8.0)[0] for given in (by_length, by_time)]
     torch.testing.assert_close(farthest[0], by_length.goal_m)
