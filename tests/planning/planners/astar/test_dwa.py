@@ -110,7 +110,8 @@ def test_it_speeds_up_toward_a_far_waypoint_and_turns_to_one_aside() -> None:
     assert velocity[0].tolist() == [1.0, 0.0]
     assert velocity[1, 1] > 0.3
     # One with limits does what it can.
-    limited = replace(problem, task=replace(problem.task, robot=DifferentialDrive()))
+    ground = torch.full((2, 16, 16), 0.8)
+    limited = factories.problem(ground, start=(2.0, 2.0), goal=(6.0, 6.0), robot=DifferentialDrive())
     velocity = chosen(limited, limited.start, torch.tensor([[0.5, 0.0]] * 2), waypoint)
     assert velocity[0].tolist() == pytest.approx([0.55, 0.0], abs=1e-6)
     assert velocity[1, 1] > 0.04
@@ -122,8 +123,9 @@ def test_it_brakes_before_a_wall() -> None:
     problem = factories.problem(walled, start=(3.4, 4.0), goal=(7.0, 4.0))
     # The arc ends before the wall, which is 0.6 m away: at λ̂ 0.9, 0.13 m/s are held for five seconds.
     assert 0 < chosen(problem, problem.start, torch.tensor([[0.3, 0.0]]), problem.goal_m)[0, 0] < 0.134
-    limited = replace(problem, task=replace(problem.task, robot=DifferentialDrive()))
-    assert chosen(limited, limited.start, torch.tensor([[0.3, 0.0]]), limited.goal_m)[0, 0] < 0.26
+    limited = factories.problem(walled, start=(3.4, 4.0), goal=(7.0, 4.0), robot=DifferentialDrive())
+    start = limited.start + torch.tensor([[0.0, 0.0, 0.0, 0.3, 0.0]])
+    assert chosen(limited, start, torch.tensor([[0.3, 0.0]]), limited.goal_m)[0, 0] < 0.26
 
 
 def test_it_drives_out_of_ground_predicted_to_hold_it() -> None:
@@ -137,11 +139,16 @@ def test_a_robot_that_spins_stops_spinning() -> None:
     problem = factories.problem(ground, start=(4.0, 4.0), goal=(4.0, 7.0), robot=robot)
     state, velocity = problem.start.clone(), torch.tensor([[0.0, -1.0]])
     state[0, 4] = -1.0
-    for _ in range(80):
+    for _ in range(120):
         velocity = chosen(problem, state, velocity, problem.goal_m)
         state = problem.robot(state, velocity, problem.traversability_at(state))
-    assert abs(velocity[0, 1]) < 0.6
-    assert torch.linalg.vector_norm(state[0, :2] - problem.goal_m[0]) < 3.0
+        if torch.linalg.vector_norm(state[0, :2] - problem.goal_m[0]) < 1:
+            break
+    else:
+        pytest.fail("it did not arrive")
+    # It has turned back, and not gone round.
+    assert velocity[0, 1] > 0
+    assert abs(state[0, 2] - problem.start[0, 2]) < math.pi
 
 
 def test_it_turns_on_the_spot_toward_a_waypoint_behind_on_either_side() -> None:
