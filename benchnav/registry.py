@@ -32,6 +32,7 @@ from benchnav.options import (
     call,
     config_class,
     from_text,
+    gone_options,
     hint,
     list_options,
     one_line,
@@ -174,8 +175,8 @@ def complete(kind: str, part: Part) -> Part:
         ConfigError: there is no such part or option, or a value is of another type.
     """
     owner = f"{kind} {part.part!r}"
-    known = options_of(kind, find(kind, part.part).target)
-    given = _typed_options(kind, part, known)
+    target = find(kind, part.part).target
+    known, given = options_of(kind, target), _typed_options(kind, part, target)
     options = {}
     for name, option in known.items():
         value = given.get(name, option.default)
@@ -208,7 +209,7 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     owner = f"{kind} {part.part!r}"
     target = find(kind, part.part).target
     complete(kind, part)
-    arguments = _typed_options(kind, part, options_of(kind, target))
+    arguments = _typed_options(kind, part, target)
     config = config_class(target, _GIVEN.get(kind, ()))
     if config:
         arguments = {"config": call(f"options of {owner}", config, arguments)}
@@ -289,9 +290,9 @@ def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
     return next(iter(known.items()))
 
 
-def _typed_options(kind: str, part: Part, known: Mapping[str, Option]) -> dict[str, Any]:
-    owner = f"{kind} {part.part!r}"
-    refuse_unknown(owner, part.options, known)
+def _typed_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
+    owner, known = f"{kind} {part.part!r}", options_of(kind, target)
+    refuse_unknown(owner, part.options, known, gone=gone_options(target, _GIVEN.get(kind, ())))
     return {name: typed(owner, name, known[name], value) for name, value in part.options.items()}
 
 

@@ -28,15 +28,15 @@ def test_several_lists_are_a_product_with_labels_of_their_own() -> None:
     given = {
         "part": "astar_dwa",
         "label": "dwa",
-        "options": {"by_time": [False, True], "dwa": {"horizon": [20, 50], "speeds": 5}},
+        "options": {"lookahead_m": [2.0, 4.0], "dwa": {"horizon_s": [2.0, 5.0], "speeds": 5}},
     }
     assert parts("planner", given) == [
         (
-            f"dwa by_time={by_time} dwa.horizon={horizon}",
-            {"by_time": by_time, "dwa": {"horizon": horizon, "speeds": 5}},
+            f"dwa lookahead_m={lookahead} dwa.horizon_s={horizon}",
+            {"lookahead_m": lookahead, "dwa": {"horizon_s": horizon, "speeds": 5}},
         )
-        for by_time in (False, True)
-        for horizon in (20, 50)
+        for lookahead in (2.0, 4.0)
+        for horizon in (2.0, 5.0)
     ]
 
 

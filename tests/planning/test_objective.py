@@ -3,7 +3,7 @@ import torch
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.planning.objective import GoalDistance, TravelTime, distance, toward_waypoints
+from benchnav.planning.objective import GoalDistance, TravelTime, distance, path_cost_of, toward_waypoints
 from benchnav.planning.robots import Bicycle, Unicycle
 
 STATE = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [0.0, 0.5, 2.0]])
@@ -65,6 +65,16 @@ def test_a_way_point_nearer_than_the_goals_radius_is_still_to_be_reached() -> No
     assert toward_waypoints(TravelTime(Unicycle(), 0.1)) == TravelTime(Unicycle(), 0.1)
     paper = GoalDistance()
     assert toward_waypoints(paper) is paper
+
+
+def test_a_metre_of_path_costs_its_time_or_its_length() -> None:
+    ground, grade = torch.tensor([1.0, 0.5, 0.05]), torch.tensor([0.0, 0.75, -0.75])
+    robot = Unicycle(speed_mps=(0.0, 2.0))
+    seconds, metres = [0.5, 1.0, 10.0], [1.0, 1.25, 1.25]
+    assert TravelTime(robot, 1.0).path_cost(ground, grade).tolist() == pytest.approx(seconds)
+    for objective in (GoalDistance(), object()):
+        assert path_cost_of(objective)(ground, grade).tolist() == pytest.approx(metres)
+    assert path_cost_of(TravelTime(robot, 1.0))(ground, grade).tolist() == pytest.approx(seconds)
 
 
 def test_distances_broadcast_and_agree_with_the_norm() -> None:
