@@ -127,6 +127,7 @@ PRIVILEGED = (Oracle, Ideal, Clairvoyant)
 Source = str | Path | Mapping[str, Any] | registry.Part
 
 
+@torch.inference_mode(False)  # so that it is the same model wherever it is loaded
 def load_model(source: Source) -> AnyModel:
     """Finds a model by checkpoint or as a part of the registry; it predicts on the observation's device.
 

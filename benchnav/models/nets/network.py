@@ -40,6 +40,7 @@ class WithFullResolution(nn.Module):
         return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
 
 
+@torch.inference_mode(False)  # idle stages are found by gradients, which a caller may have switched off
 def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.Module:
     """Builds the network with fresh weights; leaves PyTorch's global generator as it was.
 

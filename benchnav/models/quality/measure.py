@@ -26,6 +26,7 @@ from benchnav.device import CPU, exact_convolutions
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
+from benchnav.models.nets.classifier import MeanIoU
 from benchnav.models.predictor import PRIVILEGED, AnyModel, ClassModel, EnsembleModel, predict
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.scores import (
@@ -66,7 +67,9 @@ class ClassQuality:
 
     Args:
         accuracy: share of cells whose most likely class is right.
-        miou: intersection over union, averaged over the classes that occur.
+        miou: intersection over union, averaged over the classes that occur in truth.
+        miou_predicted: the same over those that are predicted somewhere too, of which each that does not occur
+            counts as 0.
         ece: expected calibration error of the most likely class, 15 bins.
         brier: Brier score, the squared distance of the probabilities to the class that is there, 0–2.
         entropy: mean predictive entropy, in nats.
@@ -83,6 +86,7 @@ class ClassQuality:
 
     accuracy: float
     miou: float
+    miou_predicted: float
     ece: float
     brier: float
     entropy: float
@@ -270,7 +274,8 @@ class _ClassTally:
         self.by_class = MetricCollection(
             {
                 "accuracy": MulticlassAccuracy(count, average="micro"),
-                "miou": MulticlassJaccardIndex(count, average="macro"),
+                "miou": MeanIoU(count),
+                "miou_predicted": MulticlassJaccardIndex(count, average="macro"),
                 "confusion": MulticlassConfusionMatrix(count),
             }
         ).to(device)
@@ -308,6 +313,7 @@ class _ClassTally:
         return ClassQuality(
             accuracy=float(by_class["accuracy"]),
             miou=float(by_class["miou"]),
+            miou_predicted=float(by_class["miou_predicted"]),
             ece=calibration_error(curve),
             brier=float(self.brier.compute()),
             entropy=self.entropy.mean,

@@ -6,7 +6,9 @@ from collections.abc import Iterable
 COLUMNS = {
     "accuracy": "share of cells whose most likely class is the true one; 1 is perfect.",
     "miou": "mean intersection over union: the cells where a class is both predicted and true, over those where it is "
-    "either, in the mean over classes; 1 is perfect.",
+    "either, in the mean over the classes that occur in truth; 1 is perfect.",
+    "miou_predicted": "the same in the mean over the classes that are true or predicted somewhere; one that never "
+    "occurs counts as 0 as soon as a cell is taken for it.",
     "twin_accuracy": "accuracy with classes of one colour counted as one, as no image tells them apart; 1 is perfect.",
     "twin_miou": "mean intersection over union with classes of one colour counted as one; 1 is perfect.",
     "twin_share_error": "of two classes that share a colour, how far the share of the true one is from ½, which is all "

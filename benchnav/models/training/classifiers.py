@@ -3,13 +3,12 @@
 from dataclasses import asdict
 
 import torch
-from torchmetrics.classification import MulticlassJaccardIndex
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER, Part, as_stored, member_name, member_names
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
 from benchnav.models.training.data import VALID, MapData, MapDataset, read_maps, training_digest
 from benchnav.models.training.fit import FitOptions, fit_network, is_first_process, say
 from benchnav.models.training.target import Target
@@ -58,17 +57,18 @@ def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, 
         maps: with `rgb` and `class_id`.
     """
     device, loss, right, cells = model.device, 0.0, 0, 0
-    miou = MulticlassJaccardIndex(model.class_count, ignore_index=UNLABELLED).to(device)
+    miou = MeanIoU(model.class_count, ignore_index=UNLABELLED).to(device)
     with torch.inference_mode():
-        for indices, some in maps.chunks(device):
+        for _, some in maps.chunks(device):
             logits, class_id = model(some["rgb"]), some["class_id"].long()
-            loss += float(model.loss(logits, class_id)) * len(indices)
+            labelled = int((class_id != UNLABELLED).sum())
+            loss += float(model.loss(logits, class_id)) * labelled
             chosen = logits.argmax(1)
             right += int((chosen == class_id).sum())
-            cells += int((class_id != UNLABELLED).sum())
+            cells += labelled
             miou.update(chosen, class_id)
     return {
-        "valid_loss": loss / len(maps),
+        "valid_loss": loss / max(1, cells),
         "valid_accuracy": right / max(1, cells),
         "valid_miou": float(miou.compute()),
     }
