@@ -30,6 +30,7 @@ READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
 CHUNK_CELLS = 2**17
 FOLDER_MANIFEST = "manifest.json"
+GENERATED, UNKNOWN = "generated", "unknown"  # where the truth of λ is from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +77,12 @@ class TerrainDataset:
     def recipe(self) -> Recipe:
         """The recipe that the file was made by; of the first part where it was made from several."""
         return recipe_from_dict(self.manifest["recipes"][0], f"in {self.path}")
+
+    @property
+    def truth(self) -> str:
+        """Where the true distribution of λ is from: "generated" by the recipe, or "unknown", as on imported ground."""
+        parts = [part for split in self.splits.values() for part in split["parts"]]
+        return UNKNOWN if any(part.get("source") for part in parts) else GENERATED
 
     @property
     def grid(self) -> Grid:

@@ -5,6 +5,7 @@ ResNet-18 encoder of paper III-B. Cells whose class is not known count neither i
 in shapes: B maps, H×W cells, C classes.
 """
 
+import math
 from typing import Any
 
 import lightning
@@ -17,7 +18,7 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
-from benchnav.models.config import ClassifierConfig
+from benchnav.models.config import ClassifierConfig, rebuild
 from benchnav.models.nets.network import build_network
 from benchnav.models.nets.schedule import one_cycle
 
@@ -175,14 +176,12 @@ class TerrainClassifier(lightning.LightningModule):
             ConfigError: the settings are not those of a classifier.
             RuntimeError: the tensors do not fit them.
         """
-        try:
-            settings = {name: value for name, value in config.items() if name != "temperature"}
-            channels = tuple(settings.get("decoder_channels", ()))
-            built = ClassifierConfig(**{**settings, "pretrained": False, "decoder_channels": channels})
-            temperature = float(config.get("temperature", 1.0))
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"Expected the settings of a classifier, got {sorted(config)}.") from error
-        model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=temperature)
+        settings = {name: value for name, value in config.items() if name != "temperature"}
+        built = rebuild(ClassifierConfig, {**settings, "pretrained": False})
+        temperature = config.get("temperature", 1.0)
+        if not isinstance(temperature, int | float) or not 0 < temperature < math.inf:
+            raise ConfigError(f"Expected a `temperature` > 0, got {temperature!r}.")
+        model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=float(temperature))
         model.load_state_dict(tensors)
         return model.eval()
 

@@ -19,7 +19,7 @@ from torchmetrics.classification import (
 )
 
 from benchnav import rng
-from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.reader import GENERATED, TerrainDataset
 from benchnav.datagen.recipe.classes import twins
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.device import CPU, exact_convolutions
@@ -105,7 +105,8 @@ class TraversabilityQuality:
 
     Args:
         rmse_observed: root mean square of E[λ] − λ as realised.
-        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none.
+        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none
+            or the truth is not known.
         nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1.
         crps: continuous ranked probability score of λ as realised.
         coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
@@ -188,11 +189,11 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    alike = twins(dataset.recipe.classes)
+    alike, truth = twins(dataset.recipe.classes), dataset.truth == GENERATED
     for split in choose_splits(model, dataset, splits):
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
         chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))
-        yield split, measure(model, chunks, generator, alike)
+        yield split, measure(model, chunks, generator, alike, truth)
 
 
 def measure(
@@ -200,6 +201,7 @@ def measure(
     chunks: Iterable[Terrain],
     generator: torch.Generator,
     alike: Sequence[tuple[int, ...]] = (),
+    truth: bool = True,
 ) -> Quality:
     """Measures a model on some maps.
 
@@ -208,6 +210,7 @@ def measure(
         chunks: the maps, at least one, a few at a time.
         generator: of the draws within atoms, on the CPU.
         alike: of each class those that look like it, itself among them; empty where none do.
+        truth: whether the maps' true distribution of λ is known.
     """
     maps, cells, sums = 0, 0, torch.zeros(7, dtype=torch.float64)
     histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
@@ -226,7 +229,7 @@ def measure(
             classes[0].add(probabilities, members, terrain.class_id, terrain.slope_deg)
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    squared_expected = float(sums[5] / sums[6])
+    squared_expected = float(sums[5] / sums[6]) if truth else math.nan
     squared_observed, nll, score, covered, in_tail = (sums[:5] / cells).tolist()
     return Quality(
         maps=maps,

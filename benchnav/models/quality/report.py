@@ -155,8 +155,12 @@ def _has_twins(quality: Quality) -> bool:
 
 
 def _shown(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of the numbers that some split has."""
-    return [name for name in HEADINGS if any(math.isfinite(row.get(name, math.nan)) for row in rows.values())]
+    """Names of the numbers that some split has, and of the one whose truth may be unknown."""
+    return [
+        name
+        for name in HEADINGS
+        if name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values())
+    ]
 
 
 def _decimal(value: float | None) -> str:

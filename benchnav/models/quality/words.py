@@ -25,7 +25,8 @@ COLUMNS = {
     "mutual_information_auroc": "the same of mutual information.",
     "rmse_observed": "typical distance of the predicted mean to λ as observed; the noise of the ground stays in it, "
     "even for a perfect model.",
-    "rmse_expected": "typical distance of the predicted mean to the true mean of λ; 0 is perfect.",
+    "rmse_expected": "typical distance of the predicted mean to the true mean of λ; 0 is perfect, and – stands where "
+    "the true mean is unknown.",
     "nll": "minus the logarithm of the predicted density at λ as observed, in the mean; lower is better, and it may be "
     "negative.",
     "crps": "continuous ranked probability score: distance of the predicted distribution to λ as observed, in units of "
@@ -63,13 +64,14 @@ _FIGURES = {
     ),
     "latent": (
         "What the Gaussian processes have learned",
-        "Traversability over slope, class by class, beside the truth in black. Where it is grey, few of the measured "
-        "cells are as steep, or none.",
+        "Traversability over slope, class by class, beside the truth in black where it is known. Where it is grey, few "
+        "of the measured cells are as steep, or none.",
     ),
     "maps": (
         "Maps of",
-        "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty. A quantity "
-        "has the same scale in all sheets of an evaluation.",
+        "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty; where the "
+        "true distribution of λ is unknown, λ as observed stands for it. A quantity has the same scale in all sheets of "
+        "an evaluation.",
     ),
 }
 

@@ -9,8 +9,8 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER, Part, as_stored, member_name, member_names
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
-from benchnav.models.training.data import VALID, MapData, MapDataset, read_maps, training_digest
-from benchnav.models.training.fit import FitOptions, fit_network, is_first_process, say
+from benchnav.models.training.data import VALID, MapData, MapDataset, check_known, read_maps, training_digest
+from benchnav.models.training.fit import FitOptions, check_network, fit_network, is_first_process, say
 from benchnav.models.training.target import Target
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
 
@@ -47,6 +47,19 @@ def fit_classifier(
     metrics = fit_network(model, part, config, data, seed, options, half_precision, measure_classifier)
     model.temperature = fit_temperature(*sample_logits(model, data.valid, seed, options.place))
     return model.cpu(), metrics
+
+
+def check_classifier(config: ClassifierConfig, dataset: TerrainDataset, options: FitOptions) -> None:
+    """Refuses a classifier that could not be trained, before anything is.
+
+    Raises:
+        ConfigError: its settings or those of the trainer do not fit.
+        DatasetError: the maps are too few, or none of their cells has a class.
+    """
+    check_known(dataset, "class_id")
+    network = TerrainClassifier(config, len(dataset.recipe.classes), torch.zeros(3), torch.ones(3))
+    image = torch.zeros(1, 3, *dataset.grid.shape, dtype=torch.uint8)
+    check_network(network, [image], config, dataset, options)
 
 
 def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, float]:
@@ -86,7 +99,7 @@ def train_members(
     """Trains the classifiers that a checkpoint lacks, with the seeds `seed`, `seed` + 1, …, and pools them all."""
     for index in range(members):
         part = member_name(index)
-        if not target.holds(part, asdict(config), seed + index, asdict(ClassifierConfig())):
+        if not target.holds(part, asdict(config), seed + index, asdict(ClassifierConfig()), half_precision):
             target.add(part, _train_member(config, dataset, seed + index, options, part, half_precision))
     _calibrate_pool(target, dataset, seed, options.place)
 
@@ -113,6 +126,7 @@ def _train_member(
         data_id=dataset.id,
         data_digest=training_digest(dataset),
         half_precision=half_precision,
+        trainer=options.trainer_settings,
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.reader import GENERATED, TerrainDataset
 from benchnav.errors import CheckpointError
 from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
 from benchnav.models.config import LatentGPConfig
@@ -61,12 +61,16 @@ def train_gps_on_maps(
 
     model = fit_gps(config, sum_split(dataset, TRAIN), options)
     _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
-    measured = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID))
+    known = dataset.truth == GENERATED
+    measured = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     metrics = {f"valid_{name}": value for name, value in measured.items()}
-    say(
-        f"gp: validation RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
-        f"noise {metrics['valid_noise_error']:.1%}, NLL {metrics['valid_nll']:.4f}"
+    errors = (
+        f"RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
+        f"noise {metrics['valid_noise_error']:.1%}, "
+        if known
+        else "(of their errors nothing is known: the true distribution of λ of this ground is unknown) "
     )
+    say(f"gp: validation {errors}NLL {metrics['valid_nll']:.4f}")
     return Part(
         config={**asdict(config), "steepest_deg": model.steepest_deg},
         tensors=model.to_tensors(),
