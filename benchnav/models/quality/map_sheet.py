@@ -137,7 +137,9 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
     ):
         values = [np.abs(sheet.layers[name]).ravel() for sheet in sheets if name in sheet.layers]
         if values:
-            most = _round_up(float(np.nanquantile(np.concatenate(values), _SHOWN_SHARE)))
+            shown = np.concatenate(values)
+            shown = shown[np.isfinite(shown)]
+            most = _round_up(float(np.quantile(shown, _SHOWN_SHARE)) if len(shown) else 0.0)
             scales[name] = {"cmap": palette, "vmin": -most if name.startswith("error") else 0, "vmax": most}
     return scales
 

@@ -70,8 +70,8 @@ _FIGURES = {
     "maps": (
         "Maps of",
         "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty; where the "
-        "true distribution of λ is unknown, λ as observed stands for it. A quantity has the same scale in all sheets of "
-        "an evaluation.",
+        "true distribution of λ is unknown, λ as observed stands for it. A quantity has the same scale in all sheets "
+        "of an evaluation.",
     ),
 }
 
