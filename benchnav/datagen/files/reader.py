@@ -30,7 +30,6 @@ READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
 CHUNK_CELLS = 2**17
 FOLDER_MANIFEST = "manifest.json"
-GENERATED, UNKNOWN = "generated", "unknown"  # where the truth of λ is from
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +81,7 @@ class TerrainDataset:
     def truth(self) -> str:
         """Where the true distribution of λ is from: "generated" by the recipe, or "unknown", as on imported ground."""
         parts = [part for split in self.splits.values() for part in split["parts"]]
-        return UNKNOWN if any(part.get("source") for part in parts) else GENERATED
+        return "unknown" if any(part.get("source") for part in parts) else "generated"
 
     @property
     def grid(self) -> Grid:

@@ -179,10 +179,9 @@ def _seen(dataset: "TerrainDataset", splits: "Sequence[str]", known: "Mapping[st
 
 def _without_truth(model: "AnyModel", dataset: "TerrainDataset", splits: "Sequence[str]") -> list[str]:
     """Says what cannot be measured where the truth is unknown, and what is measured in its place."""
-    from benchnav.datagen.files.reader import GENERATED
     from benchnav.models.predictor import Ideal, Oracle
 
-    if dataset.truth == GENERATED:
+    if dataset.truth == "generated":
         return []
     sources = [part.get("source", {}) for split in splits for part in dataset.splits[split]["parts"]]
     measured = all(source.get("traversability") for source in sources)
@@ -245,7 +244,6 @@ def _figures(
     """Names the figures that apply, each with what draws it."""
     from functools import partial
 
-    from benchnav.datagen.files.reader import GENERATED
     from benchnav.models.quality import figures, map_sheet
     from benchnav.models.quality.ladders import find_ladders
     from benchnav.models.quality.words import sheet_name
@@ -264,7 +262,7 @@ def _figures(
             [sum(counts) for counts in zip(*rows, strict=True)]
             for rows in zip(*(quality.slope_cells for quality in by_class.values()), strict=True)
         ]
-        yield "latent", partial(figures.latent_figure, table, classes, cells, dataset.truth == GENERATED)
+        yield "latent", partial(figures.latent_figure, table, classes, cells, dataset.truth == "generated")
     if maps:
         sheets = [
             map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))

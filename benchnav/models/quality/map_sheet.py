@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from benchnav.datagen.files.reader import GENERATED, TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import LACKING, class_colours, class_shades
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
@@ -86,7 +86,7 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
     terrain = dataset.terrain(split, indices)
     with torch.inference_mode():
         mixture = predict(model, terrain)
-        known = dataset.truth == GENERATED
+        known = dataset.truth == "generated"
         true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if isinstance(model, ClassModel):

@@ -19,7 +19,7 @@ from torchmetrics.classification import (
 )
 
 from benchnav import rng
-from benchnav.datagen.files.reader import GENERATED, TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import twins
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.device import CPU, exact_convolutions
@@ -189,7 +189,7 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    alike, truth = twins(dataset.recipe.classes), dataset.truth == GENERATED
+    alike, truth = twins(dataset.recipe.classes), dataset.truth == "generated"
     for split in choose_splits(model, dataset, splits):
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
         chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchnav.datagen.files.reader import GENERATED, TerrainDataset
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import CheckpointError
 from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
 from benchnav.models.config import LatentGPConfig
@@ -61,7 +61,7 @@ def train_gps_on_maps(
 
     model = fit_gps(config, sum_split(dataset, TRAIN), options)
     _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
-    known = dataset.truth == GENERATED
+    known = dataset.truth == "generated"
     measured = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     metrics = {f"valid_{name}": value for name, value in measured.items()}
     errors = (
