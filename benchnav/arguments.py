@@ -132,9 +132,13 @@ def explain(message: str, words: Sequence[str], known: Known) -> str:
         return f"Expected flags that `{known.program}` has, got {found[1]!r}.{hint(found[1], known.kinds)}"
     key = re.search(r'Parser key "([^"]+)"', message)
     value = re.search(
-        r"(?:Got value|Given value|Unable to load config): ?(.*)|Unable to load config '(.*?)'", message
+        r"(?:Got value|Given value|Unable to load config): ?(.*?)(?: - Expected .*)?$|Unable to load config '(.*?)'",
+        message,
     )
-    if key and value and (name := key[1].removeprefix(f"{known.program.split()[-1]}.")) in known.kinds:
+    # The parser's key begins with the name of the command, which a setting may have too.
+    names = [key[1], key[1].removeprefix(f"{known.program.split()[-1]}.")] if key else []
+    name = next((name for name in names if name in known.kinds), "")
+    if name and value:
         typed = any(word.partition("=")[0][2:].replace("-", "_") == name for word in words)
         kind, got = known.kinds[name], value[1] or value[2]
         where = f"--{name}" if typed else f"`{name}`{_in_files(words)}"

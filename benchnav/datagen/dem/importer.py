@@ -34,7 +34,7 @@ _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows w
 # Why maps are left out, in the order of being found.
 _REASONS = {
     "missing_elevation": "have cells without elevation",
-    "missing_classes": "have no cell with a class, or cells without one and no photo of them",
+    "missing_classes": "have no cell with a class or a measured λ, or cells without a class and no photo of them",
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
@@ -175,8 +175,11 @@ def _make(
     lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
     if "class_id" in given:
         unlabelled = np.isnan(given["class_id"])
-        # Without a photo a cell is painted in the colour of its class.
-        lacking["missing_classes"] = (unlabelled.all if "rgb" in given else unlabelled.any)(axis=(1, 2, 3))
+        # Without a photo a cell is painted in the colour of its class; measured λ can be learned from without one.
+        missing = (unlabelled.all if "rgb" in given else unlabelled.any)(axis=(1, 2, 3))
+        if "rgb" in given and "traversability" in given:
+            missing &= np.isnan(given["traversability"]).all(axis=(1, 2, 3))
+        lacking["missing_classes"] = missing
     if "rgb" in given:
         lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
     for reason, which in lacking.items():
