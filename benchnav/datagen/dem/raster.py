@@ -57,7 +57,9 @@ class Raster:
             DatasetError: there is none, as of ground that is too large.
         """
         own, bounds = _horizontal(self.file.crs), self.file.bounds
-        x, y = np.meshgrid(np.linspace(*bounds[::2], 3), np.linspace(*bounds[1::2], 3))
+        x, y = np.meshgrid(
+            np.linspace(bounds.left, bounds.right, 3), np.linspace(bounds.bottom, bounds.top, 3)
+        )
         local = local_crs(own, x[1, 1], y[1, 1])
         if local is None:
             raise DatasetError(
@@ -66,7 +68,7 @@ class Raster:
             )
         for crs in (own, _utm_of(own, x[1, 1], y[1, 1]), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
-                places = zip(*_transformed(own, crs, x.ravel(), y.ravel()), strict=True)
+                places = zip(*_transformed(own, crs, x.ravel().tolist(), y.ravel().tolist()), strict=True)
                 if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:
                     with self.warped(crs) as warped:
                         return crs, warped.bounds, (warped.res[1], warped.res[0])
@@ -240,17 +242,17 @@ def stretch(crs: Any, x: float, y: float) -> float:
     if local is None:
         return np.inf
     steps = _PROBE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    moved = np.transpose(_transformed(crs, local, *(np.array([x, y]) + steps).T))
+    moved = np.transpose(_transformed(crs, local, *(np.array([x, y]) + steps).T.tolist()))
     if not np.isfinite(moved).all():
         return np.inf
     scales = np.linalg.svd(moved[::2] - moved[1::2], compute_uv=False) / (2 * _PROBE_M)
     return float(np.abs(scales - 1).max())
 
 
-def _transformed(crs: Any, to: Any, x: Sequence[float], y: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def _transformed(crs: Any, to: Any, x: list[float], y: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """Moves places from one CRS to another; not finite where there is no way, as from another planet."""
     try:
-        moved = load_rasterio().warp.transform(crs, to, list(x), list(y))
+        moved = load_rasterio().warp.transform(crs, to, x, y)
     except Exception:  # rasterio gives PROJ's failures no public class
         moved = np.full((2, len(x)), np.nan)
     return np.asarray(moved[0]), np.asarray(moved[1])

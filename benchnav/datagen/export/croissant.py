@@ -13,7 +13,6 @@ from typing import Any
 
 import yaml
 
-from benchnav.datagen import schema
 from benchnav.datagen.export.parquet import FOLDER, MAP
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import ConfigError
@@ -190,7 +189,7 @@ def _maps(
     about = dataset.splits[split]
     columns = [column(MAP, "sc:Integer", "number of the map in its split")]
     for of in fields:
-        field = schema.FIELDS[of]
+        field = dataset.fields[of]
         shape = field.entry_shape(*dataset.grid.shape)
         words = [field.meaning] + ([f"in {field.unit}"] if field.unit != "1" else [])
         words += [f"nested lists of shape {list(shape)}"] if shape else []

@@ -234,8 +234,8 @@ class MapData(lightning.LightningDataModule):
 
 
 def training_digest(dataset: TerrainDataset) -> str:
-    """Content digest of what of a dataset is trained on."""
-    return ",".join(f"{name}:{dataset.splits[name]['digest']}" for name in (TRAIN, VALID))
+    """Digest of what of a dataset is trained on, and of what its maps mean."""
+    return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))
 
 
 def read_maps(

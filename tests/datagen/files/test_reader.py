@@ -40,7 +40,7 @@ def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no readable HDF5"):
         TerrainDataset(tmp_path / "text.h5")
     path = tiny_dataset(tmp_path / "d.h5")
-    rewrite(path, {"format_version": "1.3"})
+    rewrite(path, {"format_version": "1.4"})
     with pytest.raises(DatasetError, match="newer benchnav"):
         TerrainDataset(path)
     rewrite(path, {"format": "other"})
