@@ -47,6 +47,11 @@ class Raster:
     name: str
     file: Any
 
+    @property
+    def says_what_is_missing(self) -> bool:
+        """Whether it declares a value, or a mask, for cells without one."""
+        return any(flag.name != "all_valid" for flags in self.file.mask_flag_enums for flag in flags)
+
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
         """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.
 
