@@ -605,3 +605,41 @@ def test_traversability_out_of_range_is_refused_however_small_its_share(
     message = refusal(dem, traversability=measured, random_classes=True)
     assert "`traversability` in [0, 1]" in message
     assert f"--nodata {value}" in message
+
+
+@pytest.mark.parametrize("cell", [0.5, 0.25, 0.8])
+def test_zeros_for_missing_heights_are_refused_unless_something_is_declared(
+    tmp_path: Path, cell: float
+) -> None:
+    values = 900 + rough(64, 96)
+    values[:20, :30] = 0
+    message = refusal(write(tmp_path / "dem.tif", values, cell))
+    assert "If 0 stands for missing, declare it: rio edit-info --nodata 0" in message
+    declared = read(write(tmp_path / "zero.tif", values, cell, nodata=0))
+    assert source_of(declared)["left_out"]["missing_elevation"] > 0
+    kept = read(write(tmp_path / "other.tif", values, cell, nodata=-9999))
+    assert maps_of(kept)["slope_deg"].max() > 85  # a cliff at the sea, by their word
+    # Down to the sea by steps of less than a metre.
+    sea = write(tmp_path / "sea.tif", np.linspace(0, 30, 64)[:, None].repeat(96, 1).round(), cell)
+    assert len(maps_of(read(sea))["rgb"]) >= 1
+
+
+def test_a_map_of_no_class_is_kept_where_its_traversability_was_measured(tmp_path: Path) -> None:
+    dem = write(tmp_path / "dem.tif", rough(16, 72))
+    kinds = np.full((16, 72), 255, np.uint8)
+    kinds[:, :24] = 1
+    photo = np.full((3, 16, 72), 90, np.uint8)
+    measured = np.full((16, 72), np.nan, np.float32)
+    measured[4, 30] = 0.25  # of the second map alone
+    rasters = {
+        "classes": write(tmp_path / "classes.tif", kinds, nodata=255),
+        "photo": write(tmp_path / "photo.tif", photo),
+        "traversability": write(tmp_path / "measured.tif", measured),
+    }
+    dataset = read(dem, **rasters)
+    assert source_of(dataset)["kept"] == [0, 1]
+    assert source_of(dataset)["left_out"]["missing_classes"] == 1
+    maps = maps_of(dataset)
+    assert (maps["class_id"][1] == 255).all()
+    assert maps["traversability"][1, 11, 6] == 0.25
+    assert np.isnan(maps["traversability"][1]).sum() == 16 * 24 - 1
