@@ -130,8 +130,8 @@ def test_recorded_digests_cover_what_maps_mean(tmp_path: Path) -> None:
     for changed in (
         recipe,
         replace(recipe, classes=kinds),
-        replace(recipe, stuck_threshold=0.3),
-        replace(recipe, resolution_m=0.25),
+        replace(recipe, stuck_threshold=0.17),
+        replace(recipe, resolution_m=0.6),
     ):
         other = TerrainDataset(dataset.path)
         other.recipe = changed  # of the same arrays
