@@ -570,10 +570,10 @@ def test_show_tells_the_kind_of_truth_and_what_models_record(
     datagen: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
-    assert datagen("show", path) == 0
+    assert datagen("show", str(path)) == 0
     told, digest = capsys.readouterr().out, TerrainDataset(path).split_digest("test/hg")
     assert "generated" in told
     assert digest in told
-    assert datagen("show", path, "--json") == 0
+    assert datagen("show", str(path), "--json") == 0
     split = json.loads(capsys.readouterr().out)["splits"]["test/hg"]
     assert (split["truth"], split["recorded_digest"]) == ("generated", digest)
