@@ -137,10 +137,12 @@ def explain(message: str, words: Sequence[str], known: Known) -> str:
     )
     # The parser's key begins with the name of the command, which a setting may have too.
     names = [key[1], key[1].removeprefix(f"{known.program.split()[-1]}.")] if key else []
-    name = next((name for name in names if name in known.kinds), "")
-    if name and value:
-        typed = any(word.partition("=")[0][2:].replace("-", "_") == name for word in words)
-        kind, got = known.kinds[name], value[1] or value[2]
+    if name := next((name for name in names if name in known.kinds), ""):
+        given = [flag.value for flag in _read(words, known)[0] if flag.name == name]
+        typed = bool(given)
+        kind = known.kinds[name]
+        # What the user typed reads better than what the parser made of it.
+        got = given[-1] if typed else (value[1] or value[2]) if value else message
         where = f"--{name}" if typed else f"`{name}`{_in_files(words)}"
         near = hint(got, [member for member in _members(kind) if isinstance(member, str)])
         return f"Expected {where} as {in_words(kind)}, got {got!r}.{near}"

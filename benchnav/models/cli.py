@@ -69,8 +69,8 @@ def train_gp(
     """Train the class-wise Gaussian processes.
 
     Args:
-        data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv or .parquet with
-            the columns class, slope_deg and traversability.
+        data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv, .tsv, one of these
+            with .gz, or .parquet, with the columns class, slope_deg and traversability.
         out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
             their class table.
         gp: Settings of the GPs.
@@ -78,12 +78,13 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
+    from benchnav.models.slope_gp.slip_logs import ENDINGS
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
 
     check_seed(seed)
     options = FitOptions(device=device)
-    if data.endswith((".csv", ".parquet")):
+    if data.endswith(ENDINGS):
         train_gps_on_logs(data, out, gp, seed, options, overwrite)
         return
     dataset = _open_dataset(data)

@@ -337,3 +337,18 @@ def test_a_world_may_be_given_as_itself(dataset_path: Path) -> None:
 def test_maps_without_a_reference_time_have_no_budget_by_it(dataset_path: Path) -> None:
     with pytest.raises(ConfigError, match="solvable"):
         make(dataset_path, split="train", world="stakes")
+
+
+def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the_command(
+    tmp_path: Path,
+) -> None:
+    recipe = factories.tiny_recipe()
+    split = replace(recipe.splits["train"], solvable=False)
+    path = factories.tiny_dataset(tmp_path / "d.h5", replace(recipe, splits={"train": split}))
+    with pytest.raises(
+        ConfigError, match=r"none on 8 of 8.*create RECIPE id=NAME splits\.train\.solvable=true"
+    ) as told:
+        make(path, world="stakes")
+    assert "\n" not in str(told.value)
+    made = make(path, world={"preset": "stakes", "time_budget_s": 60})  # as the line says
+    made.reset(seed=0)

@@ -68,6 +68,7 @@ def describe_maps(trials: Trials) -> dict[str, Any]:
         data: {
             "id": datasets[data].id,
             "maps": {split: _map_digests(datasets[data], split, count) for split, count in splits.items()},
+            "about": {split: datasets[data].about_digest(split) for split in splits},
         }
         for data, splits in used.items()
     }
@@ -117,6 +118,12 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
             pairs = zip(digests, again.get(split, digests), strict=False)
             if any(before != after for before, after in pairs):
                 changed.append(f"maps of {data} {split}")
+        meanings = now["datasets"].get(data, {}).get("about", {})
+        changed += [
+            f"class table, λ_stuck, resolution or kind of truth of {data} {split}"
+            for split, digest in about.get("about", {}).items()  # not recorded by earlier versions
+            if meanings.get(split, digest) != digest
+        ]
     return changed
 
 

@@ -264,8 +264,8 @@ def check_known(dataset: TerrainDataset, field: str) -> None:
 
 
 def training_digest(dataset: TerrainDataset) -> str:
-    """Content digest of what of a dataset is trained on."""
-    return ",".join(f"{name}:{dataset.splits[name]['digest']}" for name in (TRAIN, VALID))
+    """Digest of what of a dataset is trained on, and of what its maps mean."""
+    return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))
 
 
 def read_maps(
