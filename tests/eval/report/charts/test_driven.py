@@ -134,9 +134,9 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
 ) -> None:
     rows = episodes({0: [True] * 3, 1: [True, False, True]})
     folder = run_folder(tmp_path / "run", rows, format_version=3)
-    assert write_driven(folder) == {}
+    assert write_driven(folder, folder) == {}
     with_steps(folder, rows)
-    assert write_driven(folder) == {}
+    assert write_driven(folder, folder) == {}
     ground().save(folder / GROUND)
     shown: list[Any] = []
 
@@ -145,7 +145,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
         return driven_figure(*given)
 
     monkeypatch.setattr("benchnav.eval.report.charts.driven.driven_figure", draw)
-    caption = write_driven(folder)
+    caption = write_driven(folder, folder)
     assert "std 1, seed 0, realisation 0: of all maps" in caption["driven"]
     assert (folder / "figures" / "driven.png").stat().st_size > 5000
     ((_, own, tracks),) = shown
@@ -170,7 +170,7 @@ def test_the_paths_are_those_of_the_maps_own_luck(
         "benchnav.eval.report.charts.driven.driven_figure", lambda *given: shown.append(given)
     )
     monkeypatch.setattr("benchnav.eval.report.charts.driven.save", lambda *given: None)
-    caption = write_driven(folder)["driven"]
+    caption = write_driven(folder, folder)["driven"]
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
     ((_, own, tracks),) = shown
     assert own["risk"].tolist() == list(RISKS)
@@ -186,7 +186,7 @@ def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: P
     folder = run_folder(tmp_path / "run", rows, format_version=3)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    caption = write_driven(folder)["driven"]
+    caption = write_driven(folder, folder)["driven"]
     assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} trials." in caption
 
 
