@@ -13,17 +13,20 @@ import pytest
 
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
-from benchnav.eval.folder.folder import open_run, write_run
+from benchnav.eval.folder.folder import EPISODES, open_run, read_table, write_run
+from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import Workers, run_suite
 from benchnav.eval.suite import Suite
+from benchnav.share import Share
 from tests.eval.forged import forge_rows
 
 
 def call(*words: str) -> int:
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["benchnav-eval", *words])
-        cli.main()
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
     return int(ended.value.code or 0)
 
 
@@ -46,36 +49,45 @@ def run(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "run"))
 
 
+def quick(dataset: Path, **changes: Any) -> Suite:
+    given: dict[str, Any] = {
+        "data": str(dataset), "model": "oracle", "planners": ("tests.eval.parts:Faulty",), "risks": ("mean",),
+        "scenarios": ("std",), "instances": 1, "record": "none", "steps": "none", "time_budget_s": 2.0,
+    }  # fmt: skip
+    return Suite(**(given | changes))
+
+
 def test_a_link_stays_a_link_when_what_it_points_to_is_dropped(
     run: Path, dataset_path: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "link").symlink_to(run)
     before = open_run(run).about["run_id"]
-    assert call(*words_on(dataset_path, "--out", str(tmp_path / "link"), "--overwrite")) == 0
+    list(run_suite(quick(dataset_path), tmp_path / "link", overwrite=True))
     assert (tmp_path / "link").is_symlink()
     assert open_run(run).about["run_id"] != before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "run"]
 
 
 def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
-    run: Path, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+    run: Path, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(run)
     before = open_run(run).about["run_id"]
-    assert call(*words_on(dataset_path, "--out", ".", "--overwrite")) == 0
+    list(run_suite(quick(dataset_path), Path(), overwrite=True))
     assert open_run(Path()).about["run_id"] != before
-    assert call(*words_on(dataset_path, "--out", str(tmp_path / "part"), "--shard", "1/1")) == 0
+    assert not Path("report.html").exists()
+    list(run_suite(quick(dataset_path), tmp_path / "part", shard=Share(index=1, of=1)))
     (tmp_path / "all").mkdir()
     monkeypatch.chdir(tmp_path / "all")
-    assert call("merge", ".", str(tmp_path / "part")) == 0
-    assert (tmp_path / "all" / "report.html").exists()
-    assert "Traceback" not in capsys.readouterr().err
+    list(merge_shards([tmp_path / "part"], Path()))
+    for folder in (Path(), tmp_path / "all"):
+        assert len(read_table(folder, EPISODES)) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all", "part", "run"]
 
 
 def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     again = Path(shutil.copytree(run, tmp_path / "again"))
-    with pytest.raises(ConfigError, match="1 of the 1 units in .*again are copies"):
+    with pytest.raises(ConfigError, match=r"1 of the 1 units in .*again are copies"):
         list(rerun(run, again, Workers()))
     # Nor under another name of the run.
     about = open_run(again).about
@@ -89,10 +101,11 @@ def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
 
 
 def test_merged_copies_of_one_shard_certify_nothing(dataset_path: Path, tmp_path: Path) -> None:
-    assert call(*words_on(dataset_path, "--out", str(tmp_path / "part"), "--shard", "1/1")) == 0
+    list(run_suite(quick(dataset_path), tmp_path / "part", shard=Share(index=1, of=1)))
     for name in ("one", "two"):
-        assert call("merge", str(tmp_path / name), str(tmp_path / "part")) == 0
-    assert call("rerun", str(tmp_path / "one"), "--out", str(tmp_path / "two")) == 2
+        list(merge_shards([tmp_path / "part"], tmp_path / name))
+    with pytest.raises(ConfigError, match="copies"):
+        list(rerun(tmp_path / "one", tmp_path / "two", Workers()))
 
 
 def test_a_column_that_one_table_has_is_a_difference(run: Path, tmp_path: Path) -> None:
@@ -195,15 +208,12 @@ def test_one_condition_has_one_label_for_good(dataset_path: Path, tmp_path: Path
     def suite(label: str | None, *levels: float) -> Suite:
         named = {} if label is None else {"label": label}
         risk = {"part": "cvar", "options": {"level": list(levels) if len(levels) > 1 else levels[0]}, **named}
-        return Suite(
-            data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty",), risks=(risk,),
-            scenarios=("std",), instances=1, record="none", steps="none", time_budget_s=2.0,
-        )  # fmt: skip
+        return quick(dataset_path, risks=(risk,))
 
     out = tmp_path / "run"
     list(run_suite(suite("careful", 0.9), out))
     before = json.loads((out / "run.json").read_text())
-    with pytest.raises(ConfigError, match="got 'cvar:0.9' for what is called 'careful'"):
+    with pytest.raises(ConfigError, match=r"got 'cvar:0\.9' for what is called 'careful'"):
         list(run_suite(suite(None, 0.5, 0.9), out))
     assert json.loads((out / "run.json").read_text()) == before
     list(run_suite(suite("cautious", 0.5), out))

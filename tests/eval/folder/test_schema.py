@@ -38,10 +38,10 @@ def first(about: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize("text", ["", "{", "[]", "{}", "null", '{"format": "benchnav-run"}', "[" * 100000])
 def test_an_empty_or_truncated_file_is_damaged_and_a_missing_one_is_none(text: str, run: Path) -> None:
     (run / "run.json").write_text(text)
-    with pytest.raises(ConfigError, match="run.json is damaged: "):
+    with pytest.raises(ConfigError, match=r"run\.json is damaged: "):
         open_run(run)
     (run / "run.json").unlink()
-    with pytest.raises(ConfigError, match="Expected a run folder with run.json"):
+    with pytest.raises(ConfigError, match=r"Expected a run folder with run\.json"):
         open_run(run)
 
 
