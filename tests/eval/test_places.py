@@ -8,12 +8,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table, write_run
+from benchnav.eval.run import episode
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import Workers, run_suite
@@ -223,7 +226,23 @@ def test_one_condition_has_one_label_for_good(dataset_path: Path, tmp_path: Path
     assert set(labels.values()) == {"careful", "cautious"}
 
 
-def test_rows_have_the_group_of_their_map(run: Path) -> None:
+def test_rows_have_the_group_of_their_map(
+    run: Path, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rows = pd.read_parquet(run / "episodes.parquet")
     assert rows["group"].dtype == "int64"
     assert (rows["group"] == rows["instance"]).all()
+
+    class Grouped(TerrainDataset):
+        field_names = ("group",)
+
+        def read(self, split: str, indices: Any, names: Any = None) -> Any:
+            if names != ["group"]:
+                return super().read(split, indices, names)
+            return {"group": np.array([40 + index // 2 for index in indices], np.int32)}
+
+    monkeypatch.setattr(episode, "TerrainDataset", Grouped)
+    block = episode.read_maps(Grouped(dataset_path), "test/std", [0, 1])
+    assert (block.groups.tolist(), block.groups.dtype) == ([40, 40], np.int64)
+    list(run_suite(quick(dataset_path, instances=2), tmp_path / "grouped"))
+    assert read_table(tmp_path / "grouped", EPISODES)["group"].tolist() == [40, 40]
