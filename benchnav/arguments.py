@@ -198,7 +198,7 @@ def _read(words: Sequence[str], known: Known) -> tuple[list[_Flag], list[str]]:
                 expected = "" if kind is Any else f" ({in_words(kind)})"
                 raise ConfigError(f"Expected a value after {flag}{expected}, got none.")
             value = rest.pop(0)
-        if _is_list(kind) and not value.lstrip().startswith(("[", "(")):
+        if _is_list(kind) and str not in _members(kind) and not value.lstrip().startswith(("[", "(")):
             value = f"[{value}]"
         given.append(_Flag(name, keys, value))
     return given, places

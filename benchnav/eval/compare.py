@@ -10,7 +10,7 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import EPISODES, Run, open_run, read_table
+from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
 from benchnav.eval.report.comparison import comparison_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import ResultTable
@@ -49,7 +49,8 @@ def compare_runs(
     pairs = find_pairs(_chosen(read_trials(runs), asked), by, against)
     table = compare(pairs, difference)
     shown = comparison_table(table, difference)
-    notes = (*_about(pairs, table), *shown.notes, *_sources(runs))
+    said = dict.fromkeys(line for run in runs for line in caveats(run.about))
+    notes = (*_about(pairs, table), *shown.notes, *_sources(runs), *said)
     return table, ResultTable(headings=shown.headings, labels=shown.labels, rows=shown.rows, notes=notes)
 
 

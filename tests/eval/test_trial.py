@@ -98,6 +98,18 @@ def test_every_setting_reaches_its_place() -> None:
     assert travel.make_task().objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
 
 
+def test_several_worlds_stand_at_the_top_of_a_suite() -> None:
+    suite = Suite(
+        model="oracle",
+        planners=("straight",),
+        world=("paper", {"preset": "stakes", "correlation_m": [1.0, 2.0]}),
+    )
+    worlds = [trial.world for trial in trials_of(suite, lambda data: ["std"])]
+    assert [(world.noise, world.correlation_m) for world in worlds] == [
+        ("resampled", 1.5), ("frozen", 1.0), ("frozen", 2.0),
+    ]  # fmt: skip
+
+
 def test_what_a_world_says_itself_goes_before_the_short_forms() -> None:
     assert one(world={"noise": "resampled"}, noise="stored").world.noise == "resampled"
 

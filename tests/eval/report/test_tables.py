@@ -37,13 +37,13 @@ def test_golden_table() -> None:
     table = table_of(made.rows(quick, slow, blind), **notes)
     assert to_markdown(table).partition("\n\n- **")[0] == (
         "| scenario | planner | risk | Succ. [%] | 95 % interval | T_total [s] | T if success [s] | λ̄ [%] "
-        "| planning [ms] | failures |\n"
+        "| per episode of a batch [ms] | failures |\n"
         "|---|---|---|---|---|---|---|---|---|---|\n"
         "| std | mppi | cvar | **100** | 34–100 | 25.0 | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (2)¶ | – |\n"
         "| std | cl_rrt¹,² | mean | **50** | 9–91 | 70.0 | 40.0 | 70.0 ± 28.3 | 1 (3) | 1 stuck |\n"
         "| std | straight | – | **0** | 0–66 | 100.0 | – | 80.0 (n = 1) | – | 1 out of bounds, "
         "1 planner failure |\n"
-        "\n¹ objective: its own time\n"
+        "\n¹ minimises, in place of the task's J: its own time\n"
         "\n² limits 0.5 m/s²\n"
         "\nBold: the highest success rate of its block, and all that the paired test does not tell from it (sign-flip "
         "test by map, Holm's correction over the block, p ≥ 0.05)."
@@ -65,7 +65,7 @@ def test_only_columns_that_are_shown_are_explained_each_in_one_sentence() -> Non
     earlier = made.rows(made.row(made.trial())).drop(columns=["planning_ms_p95", "planning_start_ms"])
     assert "1¶" in table_of(earlier).rows[0]
     without = table_of(made.rows(made.row(made.trial(), planning_ms=np.nan)))
-    assert "planning [ms]" not in without.headings
+    assert "per episode of a batch [ms]" not in without.headings
     assert {len(row) for row in without.rows} == {len(without.headings)}
     assert without.rows[0][-1] == "–"
     others = [(name, value, n) for name in LABELS for n, value in enumerate("abc", 1)]
@@ -141,7 +141,7 @@ def test_notes_are_numbered_once_and_marked_at_every_trial_they_hold_for() -> No
     shared = {"follows": "path length", "remarks": []}
     table = table_of(episodes, a=shared, b=shared | {"remarks": ["slow"]})
     assert [row[1] for row in table.rows] == ["mppi", "mppi", "a¹", "a¹", "b¹,²", "b¹,²"]
-    assert table.notes == ("¹ objective: path length", "² slow")
+    assert table.notes == ("¹ minimises, in place of the task's J: path length", "² slow")
 
 
 @pytest.mark.parametrize("follows", ["", "J"])

@@ -24,6 +24,12 @@ def episodes() -> pd.DataFrame:
     )
 
 
+def draws(rows: pd.DataFrame) -> list[list[int]]:
+    """How often a trial was run, as `run.json` says it."""
+    counted = rows.groupby(["seed", "realisation"], sort=False)["instance"].nunique()
+    return [[seed, realisation, count] for (seed, realisation), count in counted.items()]
+
+
 def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
     """A run folder with what a report reads of it; parts of the trials stand in for any."""
     parts = {
@@ -34,7 +40,7 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         name: about
         | {
             "value": {"data": "paper-v1", "split": "test/std", **parts, **made.PAPER},
-            "draws": [[0, 0, 2], [7, 0, 2]],
+            "draws": draws(rows[rows["trial"] == name]),
         }
         for name, about in known.items()
     }
@@ -68,7 +74,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "- World paper: λ resampled, T = 100 s, free where the risk map is above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each trial: 4 episodes on 2 maps.",
-        "¹ objective: its own time",
+        "¹ minimises, in place of the task's J: its own time",
         "    benchnav-eval run --seeds '[0,7]'",
     ):
         assert line in text.splitlines()
@@ -134,7 +140,7 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
 
 
 def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
-    rows = made.rows(made.row(made.trial(world="stakes"), 4, None, outcome="immobilised"))
+    rows = made.rows(made.row(made.trial(world="stakes"), i, None, outcome="immobilised") for i in range(5))
     folder = run_folder(tmp_path / "run", rows)
     about = {**made.held_recording().about, "trial": rows["trial"][0]}
     write_playback(folder, "a", made.held_recording(about=about))
@@ -165,7 +171,7 @@ def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     printed = capsys.readouterr().out
     assert printed.startswith("World paper: λ resampled, T = 100 s")
     assert "T if success [s]" in printed
-    assert "¹ objective: its own time" in printed
+    assert "¹ minimises, in place of the task's J: its own time" in printed
     assert "\nstd:\nThe highest success rate is that of " in printed
     assert "\x1b" not in printed
 

@@ -15,12 +15,13 @@ import torch
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.folder import open_run, write_run
 from benchnav.eval.run.rerun import Comparison, compare, rerun
 from benchnav.eval.run.runner import Workers, run_suite
 from benchnav.eval.suite import Suite
 from benchnav.share import Share
 from tests import factories
+from tests.eval.forged import forge_rows
 
 HERE = Workers()
 MINE = "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
@@ -53,7 +54,7 @@ def change_rows(run: Path, changes: Mapping[str, object], where: str) -> None:
     chosen = rows.eval(where)
     for name, value in changes.items():
         rows.loc[chosen, name] = value
-    rows.to_parquet(run / "episodes.parquet")
+    forge_rows(run, rows)
 
 
 def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_the_time_limit_of_planners_is_repeated(suite: Suite, tmp_path: Path) ->
     run = finish(suite, tmp_path / "run")
     about = json.loads((run / "run.json").read_text())
     assert "planner_limit_s" in about
-    (run / "run.json").write_text(json.dumps({**about, "planner_limit_s": 77.0}))
+    write_run(run, {**about, "planner_limit_s": 77.0})
     next(steps := rerun(run, tmp_path / "again", HERE))
     steps.close()
     assert open_run(tmp_path / "again").about["planner_limit_s"] == 77.0
@@ -88,7 +89,7 @@ def test_the_device_is_repeated_and_refused_where_it_is_not(
     run = finish(suite, tmp_path / "run")
     about = json.loads((run / "run.json").read_text())
     assert about["device"] == "cpu"
-    (run / "run.json").write_text(json.dumps({**about, "device": "cuda"}))
+    write_run(run, {**about, "device": "cuda"})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU"):
         next(rerun(run, tmp_path / "again", HERE))

@@ -516,7 +516,8 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
         return [line for line in lines if "within T" in line]
 
     # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
-    assert told(10.2) == ["in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"]
+    line = "warning: in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"
+    assert told(10.2) == [line]
     assert told(10.4) == []
     assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []
 
