@@ -403,7 +403,7 @@ def option_files(kind: str, part: Part) -> dict[str, str]:
         if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
             raise ConfigError(
                 f"Expected options of {kind} {part.part!r} that name files or folders of their own, got {text!r}, "
-                "which holds the working folder. Name the folder that is read, or list the option in the part's `writes`."
+                "which holds the working folder. Name the folder that is read, or list the option in its `writes`."
             )
         if there or os.sep in text or re.search(r"\.[A-Za-z]\w*$", text):
             found[text] = digest_of_path(path) if there else ""
