@@ -98,22 +98,27 @@ def code_of(about: Mapping[str, Any], trial: Trial) -> dict[str, Any]:
         about: the `run.json` of its run.
         trial: of the run.
     """
-    known = {f"{kind} {part.part}": part for kind in PART_KINDS if (part := getattr(trial, kind))}
+    used = {
+        f"{kind} {getattr(trial, kind).part}": json.dumps(dict(getattr(trial, kind).options))
+        for kind in PART_KINDS
+    }
 
     def bears(name: str) -> bool:
-        text, _, owner = name.rpartition(" of ")
-        return name in known or (owner in known and json.dumps(text) in json.dumps(known[owner].options))
+        named = ((name.removesuffix(f" of {owner}"), options) for owner, options in used.items())
+        return name in used or any(text != name and json.dumps(text) in options for text, options in named)
 
-    return _code({**about, "parts": {name: about["parts"][name] for name in about["parts"] if bears(name)}})
+    parts = {name: identity for name, identity in about.get("parts", {}).items() if bears(name)}
+    return _code({**about, "parts": parts})
 
 
 def _code(about: Mapping[str, Any]) -> dict[str, Any]:
-    code = about["code"]
+    """All that rows depend on beside trials and maps; runs of earlier versions do not say all of it."""
+    code = about.get("code", {})
     return {
-        "benchnav's own sources": {"digest": code["sources"]},
-        **code["versions"],
-        **{name: code[name] for name in ("processor", "compiles")},
-        "planner_limit_s": about["planner_limit_s"],
+        **({"benchnav's own sources": {"digest": code["sources"]}} if "sources" in code else {}),
+        **code.get("versions", {}),
+        **{name: code[name] for name in ("processor", "compiles") if name in code},
+        **({"planner_limit_s": about["planner_limit_s"]} if "planner_limit_s" in about else {}),
         "device": _device(about),
         **about["parts"],
     }
