@@ -165,7 +165,7 @@ def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every
     assert f"Different code: {latex(line)}." in out.with_suffix(".tex").read_text()
     assert list(pd.read_csv(out.with_suffix(".csv"))["different_code"]) == [line]
     same = run_folder(tmp_path / "c", episodes[episodes["risk"] == "mean"])
-    table, shown = compare_runs([cautious, same], "risk", "", {}, 0.05)
+    _, shown = compare_runs([cautious, same], "risk", "", {}, 0.05)
     assert not any("Different" in note for note in shown.notes)
 
 
@@ -228,7 +228,7 @@ def test_two_settings_under_one_label_are_refused(tmp_path: Path) -> None:
     other = {"mppi": {"planner": {"part": "mppi", "options": {"samples": 9}}}}
     second = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"], values=other)
     with pytest.raises(
-        ConfigError, match="one planner under each label.*'mppi': planner.options.samples None and 9"
+        ConfigError, match=r"one planner under each label.*'mppi': planner\.options\.samples None and 9"
     ):
         compare_runs([first, second], "risk", "", {}, 0.05)
 
@@ -264,7 +264,8 @@ def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tm
     assert (table["n_maps"][0], table["n_episodes"][0]) == (10, 10)
     assert [note for note in shown.notes if "Left out" in note] == [
         "Left out: 1 of 11 episodes of cvar, on which mean was not run (seed 2 on map 0).",
-        "Left out: 11 of 21 episodes of mean, on which cvar was not run (seed 0 on maps 10 to 11; seed 1 on maps 0 to 8).",
+        "Left out: 11 of 21 episodes of mean, on which cvar was not run "
+        "(seed 0 on maps 10 to 11; seed 1 on maps 0 to 8).",
     ]
 
 

@@ -96,6 +96,8 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         if "planning [ms]" not in headings:
             results = (*results[:-2], results[-1])
         rows.append((*labels, *(str(row[name]) for name in counts), *results))
+    if any("¶" in cell for row in rows for cell in row):
+        notes.append("¶ compiled planner: its time is that of compiled code.")
     rate = headings.index("Succ. [%]")
     alike = [place for place, value in enumerate(summary["best_alike"]) if value]
     return ResultTable(
