@@ -150,15 +150,16 @@ def compare(
     world: str = "",
     data: str = "",
     points: float = 5.0,
+    allow_different: Literal["nothing", "code"] = "nothing",
     out: str = "",
 ) -> None:
-    """Compare trials that met the same maps under the same luck, with intervals and corrected tests.
+    """Compare conditions that met the same maps with the same draws of λ, with intervals and corrected tests.
 
     Args:
         folders: Folders of finished runs, one or more.
         against: What all others are compared with, such as mean or straight; all pairs when not given.
-        by: Label in which trials differ: risk, planner, model, objective, robot, world or run. When not given, that in
-            which `against` is found; run where runs share trials; else risk.
+        by: In what conditions differ, and in nothing else: risk, planner, model, objective, robot, world or run. When
+            not given, that in which `against` is found; run where runs share conditions; else risk.
         planner: Planners that are looked at, as the table calls them, with a comma between; all when not given.
         risk: Risk settings.
         scenario: Scenarios.
@@ -168,6 +169,7 @@ def compare(
         world: Worlds.
         data: Datasets.
         points: Difference of success in percentage points, for which the maps that it needs are told.
+        allow_different: code compares conditions that other code made too, and names in every table what differs.
         out: Path without a suffix; .csv, .md and .tex are written there.
     """
     from benchnav.errors import ConfigError
@@ -180,7 +182,8 @@ def compare(
         **{"robot": robot, "objective": objective, "world": world, "data": data},
     }
     asked = {name: label for name, label in labels.items() if label}
-    table, shown = compare_runs([Path(folder) for folder in folders], by, against, asked, points / 100)
+    runs = [Path(folder) for folder in folders]
+    table, shown = compare_runs(runs, by, against, asked, points / 100, allow_different == "code")
     print_comparison(shown)
     if out:
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))

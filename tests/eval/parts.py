@@ -19,6 +19,7 @@ class Spy:
     """Stands still, and writes down what it is given."""
 
     steers = (("speed_mps", "turn_rate_radps"),)
+    writes = ("log",)
 
     def __init__(self, log: str, gain: float = 1.0) -> None:
         self.log, self.gain = Path(log), gain
@@ -138,6 +139,8 @@ class Picky(Faulty):
 class Held(Faulty):
     """Writes down which process began it; one that a file beside names, `PID N`, ends nothing from its Nth on."""
 
+    writes = ("log",)
+
     def __init__(self, log: str) -> None:
         super().__init__()
         self.log = Path(log)
@@ -185,6 +188,8 @@ def least(mixture: TraversabilityMixture, factor: float = 1.0) -> torch.Tensor:
 
 class Asleep:
     """Writes down which process began it, and does not wake."""
+
+    writes = ("folder",)
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)

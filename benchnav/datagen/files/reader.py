@@ -79,12 +79,6 @@ class TerrainDataset:
         return recipe_from_dict(self.manifest["recipes"][0], f"in {self.path}")
 
     @property
-    def truth(self) -> str:
-        """Where the true distribution of λ is from: "generated" by the recipe, or "unknown", as on imported ground."""
-        parts = [part for split in self.splits.values() for part in split["parts"]]
-        return "unknown" if any(part.get("source") for part in parts) else "generated"
-
-    @property
     def grid(self) -> Grid:
         """Size and resolution of every map."""
         return self.recipe.grid

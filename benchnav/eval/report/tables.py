@@ -102,6 +102,8 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         rows.append(
             (*labels, *(str(row[name]) for name in counts), *(results[h] for h in headings if h in results))
         )
+    if any("¶" in cell for row in rows for cell in row):
+        notes.append("¶ compiled planner: its time is that of compiled code.")
     rate = headings.index("Succ. [%]")
     alike = [place for place, value in enumerate(summary["best_alike"]) if value]
     return ResultTable(

@@ -17,7 +17,7 @@ _HELD = 3_000_000
 
 
 def success_interval(
-    gain: np.ndarray, draws: int, confidence: float = 0.95
+    gain: np.ndarray, draws: float, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Difference of success rates, with the adjusted Wald interval for paired proportions.
 
@@ -30,7 +30,7 @@ def success_interval(
 
     Args:
         gain: successes of the one trial less those of the other by map, whole numbers, shape [..., M], M ≥ 2.
-        draws: episodes of a trial on each map.
+        draws: episodes of a trial on each map, their mean where the numbers differ.
         confidence: coverage asked for.
 
     Returns:
@@ -43,7 +43,7 @@ def success_interval(
     return share.mean(-1), np.maximum(centre - half, -1), np.minimum(centre + half, 1)
 
 
-def standard_deviation(gain: np.ndarray, draws: int) -> np.ndarray:
+def standard_deviation(gain: np.ndarray, draws: float) -> np.ndarray:
     """Standard deviation over maps of the difference of success, with the two maps that `success_interval` adds.
 
     Args:

@@ -4,6 +4,9 @@ The map is the unit. Episodes on one map, under other seeds or realisations, hav
 hundred of them on twenty maps tell less than a hundred maps would. The design effect says how much less.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from scipy.stats import norm
@@ -95,6 +98,30 @@ def cautious_design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     ends = np.repeat([True, False], each)
     effect = design_effect(np.concatenate([success, ends]), np.concatenate([member, added]))
     return min(effect, len(success))
+
+
+def units_of(episodes: pd.DataFrame) -> pd.Series:
+    """The statistical unit of each row: its group of maps, or its map where the dataset has no groups.
+
+    Args:
+        episodes: rows of one dataset's split.
+    """
+    return episodes["group" if "group" in episodes else "instance"]
+
+
+def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
+    """T of each episode in seconds: what a failure counts as, and what a success might have cost.
+
+    Args:
+        episodes: rows of one condition.
+        world: of the condition, as `run.json` holds it.
+    """
+    if "time_budget_ratio" in world:
+        # The time over its ratio is the reference time at the robot's top speed.
+        granted = world["time_budget_ratio"] * episodes["total_time_s"] / episodes["time_ratio"]
+    else:
+        granted = world["time_budget_s"]
+    return episodes["total_time_s"].where(~episodes["success"], granted)
 
 
 def summarise(episodes: pd.DataFrame) -> pd.DataFrame:

@@ -140,6 +140,47 @@ def test_code_that_changed_is_named_beside_the_rows(suite: Suite, tmp_path: Path
     assert "mine.py" in comparison.lines[-1]
 
 
+def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_and_repetition(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    helper, weights = tmp_path / "helper_of_mine.py", tmp_path / "weights.txt"
+    helper.write_text("from tests.eval.parts import Faulty\n")
+    weights.write_text("1.0")
+    (tmp_path / "mine.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom helper_of_mine import Faulty\n\n"
+        "class Mine(Faulty):\n    def __init__(self, weights: str = ''):\n"
+        "        super().__init__('give up', float(open(weights).read()))\n"
+    )
+    own = {"part": f"{tmp_path / 'mine.py'}:Mine", "options": {"weights": "weights.txt"}}
+    suite = replace(suite, planners=(own,))
+    run = finish(suite, tmp_path / "run")
+    assert repeat(run, tmp_path / "same").lines[-1] == "nothing that is known of the environment differs"
+    name = f"planner {tmp_path / 'mine.py'}:Mine"
+    for changed, content, told in (
+        (helper, "from tests.eval.parts import Faulty\nx = 1\n", f"these changed: {name}. Choose"),
+        (weights, "2.0", f"these changed: weights.txt of {name}. Choose"),
+    ):
+        before = changed.read_text()
+        changed.write_text(content)
+        for asked in (suite, replace(suite, realisations=2)):
+            with pytest.raises(ConfigError, match=told):
+                finish(asked, run)
+        if changed is weights:
+            comparison = repeat(run, tmp_path / "again")
+            assert (len(comparison.different), comparison.lines[-1]) == (
+                2, f"what differs in the environment: weights.txt of {name}",
+            )  # fmt: skip
+        changed.write_text(before)
+    steps = run_suite(suite, tmp_path / "other")
+    next(steps)
+    weights.write_text("3.0")
+    with pytest.raises(ConfigError, match=r"While .* running these changed: weights\.txt of"):
+        list(steps)
+    del sys.modules["helper_of_mine"]
+
+
 def test_maps_that_changed_are_named(suite: Suite, tmp_path: Path) -> None:
     run = finish(suite, tmp_path / "run")
     factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
