@@ -223,7 +223,10 @@ class CLRRT:
             problem=plan_state.problem.select(members),
             route=map_tensors(keep, plan_state.route),
             tracking=map_tensors(keep, plan_state.tracking),
-            **{name: keep(getattr(plan_state, name)) for name in ("edge", "failures", "mark_m", "mark_step")},
+            edge=keep(plan_state.edge),
+            failures=keep(plan_state.failures),
+            mark_m=keep(plan_state.mark_m),
+            mark_step=keep(plan_state.mark_step),
         )
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
