@@ -181,7 +181,9 @@ def test_the_paths_are_those_of_the_maps_own_luck(
 
 def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.trial(risk=f"cvar:0.{i:02}", world="stakes"), 1) for i in range(MOST_PATHS + 2)
+        made.row(made.trial(risk=f"cvar:0.{i:02}", world="stakes"), instance)
+        for instance in range(2)
+        for i in range(MOST_PATHS + 2)
     )
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
