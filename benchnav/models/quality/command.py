@@ -167,8 +167,14 @@ def _beside_colour(by_colour: "Mapping[str, float]", qualities: "Mapping[str, Qu
 
 def _seen(dataset: "TerrainDataset", splits: "Sequence[str]", known: "Mapping[str, str]") -> list[str]:
     """Says which splits hold the very maps that the model was trained on, by their digests."""
-    digests = {split: dataset.splits[split]["digest"] for split in splits}
-    found = [f"{split} (its {known[digest]})" for split, digest in digests.items() if digest in known]
+    # Checkpoints of earlier versions hold the digest of the arrays alone.
+    digests = {split: (dataset.split_digest(split), dataset.splits[split]["digest"]) for split in splits}
+    found = [
+        f"{split} (its {known[digest]})"
+        for split, both in digests.items()
+        for digest in both
+        if digest in known
+    ]
     if not found:
         return []
     return [
