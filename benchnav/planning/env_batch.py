@@ -77,8 +77,8 @@ class EnvBatch:
             raise ConfigError(
                 f"Expected a reference time on each map of split {split!r} of {dataset.path}, of which this world's "
                 f"time budget is a multiple, got none on {lacking} of {len(self._maps)}. Make such maps: "
-                f"benchnav-datagen create RECIPE id=NAME splits.{split}.solvable=true; or give a budget: world={{'preset': 'stakes', "
-                "'time_budget_s': 60}."
+                f"benchnav-datagen create RECIPE id=NAME splits.{split}.solvable=true; or give a budget: "
+                "world={'preset': 'stakes', 'time_budget_s': 60}."
             )
         # To be refused at once.
         self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)
