@@ -56,8 +56,8 @@ def test_the_manifest_says_where_the_maps_came_from(tmp_path: Path) -> None:
 
 
 def test_with_solvable_maps_behind_a_wall_are_left_out(tmp_path: Path) -> None:
-    values = np.zeros((16, 72))
-    values[:, 24 + 12 :] = 50  # through map 1, between start and goal
+    values = np.full((16, 72), 10.0)
+    values[:, 24 + 12 :] = 60  # through map 1, between start and goal
     flat = np.zeros((16, 72), np.uint8)
     dem, classes = write(tmp_path / "dem.tif", values), write(tmp_path / "classes.tif", flat)
     dataset = read(dem, classes=classes, solvable=True)
