@@ -63,6 +63,7 @@ from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial, check_labels
 from benchnav.eval.unit import Extent, Unit, in_table_order, units
 from benchnav.files import sole_writer
+from benchnav.planning.planners.planner import what_it_follows
 from benchnav.planning.world.outcome import Outcome
 from benchnav.share import Share
 from benchnav.workers import end_with
@@ -416,9 +417,9 @@ def _about(earlier: Mapping[str, Any], work: Work, trials: Trials) -> dict[str, 
 def _notes(trial: Trial) -> dict[str, Any]:
     """What tables say of a trial's planner."""
     planner = trial.make_planner()
-    remarks = getattr(planner, "remarks", None)
+    task, remarks = trial.make_task(), getattr(planner, "remarks", None)
     return {
-        "follows": str(getattr(planner, "follows", "J")),
-        "remarks": list(remarks(trial.make_task())) if remarks else [],
+        "follows": what_it_follows(planner, task),
+        "remarks": list(remarks(task)) if remarks else [],
         "changed": changed_options(trial.planner),
     }

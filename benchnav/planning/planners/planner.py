@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Robot
 
 
@@ -90,7 +90,8 @@ class Planner(Protocol[State]):
 
     - `steers`: tuples of action names; a robot of other actions is refused before anything runs. Without
       it any robot is accepted.
-    - `follows`: whose objective it follows, for tables, where it is not the user's J alone.
+    - `follows(task)`: a line on what it minimises, for tables, where that is not the task's J alone; empty where it
+      is.
     - `blind`: on the class, true where it looks at nothing predicted, so that one run stands for every
       model and risk setting.
     - `remarks(task)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
@@ -122,6 +123,23 @@ class Planner(Protocol[State]):
             Actions within the bounds, shape [B, A]; the next plan state; what was planned.
         """
         ...
+
+
+def what_it_follows(planner: Any, task: Task) -> str:
+    """What a planner minimises in place of the task's J, in words; empty where it minimises J alone.
+
+    Raises:
+        ConfigError: its `follows` is no function, as it was in earlier versions.
+    """
+    follows = getattr(planner, "follows", None)
+    if follows is None:
+        return ""
+    if not callable(follows):
+        raise ConfigError(
+            f"Expected `follows` of planner {type(planner).__name__} as a function of the task, got {follows!r}. "
+            "Write `def follows(self, task)`."
+        )
+    return str(follows(task))
 
 
 def check_steers(planner: Any, robot: Robot, name: str) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot, action_limits
 
 # Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
@@ -53,8 +53,11 @@ class Straight:
     """The blind baseline: full speed straight at the goal, whatever the ground is."""
 
     steers = STEERS
-    follows = "none, drives straight at the goal"
     blind = True
+
+    def follows(self, task: Task) -> str:
+        """That it minimises nothing; see `Planner`."""
+        return "nothing, drives straight at the goal"
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
         """Keeps the problem, for its goals; draws nothing. See `Planner`."""

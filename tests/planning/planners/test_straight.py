@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchnav.errors import ConfigError
-from benchnav.planning.planners.planner import check_steers
+from benchnav.planning.planners.planner import check_steers, what_it_follows
 from benchnav.planning.planners.straight import Straight, steer_toward
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -93,7 +93,7 @@ def test_it_is_blind() -> None:
     assert plan.status.tolist() == [0, 0]
     torch.testing.assert_close(plan.path[0], torch.tensor([[1.25, 1.25], [6.75, 6.75]]))
     assert planner.blind
-    assert "straight" in planner.follows
+    assert "straight" in planner.follows(factories.task())
 
 
 def test_it_drives_through_what_others_avoid() -> None:
@@ -112,3 +112,10 @@ def test_it_refuses_robots_of_other_actions() -> None:
     check_steers(Straight(), BICYCLE, "straight")
     with pytest.raises(ConfigError, match="gait"):
         check_steers(Straight(), Legged(), "straight")
+
+
+def test_what_a_planner_minimises_is_asked_of_the_task() -> None:
+    assert "straight" in what_it_follows(Straight(), factories.task())
+    assert what_it_follows(object(), factories.task()) == ""
+    with pytest.raises(ConfigError, match="def follows"):
+        what_it_follows(type("Old", (), {"follows": "travel time"})(), factories.task())

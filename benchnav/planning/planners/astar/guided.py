@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
-from benchnav.planning.objective import path_cost_of, path_length, toward_waypoints
+from benchnav.planning.objective import GoalDistance, path_cost_of, path_length, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
@@ -98,10 +98,11 @@ class Guided(Generic[Local]):
         """Keeps the settings; all else is in the plan state."""
         self.guide, self.local = guide, local
 
-    @property
-    def follows(self) -> str:
-        """Whose objectives it follows."""
-        return f"path cost of J (A*), J ({self.local.name})"
+    def follows(self, task: Task) -> str:
+        """What A* minimises where that is the length of the path and not J; see `Planner`."""
+        if isinstance(task.objective, GoalDistance) or path_cost_of(task.objective) is path_length:
+            return f"3D path length (A*), J ({self.local.name})"
+        return ""
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Says what a path costs where J does not, and where no risk setting moves the path; see `Planner`."""

@@ -117,9 +117,8 @@ def _unsound_attributes(planner: Any) -> Breaches:
         and all(isinstance(n, tuple) and all(isinstance(a, str) for a in n) for n in known)
     ):
         yield f"Expected `steers` as tuples of action names, got {known!r}."
-    for name, kind in (("follows", str), ("blind", bool)):
-        if not isinstance(getattr(planner, name, kind()), kind):
-            yield f"Expected `{name}` of type {kind.__name__}, got {getattr(planner, name)!r}."
+    if not isinstance(getattr(planner, "blind", False), bool):
+        yield f"Expected `blind` of type bool, got {planner.blind!r}."
 
 
 def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
@@ -156,6 +155,11 @@ def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
 
 
 def _unsound_remarks(planner: Any, task: Task) -> Breaches:
+    if hasattr(planner, "follows"):
+        follows, found = watch("follows", lambda: planner.follows(task))
+        yield from found
+        if follows is not NOTHING and not (isinstance(follows, str) and "\n" not in follows):
+            yield "Expected `follows` to give a single line, got something else."
     if not hasattr(planner, "remarks"):
         return
     remarks, found = watch("remarks", lambda: planner.remarks(task))

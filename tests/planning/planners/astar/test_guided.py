@@ -187,8 +187,23 @@ def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
     torch.testing.assert_close(plan.reference[:, -1], problem.goal_m)
 
 
-def test_it_says_whose_objectives_it_follows() -> None:
-    assert Guided(GuideConfig(), Constant((0, 0))).follows == "path cost of J (A*), J (constant)"
+def test_it_says_where_the_path_is_the_shortest_and_not_the_cheapest_by_the_objective() -> None:
+    class Own:
+        """A J that says nothing of paths."""
+
+    class OwnPath(Own):
+        def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
+            return 1 / traversability
+
+    planner = Guided(GuideConfig(), Constant((0, 0)))
+    for objective in (GoalDistance(), Own()):
+        follows = planner.follows(factories.task(objective=objective))  # type: ignore[arg-type]
+        assert follows == "3D path length (A*), J (constant)"
+    for objective in (TravelTime(Unicycle(), 1.0), OwnPath()):
+        assert planner.follows(factories.task(objective=objective)) == ""  # type: ignore[arg-type]
+
+
+def test_a_look_ahead_that_looks_nowhere_is_refused() -> None:
     with pytest.raises(ConfigError, match="lookahead_m"):
         GuideConfig(lookahead_m=0)
 

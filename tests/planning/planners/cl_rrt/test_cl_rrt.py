@@ -11,7 +11,7 @@ from torch import Tensor
 from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.eval.run.rollout import run_episodes
-from benchnav.planning.objective import distance
+from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt import cl_rrt
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig, CLRRTState
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
@@ -494,7 +494,8 @@ def test_robots_that_it_cannot_steer_are_refused_before_anything_runs(robot: Rob
 def test_what_tables_say_of_it() -> None:
     planner = CLRRT()
     assert planner.steers == (("speed_mps", "turn_rate_radps"),)
-    assert planner.follows == "travel time"
+    assert planner.follows(factories.task()) == "simulated time to the goal"
+    assert planner.follows(factories.task(objective=TravelTime(Unicycle(), 1.0))) == ""
     assert planner.remarks(factories.task(Unicycle())) == ()
     assert planner.remarks(factories.task(Unicycle(speed_mps=(-1.0, 3.0)))) == ()
     (remark,) = planner.remarks(factories.task(DifferentialDrive()))
