@@ -16,7 +16,7 @@ from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, Pair, find_pairs
-from benchnav.eval.stats.summary import LABELS
+from benchnav.eval.stats.summary import LABELS, time_budgets
 from benchnav.eval.trial import NOT_USED
 from benchnav.files import write_text
 
@@ -100,13 +100,13 @@ def read_trials(runs: Sequence[Run]) -> list[Compared]:
     for run, name in zip(runs, names, strict=True):
         episodes = dict(list(read_table(run.folder, EPISODES).groupby("trial", sort=False)))
         for trial, about in run.about["trials"].items():
-            labels, value = about["labels"], about["value"]
+            labels, value, rows = about["labels"], about["value"], episodes[trial]
             found.append(
                 Compared(
                     labels={**labels, "run": name if shared[trial] > 1 else NOT_USED},
                     world=value["world"],
                     maps=run.about["datasets"][labels["data"]]["maps"][value["split"]],
-                    episodes=episodes[trial],
+                    episodes=rows.assign(time_budget_s=time_budgets(rows, value["world"])),
                 )
             )
     return found

@@ -82,8 +82,8 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
     return (
         f"Family: {pairs}. Holm's correction is over all of them, for success and for T_total apart.",
         "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
-        "interval of Bonett and Price. T_total: a failure counts as T; Wilcoxon's signed-rank test, bootstrap over "
-        "maps.",
+        "interval of Bonett and Price. T_total: a failure counts as T; Wilcoxon's signed-rank test, and an "
+        "interval of the mean from those of success and of the time without failures.",
         "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "
         f"where there are fewer than {LEAST_MAPS} maps.",
         "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %; "

@@ -30,7 +30,7 @@ from benchnav.eval.report.page import Drawn, write_page
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recorded.recording import read_snapshots
 from benchnav.eval.report.rendering import markdown, to_markdown, to_terminal
-from benchnav.eval.report.tables import NOT_USED, ResultTable, result_table
+from benchnav.eval.report.tables import NOT_USED, ResultTable, maps_in_words, result_table
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.stats.best import against_best, told_the_truth
 from benchnav.eval.stats.summary import summarise
@@ -39,8 +39,8 @@ from benchnav.files import write_text
 PAGE = "report.html"
 
 _SUCCESS = (
-    "Success rates with their 95 % intervals; filled: not told from the best of its panel by the paired test; grey: "
-    "planners that look at nothing predicted."
+    "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where another "
+    "is; grey: planners that look at nothing predicted."
 )
 _OUTCOMES = "How episodes ended."
 _DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean λ met."
@@ -95,7 +95,8 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     if run.version == 1:
         episodes = convert_rows(episodes, about)
         about = {**about, **convert_about(about, episodes)}
-    summary = summarise(episodes)
+    worlds = {trial: entry["value"]["world"] for trial, entry in about["trials"].items()}
+    summary = summarise(episodes, worlds)
     best = against_best(episodes, summary, told_the_truth(about["trials"]))
     summary = summary.merge(best, on="trial", how="left", validate="1:1")
     failures = failures_table(folder, episodes)
@@ -150,9 +151,9 @@ def print_report(report: Report) -> None:
 def _charts(folder: Path, report: Report) -> list[Drawn]:
     """Draws the figures at the width of a column."""
     summary = report.summary
-    alike = set(summary.loc[summary["best_alike"], "trial"])
+    marked = set(summary.loc[summary["best_marked"], "trial"])
     made: list[tuple[str, str, Callable[[], Figure]]] = [
-        ("success", _SUCCESS, partial(success_figure, summary, alike))
+        ("success", _SUCCESS, partial(success_figure, summary, marked))
     ]
     sweeps = find_sweeps(report.about["trials"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
@@ -201,8 +202,9 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     lines = [f"World {label}: {text}." for label, text in worlds.items()]
     seeds = dict.fromkeys(seed for trial in trials for seed in trial["seeds"])
     lines.append(f"Data: {_list(summary['data'])}. Models: {_list(summary['model'])}. Seeds: {_list(seeds)}.")
-    if summary["n_episodes"].nunique() == summary["n_maps"].nunique() == 1:
-        lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {summary['n_maps'][0]} maps.")
+    if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
+        maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
+        lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {maps}.")
     options = dict.fromkeys(
         f"{trial['labels']['planner']} {change}" for trial in trials for change in trial.get("changed", ())
     )

@@ -7,14 +7,17 @@ import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.stats.difference import (
-    mean_intervals,
+    by_map,
+    mean_interval,
     sign_flip_p,
     signed_rank_p,
     standard_deviation,
     success_interval,
+    total_time_interval,
 )
 from benchnav.eval.stats.pairing import Pair
 from benchnav.eval.stats.power import maps_needed, smallest_difference
+from benchnav.eval.stats.summary import units_of
 
 ALPHA = 0.05
 
@@ -37,23 +40,55 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     alpha = ALPHA / len(pairs)
     table = pd.DataFrame([_compare_success(pair, alpha, difference) for pair in pairs])
     late = [_late(pair.episodes) for pair in pairs]
-    table = table.join(_intervals(late, "time"))
+    table = table.join(_columns("time", [time_difference(pair.episodes) for pair in pairs]))
     table["time_p"] = [signed_rank_p(values) for values in late]
     arrived = [
         _late(pair.episodes[pair.episodes["success"] & pair.episodes["success_other"]]) for pair in pairs
     ]
-    table = table.join(_intervals(arrived, "arrival_time"))
+    table = table.join(_columns("arrival_time", [mean_interval(values) for values in arrived]))
     table["arrival_time_n_maps"] = [len(values) for values in arrived]
     for name in ("success_p", "time_p"):
         table[f"{name}_holm"] = multipletests(table[name], ALPHA, method="holm")[1]
     return table
 
 
+def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Difference of T_total of a pair, a failure counted as T, with the interval of `total_time_interval`.
+
+    Args:
+        rows: as `Pair.episodes`.
+        confidence: coverage asked for.
+
+    Returns:
+        Difference and the ends of its interval in seconds.
+    """
+    units, arrived, arrival_s, budget_s = units_of(rows), [], [], []
+    for suffix in ("", "_other"):
+        success = rows[f"success{suffix}"].astype(bool)
+        arrived.append(set(units[success]))
+        arrival_s.append(rows.loc[success, f"total_time_s{suffix}"])
+        budget_s.append(rows[f"time_budget_s{suffix}"])
+    arrivals = pd.concat(arrival_s)
+    gain, draws = _gain(rows)
+    _, low, high = success_interval(gain, draws, confidence)
+    mean, low_s, high_s = total_time_interval(
+        _late(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - (arrivals.mean() if len(arrivals) else 0),
+        len(set.intersection(*arrived)), confidence,
+    )  # fmt: skip
+    return float(mean), float(low_s), float(high_s)
+
+
+def _gain(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
+    """Successes of the one less those of the other by map, shape [M], and the mean number of episodes on a map."""
+    gain = rows["success"].astype(int) - rows["success_other"].astype(int)
+    by_unit = gain.groupby(units_of(rows)).sum().to_numpy()
+    return by_unit, len(rows) / len(by_unit)
+
+
 def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, object]:
     rows = pair.episodes
     one, other = rows["success"].astype(int), rows["success_other"].astype(int)
-    gain = (one - other).groupby(rows["instance"]).sum().to_numpy()
-    draws = len(rows) // len(gain)
+    gain, draws = _gain(rows)
     mean, low, high = success_interval(gain, draws)
     std = float(standard_deviation(gain, draws))
     return {
@@ -61,7 +96,7 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
         "one": pair.one,
         "other": pair.other,
         "n_maps": len(gain),
-        "n_draws": draws,
+        "n_draws": round(draws),
         "success_one": one.mean(),
         "success_other": other.mean(),
         "success_difference": float(mean),
@@ -75,9 +110,10 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
 
 def _late(rows: pd.DataFrame) -> np.ndarray:
     """By how much longer one trial took, by map, shape [M]."""
-    return (rows["total_time_s"] - rows["total_time_s_other"]).groupby(rows["instance"]).mean().to_numpy()
+    late = (rows["total_time_s"] - rows["total_time_s_other"]).to_numpy()
+    return by_map(late, units_of(rows).to_numpy())
 
 
-def _intervals(late: Sequence[np.ndarray], name: str) -> pd.DataFrame:
+def _columns(name: str, intervals: Sequence[Sequence[float | np.ndarray]]) -> pd.DataFrame:
     columns = [f"{name}_difference_s", f"{name}_low_s", f"{name}_high_s"]
-    return pd.DataFrame(dict(zip(columns, mean_intervals(late), strict=True)))
+    return pd.DataFrame(np.array(intervals, dtype=float), columns=columns)

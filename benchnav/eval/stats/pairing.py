@@ -25,7 +25,7 @@ class Compared:
         labels: what tables call it, by column; `run` among them, `NOT_USED` where no two runs share a trial.
         world: what λ did, as plain data.
         maps: digests of its maps, in the order of instances.
-        episodes: its rows.
+        episodes: its rows, with T of each as `time_budget_s`.
     """
 
     labels: Mapping[str, str]
@@ -42,7 +42,7 @@ class Pair:
         one: what is compared.
         other: with what.
         shared: labels of the two; of a label that one of them does not use, the other's.
-        episodes: of both, one's `success` and `total_time_s`, the other's with `_other`; maps of which one trial
+        episodes: of both, one's `success`, `total_time_s` and `time_budget_s`, the other's with `_other`; maps of which one trial
             has fewer episodes are left out.
         left_out: episodes of either trial that the other does not have.
     """
@@ -146,8 +146,9 @@ def _pair(one: Compared, other: Compared, by: str) -> Pair:
     common = min(len(one.maps), len(other.maps))
     if list(one.maps[:common]) != list(other.maps[:common]):
         raise ConfigError(f"Expected trials on the same maps, got {names}, whose maps have other digests.")
-    columns = [*_LUCK, "success", "total_time_s"]
-    both = one.episodes[columns].merge(other.episodes[columns], on=_LUCK, suffixes=("", "_other"))
+    columns = [*_LUCK, "success", "total_time_s", "time_budget_s"]
+    grouped = [*columns, "group"] if "group" in one.episodes else columns
+    both = one.episodes[grouped].merge(other.episodes[columns], on=_LUCK, suffixes=("", "_other"))
     if both.empty:
         raise ConfigError(
             f"Expected trials with episodes in common, got {names} with {_luck(one)} and {_luck(other)}."

@@ -6,7 +6,7 @@ import pytest
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.tables import failures_in_words, result_table
-from benchnav.eval.stats.summary import LABELS, summarise
+from benchnav.eval.stats.summary import LABELS
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
@@ -162,7 +162,7 @@ def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows:
 def test_failures_in_words(outcomes: list[str], expected: str) -> None:
     labels = made.trial()
     failed = (made.row(labels, i, None, outcome=outcome) for i, outcome in enumerate(outcomes))
-    summary = summarise(made.rows(made.row(labels, 99), failed))
+    summary = made.summarised(made.rows(made.row(labels, 99), failed))
     assert failures_in_words(summary.to_dict("records")[0]) == expected
 
 

@@ -10,7 +10,6 @@ from benchnav.errors import ConfigError
 from benchnav.eval.report import write
 from benchnav.eval.report.playback.files import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 VERSION_1 = Path(__file__).parent.parent.parent / "data" / "run-1"
@@ -51,7 +50,7 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
 def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", episodes())
     summary = write_report(folder).summary
-    known = summarise(episodes())
+    known = made.summarised(episodes())
     pd.testing.assert_frame_equal(summary[list(known.columns)], known)
     assert {
         "planning_ms_p95_median",

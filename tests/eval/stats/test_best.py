@@ -4,7 +4,6 @@ import pytest
 from scipy.stats import binomtest
 
 from benchnav.eval.stats.best import TOLD, against_best, competing, told_the_truth
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
@@ -17,7 +16,7 @@ def episodes(labels: dict[str, str], successes: range, **changes: object) -> lis
 
 def compared(*trials: list[dict]) -> pd.DataFrame:  # type: ignore[type-arg]
     rows = made.rows(*trials)
-    summary = summarise(rows)
+    summary = made.summarised(rows)
     found = against_best(rows, summary, told_the_truth(made.trials(rows)))
     assert list(found["trial"]) == list(summary["trial"])
     return found.assign(risk=summary["risk"], model=summary["model"]).set_index("risk")

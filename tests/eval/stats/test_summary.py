@@ -4,7 +4,7 @@ import pytest
 from scipy.stats import binomtest
 
 from benchnav.eval.stats.difference import mean_interval
-from benchnav.eval.stats.summary import cautious_design_effect, design_effect, summarise, wilson_interval
+from benchnav.eval.stats.summary import cautious_design_effect, design_effect, wilson_interval
 from tests.eval.report.made import row, rows, trial
 
 
@@ -91,7 +91,7 @@ def test_design_effect_at_its_ends() -> None:
 
 
 def summary_of(*episodes: dict) -> pd.Series:  # type: ignore[type-arg]
-    summary = summarise(rows(*episodes))
+    summary = made.summarised(rows(*episodes))
     assert len(summary) == 1
     return summary.iloc[0]
 
@@ -155,7 +155,7 @@ def test_episodes_of_one_map_are_not_maps() -> None:
 
 def test_a_row_a_trial_in_order_of_appearance() -> None:
     order = [trial("mppi", scenario="std"), trial("cl_rrt", scenario="std"), trial("cl_rrt", scenario="hg")]
-    summary = summarise(rows(*(row(labels, i) for i in range(2) for labels in order)))
+    summary = made.summarised(rows(*(row(labels, i) for i in range(2) for labels in order)))
     assert summary[["planner", "scenario"]].to_numpy().tolist() == [
         ["mppi", "std"], ["cl_rrt", "std"], ["cl_rrt", "hg"]
     ]  # fmt: skip
@@ -179,7 +179,7 @@ def test_planning_time_is_the_median_and_compilation_a_share() -> None:
 def test_time_has_the_interval_of_its_own_trial_over_maps() -> None:
     generator = np.random.default_rng(4)
     taken = {name: generator.uniform(20, 60, (12, 3)) + late for name, late in (("mppi", 0), ("cl_rrt", 30))}
-    summary = summarise(
+    summary = made.summarised(
         rows(
             row(trial(name), m, taken[name][m, seed], seed=seed)
             for seed in range(3)
