@@ -12,6 +12,8 @@ from benchnav.eval.keep import Keep, Record, Steps
 
 PartSpec = str | dict[str, Any]
 
+_SEEDS = 2**63  # what a table's column of whole numbers holds
+
 # What to say in place of settings that had other names.
 RENAMED = {"recorded": "`record`: none, failures, first or all"}
 
@@ -34,7 +36,7 @@ class Suite:
         objectives: Objectives J.
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
             frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
-            time_budget_ratio: T over the map's reference time}.
+            time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, slowest: 0.3,
             goal_radius_m: 1.0}.
         noise: Short for `world.noise`.
@@ -57,7 +59,7 @@ class Suite:
     risks: tuple[PartSpec, ...] = ("cvar", "var", "mean")
     robots: tuple[PartSpec, ...] = ("unicycle",)
     objectives: tuple[PartSpec, ...] = ("goal_distance",)
-    world: PartSpec = "paper"
+    world: tuple[PartSpec, ...] | PartSpec = "paper"
     task: dict[str, Any] = field(default_factory=dict)
     noise: str = ""
     time_budget_s: float = 0.0
@@ -72,13 +74,16 @@ class Suite:
 
     def __post_init__(self) -> None:
         """Refuses suites with nothing in them."""
-        for name in ("planners", "risks", "robots", "objectives"):
+        for name in ("planners", "risks", "robots", "objectives", "world"):
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
         if self.instances < 0:
             raise ConfigError(f"Expected `instances` ≥ 0, got {self.instances}.")
         if self.realisations < 1:
             raise ConfigError(f"Expected `realisations` ≥ 1, got {self.realisations}.")
+        for seed in self.all_seeds:
+            if not 0 <= seed < _SEEDS:
+                raise ConfigError(f"Expected `seed` ≥ 0 and below 2^63, got {seed}.")
         if len(set(self.all_seeds)) != len(self.all_seeds):
             raise ConfigError(f"Expected `seeds` that differ, got {list(self.seeds)}.")
         _ = self.keep  # refuses what is no choice

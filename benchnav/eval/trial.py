@@ -13,10 +13,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.eval.suite import Suite
 from benchnav.eval.sweep import each_mapping, each_part
+from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.problem import Task
 from benchnav.planning.risk import RiskMeasure
@@ -147,33 +150,44 @@ def trials_of(suite: Suite, scenarios_of: Any) -> list[Trial]:
         ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
     """
     _check_options_used(suite)
-    found: dict[str, Trial] = {}
+    every: list[Trial] = []
     for product in suite.trials or ({},):
         here: set[str] = set()
         for trial in _product(suite, product, scenarios_of):
             if trial.id in here and trial.risk.label != NOT_USED:
                 raise ConfigError(f"Expected settings that differ, got twice what {_words(trial)} is.")
             here.add(trial.id)
-            if found.setdefault(trial.id, trial).labels != trial.labels:
-                raise ConfigError(f"Expected one label for one setting, got two for what {_words(trial)} is.")
-    check_labels(found.values())
-    return list(found.values())
+            every.append(trial)
+    check_labels(every)
+    return list({trial.id: trial for trial in every}.values())
 
 
 def check_labels(trials: Iterable[Trial]) -> None:
-    """Refuses two settings under one label, which no reader of a table could tell apart.
+    """Refuses two settings under one label, which no reader of a table could tell apart, and two labels of one.
+
+    Args:
+        trials: those that had their labels first come first; one condition may be there twice.
 
     Raises:
         ConfigError: there are such.
     """
     known: dict[tuple[str, str], Any] = {}
+    labels: dict[tuple[str, str], str] = {}
     for trial in trials:
         for name, label in trial.labels.items():
+            if label == NOT_USED:
+                continue
             value = _labelled(trial, name)
-            if known.setdefault((name, label), value) != value and label != NOT_USED:
+            if known.setdefault((name, label), value) != value:
                 raise ConfigError(
                     f"Expected a label for each {name}, got two settings that are both called {label!r}. "
                     f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
+                )
+            first = labels.setdefault((name, repr(value)), label)
+            if value is not None and first != label:
+                raise ConfigError(
+                    f"Expected one label for one {name}, got {label!r} for what is called {first!r}. Write "
+                    f"label: {first}."
                 )
 
 
@@ -204,7 +218,9 @@ def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Ite
     }
     worlds = [
         _world(suite, world, task)
-        for listed_world in chosen("world", (suite.world,))
+        for listed_world in chosen(
+            "world", suite.world if isinstance(suite.world, list | tuple) else (suite.world,)
+        )
         for world in each_mapping(listed_world)
         for listed_task in chosen("task", (suite.task,))
         for task in each_mapping(listed_task)
@@ -230,7 +246,18 @@ def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
     if kind == "planner" and part.part in suite.planner_options:
         part = replace(part, options={**suite.planner_options[part.part], **part.options})
     every = each_part(kind, part)
-    return [read_model(one) if kind == "model" else registry.complete(kind, one) for one in every]
+    made = [read_model(one) if kind == "model" else registry.complete(kind, one) for one in every]
+    for one in made if kind == "risk" else ():
+        _check_risk(one)
+    return made
+
+
+def _check_risk(part: Part) -> None:
+    """Lets a shipped risk measure refuse its options, on the distribution of one cell; be it that no trial uses it."""
+    measure = registry.make("risk", part)
+    if registry.find("risk", part.part).shipped:
+        cell = torch.full((1, 1, 1, 1), 0.5)
+        measure(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
 
 
 def read_model(given: Any) -> Part:

@@ -7,7 +7,9 @@ is written under another name first. Version 2 had all steps within the files of
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import secrets
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +19,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
+from benchnav.eval.folder import schema
 from benchnav.eval.keep import Keep
 from benchnav.eval.trial import Trial, trial_from
 from benchnav.eval.unit import Extent, Unit
 from benchnav.files import replacing, write_text
+from benchnav.options import one_line
 from benchnav.share import Share
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 3
@@ -54,50 +58,103 @@ def open_run(folder: Path) -> Run:
     Raises:
         ConfigError: the folder is no run folder, or of a newer format.
     """
-    try:
+    if not (folder / RUN).is_file():
+        raise ConfigError(
+            f"Expected a run folder with {RUN}, got {folder}. Make one with `benchnav-eval run`."
+        )
+    with _damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
         about = json.loads((folder / RUN).read_text())
-        version = about["format_version"] if "format" in about else 1
-        if version > FORMAT_VERSION:
-            raise ConfigError(
-                f"Expected a run folder of format version at most {FORMAT_VERSION}, got {folder} of version "
-                f"{version}. Read it with a newer benchnav: pip install --upgrade benchnav."
-            )
+        version = _format_version(about)
+    if version > FORMAT_VERSION:
+        raise ConfigError(
+            f"Expected a run folder of format version at most {FORMAT_VERSION}, got {folder} of version "
+            f"{version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+        )
+    with _damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
+        schema.check_about(about, version)
         known = {} if version == 1 else about["trials"]
         trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in known.items()}
         shard = Share(**about["shard"]) if "shard" in about else None
-        if not isinstance(about["suite"], dict):
-            raise TypeError("no suite")
-    except ConfigError:
-        raise
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ConfigError(
-            f"Expected a run folder with {RUN}, got {folder}. Make one with `benchnav-eval run`."
-        ) from error
     return Run(folder=folder, about=about, version=version, trials=trials, shard=shard)
 
 
+def _format_version(about: Any) -> int:
+    """The version of `run.json`; before there was one it had no format, but the command that made it."""
+    if not isinstance(about, dict):
+        raise schema.DamageError("it is no mapping")
+    if "format" not in about and "command" in about:
+        return 1
+    version = about.get("format_version")
+    if about.get("format") != FORMAT or type(version) is not int or version < 2:
+        raise schema.DamageError("it does not say that it is a run, or of which version")
+    return version
+
+
+def write_run(folder: Path, about: Mapping[str, Any]) -> None:
+    """Writes `run.json`, sealed."""
+    write_text(folder / RUN, json.dumps(schema.seal(about), indent=1))
+
+
+def caveats(about: Mapping[str, Any]) -> list[str]:
+    """What readers of a run's tables should know: its warnings, and the pairs that it left out.
+
+    Args:
+        about: of its `run.json` what there is of `warnings` and `dropped`.
+    """
+    left_out = [
+        f"left out: planner {pair['planner']} with robot {pair['robot']}, which it cannot steer"
+        for pair in about.get("dropped", ())
+    ]
+    return [*(f"warning: {line}" for line in about.get("warnings", ())), *left_out]
+
+
 def read_table(folder: Path, name: str) -> pd.DataFrame:
-    """Reads a table of a finished run.
+    """Reads a table of episodes of a finished run, which is checked against `run.json`.
 
     Raises:
-        ConfigError: the run is not finished, or the folder holds a shard of it.
+        ConfigError: the run is not finished, the folder holds a shard of it, or the table is not the run's.
     """
-    path = folder / name
+    path, run = folder / name, open_run(folder)
     if not path.exists():
-        shard = open_run(folder).shard
-        if shard is not None:
+        if run.shard is not None:
             raise ConfigError(
-                f"Expected a whole run, got {folder}, which is shard {shard} of one and has no tables. Put all "
+                f"Expected a whole run, got {folder}, which is shard {run.shard} of one and has no tables. Put all "
                 "shards together with `benchnav-eval merge OUT PART …`."
             )
         raise ConfigError(
             f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
             "finish it."
         )
+    with _damaged(path, "Remove it and give the run's command again."):
+        schema.check_table(path, run.about)
+        rows = pd.read_parquet(path)
+        schema.check_rows(rows, run.about, run.version)
+    return rows
+
+
+@contextmanager
+def _damaged(path: Path, remedy: str) -> Iterator[None]:
+    """Says in one line that a file is not what it has to be, whatever reading it raised."""
     try:
-        return pd.read_parquet(path)
-    except (ValueError, OSError) as error:
-        raise ConfigError(f"{path} is damaged: {error}. Remove it and run the same command again.") from error
+        yield
+    except PermissionError:
+        raise
+    # Of a trial's rules and world what refuses a suite; of a table what its library raises.
+    except (
+        *(
+            ValueError,
+            TypeError,
+            KeyError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+            MemoryError,
+            OSError,
+        ),
+        *(ConfigError, pa.ArrowException),
+    ) as error:
+        said = error if isinstance(error, schema.DamageError | ConfigError) else one_line(error)
+        raise ConfigError(f"{path} is damaged: {said}. {remedy}") from error
 
 
 def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, Any]) -> None:
@@ -107,10 +164,12 @@ def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, An
         folder: the run folder.
         unit: what was run.
         rows: a row an episode.
-        about: what else is known; `run_id` and `traceback` among it.
+        about: what else is known; `run_id` and `traceback` among it. With it goes a token of this one making of
+            the unit, which copies keep.
     """
     table = pa.Table.from_pandas(rows, preserve_index=False)
-    text = json.dumps({**about, "instances": list(unit.instances), "keep": unit.keep.to_dict()})
+    own = {"made": secrets.token_hex(8), "instances": list(unit.instances), "keep": unit.keep.to_dict()}
+    text = json.dumps({**about, **own})
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), _METADATA: text.encode()})
     with replacing(folder / unit.path) as partial:
         pq.write_table(table, partial)
@@ -128,13 +187,30 @@ def kept(folder: Path, unit: Unit, run_id: str) -> Keep:
     return Keep(**about["keep"]) if about else Keep()
 
 
+def making(folder: Path, unit: Unit) -> tuple[str, str] | None:
+    """Which making of a unit a folder holds, of any run: by the token, or by the run where that is of before tokens.
+
+    Returns:
+        The same for copies alone; None where there is no such unit.
+    """
+    about = _any_about(folder, unit)
+    if "made" in about:
+        return "made", about["made"]
+    return ("run", about["run_id"]) if "run_id" in about else None
+
+
 def _about(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
+    about = _any_about(folder, unit)
+    return about if about.get("run_id") == run_id else None
+
+
+def _any_about(folder: Path, unit: Unit) -> dict[str, Any]:
     try:
         metadata = pq.read_schema(folder / unit.path).metadata or {}
+        about: dict[str, Any] = json.loads(metadata.get(_METADATA, b"{}"))
     except (OSError, ValueError):
-        return None
-    about: dict[str, Any] = json.loads(metadata.get(_METADATA, b"{}"))
-    return about if about.get("run_id") == run_id else None
+        return {}
+    return about
 
 
 def has_all(about: Mapping[str, Any] | None, unit: Unit) -> bool:
@@ -156,15 +232,18 @@ def copy_unit(source: Path, unit: Unit, folder: Path, run_id: str) -> None:
         pq.write_table(table.replace_schema_metadata(metadata), partial)
 
 
-def merge_tables(folder: Path, finished: Iterable[Unit], run_id: str) -> None:
-    """Writes `episodes.parquet` of all units, a unit at a time, and `errors.txt`.
+def finish_run(folder: Path, finished: Iterable[Unit]) -> None:
+    """Writes `episodes.parquet` of all units, a unit at a time, its digest into `run.json`, and `errors.txt`.
 
     Raises:
         ConfigError: a unit is missing, or of another run.
     """
-    finished = list(finished)
-    write_errors(folder, finished, run_id)
+    about, finished = open_run(folder).about, list(finished)
+    write_errors(folder, finished, about["run_id"])
     _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
+    tables = {EPISODES: schema.digest_of_file(folder / EPISODES)}
+    if about.get("tables") != tables:
+        write_run(folder, {**about, "tables": tables})
 
 
 def write_errors(folder: Path, finished: Sequence[Unit], run_id: str) -> None:

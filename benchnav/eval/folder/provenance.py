@@ -1,10 +1,15 @@
 """Where rows come from: what `run.json` holds, and what has to be the same for a run to go on."""
 
+import json
 import os
 import platform
+import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -40,7 +45,52 @@ def describe_code() -> dict[str, Any]:
 
 def describe_machine() -> dict[str, Any]:
     """The machine, for people."""
-    return {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    return {"processor": _processor(), "cores": os.cpu_count(), "host": platform.node()}
+
+
+def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """What was asked of a run: command, suite, date, machine, and git commit of this package, an entry each.
+
+    The commit ends in `+` where files differ from it, and is empty where the package is in no repository. A command
+    that is given again at the same place adds no entry.
+
+    Args:
+        earlier: entries that are there.
+        suite: of this process's command, as it was written.
+    """
+    asked = {"command": describe_command(), "suite": dict(suite), **describe_machine(), "commit": _commit()}
+    now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), **json.loads(json.dumps(asked))}
+    again = any({**entry, "date": now["date"]} == now for entry in earlier)
+    return [*earlier, *([] if again else [now])]
+
+
+def join(*lists: Iterable[Any]) -> list[Any]:
+    """All entries of lists of plain data, each once, in order."""
+    return list({json.dumps(item, sort_keys=True): item for one in lists for item in one}.values())
+
+
+@cache
+def _processor() -> str:
+    """The processor's name, which Python itself does not know on Linux."""
+    cpuinfo = Path("/proc/cpuinfo")
+    text = cpuinfo.read_text(errors="replace") if cpuinfo.is_file() else ""
+    named = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
+    return named[1].strip() if named else platform.processor() or platform.machine()
+
+
+@cache
+def _commit() -> str:
+    package = Path(benchnav.__file__).parent
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(package), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")  # else the repository is another project's
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
 
 
 def describe_command() -> str:

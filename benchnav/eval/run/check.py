@@ -1,6 +1,7 @@
 """What is refused, and what a user is told, before anything of a suite is run or dropped."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.run.check_world import Say, check_budgets, check_known_ground, check_luck
+from benchnav.eval.run.check_world import check_budgets, check_known_ground, check_luck
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
 from benchnav.eval.unit import Extent
@@ -18,6 +19,8 @@ from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint, predict
 from benchnav.options import one_line
 from benchnav.planning.planners.planner import check_steers
+from benchnav.planning.problem import pose_problem
+from benchnav.terrain import Grid, Observation
 
 _MEMBERS = {
     "planner": ("init", "plan"),
@@ -34,21 +37,33 @@ _MEMBERS = {
 }
 
 
-def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Trial, Extent]]:
+@dataclass(frozen=True, kw_only=True)
+class Checked:
+    """What of a suite is to be run.
+
+    Args:
+        trials: by id, with how often each is to be run.
+        dropped: pairs of which the planner cannot steer the robot, by their labels, each with the reason.
+        warnings: what readers of the results should know.
+    """
+
+    trials: dict[str, tuple[Trial, Extent]]
+    dropped: tuple[dict[str, str], ...]
+    warnings: tuple[str, ...]
+
+
+def check_suite(suite: Suite, elsewhere: bool) -> Checked:
     """Makes the trials of a suite and refuses what cannot be run.
 
     Args:
         suite: what is evaluated.
         elsewhere: parts are made in other processes.
-        say: is told what is worth knowing, a line at a time.
-
-    Returns:
-        The trials by id, with how often each is to be run.
 
     Raises:
-        ConfigError: a part, scenario, instance or combination cannot be had.
+        ConfigError: a part, scenario, instance or combination cannot be had, or no planner can steer any robot.
         DatasetError: there is no such dataset.
     """
+    warnings: list[str] = []
     datasets: dict[str, TerrainDataset] = {}
 
     def scenarios_of(data: str) -> list[str]:
@@ -65,11 +80,10 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
         _check_split(trial, scenarios_of(trial.data), datasets[trial.data], suite.instances)
     for trial in _distinct(trials, ("planner", "robot", "objective")):
         _check_members(trial)
-        check_steers(trial.make_planner(), trial.make_task().robot, trial.planner.label)
+    trials, dropped = _steered(trials)
+    for trial in _distinct(trials, ("planner", "robot", "objective")):
         _check_first_plan(trial)
-    for trial in _distinct(trials, ("risk",)):
-        _check_risk(trial)
-    check_budgets(trials, datasets, suite.instances, say)
+    check_budgets(trials, datasets, suite.instances, warnings.append)
     check_known_ground(trials, datasets, suite.instances)
     check_luck(trials, datasets, suite)
     _check_single_class(trials, datasets)
@@ -78,15 +92,33 @@ def check_suite(suite: Suite, elsewhere: bool, say: Say) -> dict[str, tuple[Tria
     for trial in _distinct(trials, ("model",)):
         model = _class_table(trial)
         for data in {other.data for other in trials if other.model == trial.model and not other.blind}:
-            _tell(say, class_mismatch(model, datasets[data], f"model {trial.model.label}"))
-    for line in dict.fromkeys(line for trial in trials for line in _doubts(trial, datasets[trial.data])):
-        say(line)
+            warnings += filter(None, [class_mismatch(model, datasets[data], f"model {trial.model.label}")])
+    warnings += [line for trial in trials for line in _doubts(trial, datasets[trial.data])]
     wanted = {}
     for trial in trials:
         there = datasets[trial.data].map_count(trial.split)
         extent = Extent.product(suite.all_seeds, suite.realisations, suite.instances or there)
         wanted[trial.id] = (trial, extent)
-    return wanted
+    return Checked(trials=wanted, dropped=tuple(dropped), warnings=tuple(dict.fromkeys(warnings)))
+
+
+def _steered(trials: list[Trial]) -> tuple[list[Trial], list[dict[str, str]]]:
+    """The trials in which the planner can steer the robot, and the pairs in which it cannot."""
+    unfit: dict[str, dict[str, str]] = {}
+    for trial in _distinct(trials, ("planner", "robot")):
+        planner, robot = trial.planner.label, trial.robot.label
+        try:
+            check_steers(trial.make_planner(), trial.make_task().robot, planner)
+        except ConfigError as error:
+            unfit[_pair(trial)] = {"planner": planner, "robot": robot, "reason": str(error)}
+    left = [trial for trial in trials if _pair(trial) not in unfit]
+    if not left:
+        raise ConfigError(next(iter(unfit.values()))["reason"])
+    return left, list(unfit.values())
+
+
+def _pair(trial: Trial) -> str:
+    return repr([trial.planner, trial.robot])
 
 
 def _class_table(trial: Trial) -> Any:
@@ -121,14 +153,6 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
 
 
-def _check_risk(trial: Trial) -> None:
-    """Lets a shipped risk measure refuse its options, on the distribution of one cell."""
-    measure = trial.make_risk()
-    if registry.find("risk", trial.risk.part).shipped:
-        cell = torch.full((1, 1, 1, 1), 0.5)
-        measure(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
-
-
 def _check_single_class(trials: list[Trial], datasets: dict[str, TerrainDataset]) -> None:
     """Refuses the single-class option of a model whose components are no classes, by its first prediction."""
     for trial in _distinct(trials, ("model", "risk")):
@@ -158,12 +182,6 @@ def _check_first_plan(trial: Trial) -> None:
     """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
     if not registry.find("planner", trial.planner.part).shipped:
         return
-    import torch
-
-    from benchnav.mixture import TraversabilityMixture
-    from benchnav.planning.problem import pose_problem
-    from benchnav.terrain import Grid, Observation
-
     ground = torch.full((1, 4, 4), 0.9)
     seen = Observation(torch.zeros(1, 3, 4, 4, dtype=torch.uint8), 0 * ground, 0 * ground, Grid(4, 4, 1.0))
     ones = torch.ones_like(ground).unsqueeze(1)
@@ -221,8 +239,3 @@ def _distinct(trials: list[Trial], kinds: tuple[str, ...]) -> list[Trial]:
     for trial in trials:
         found.setdefault(repr([getattr(trial, kind) for kind in kinds]), trial)
     return list(found.values())
-
-
-def _tell(say: Say, line: Any) -> None:
-    if line:
-        say(str(line))

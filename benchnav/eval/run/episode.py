@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,22 +39,28 @@ class Block:
     Args:
         terrain: the true maps.
         places: starts, goals and grid reference times.
+        groups: which maps go together, as overlapping ones do: those of one number; int64, shape [B].
     """
 
     terrain: Terrain
     places: Places
+    groups: np.ndarray
 
     def to(self, device: torch.device) -> "Block":
         """The same on a device."""
-        return Block(terrain=self.terrain.to(device), places=self.places.to(device))
+        return replace(self, terrain=self.terrain.to(device), places=self.places.to(device))
 
 
 def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> Block:
-    """Reads some instances of a split, with starts, goals and reference times."""
+    """Reads some instances of a split, with starts, goals, reference times and groups; else each map is one."""
     places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
+    groups: Any = instances
+    if "group" in getattr(dataset, "field_names", ()):
+        groups = dataset.read(split, instances, ["group"])["group"]
     return Block(
         terrain=dataset.terrain(split, instances),
         places=Places(**{name: torch.from_numpy(values) for name, values in places.items()}),
+        groups=np.asarray(groups, dtype=np.int64).reshape(-1),
     )
 
 
@@ -140,8 +147,19 @@ def simulate(
     watch: Watcher | None = None,
     watch_every: int = 1,
     planner_limit_s: float = 0.0,
+    **options: Any,
 ) -> tuple[Episodes, bool]:
-    """Runs a unit's episodes; gives what happened, and whether the planner ran compiled."""
+    """Runs a unit's episodes; gives what happened, and whether the planner ran compiled.
+
+    Args:
+        unit: what is run.
+        problem: the unit's.
+        simulation: the unit's.
+        watch: see `run_episodes`, as of `watch_every` and `options`.
+        watch_every: as there.
+        planner_limit_s: time limit of each call of the planner; 0 for none.
+        **options: further arguments of `run_episodes`.
+    """
     trial = unit.trial
     planner: Any
     with ExitStack() as stack:
@@ -153,7 +171,7 @@ def simulate(
         except (Exception, SystemExit) as error:
             planner = _Unmade(error)
         generator = planner_generator(unit)
-        episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every)
+        episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every, **options)
     return episodes, bool(getattr(planner, "compiled", False))
 
 

@@ -1,6 +1,5 @@
 """Merging the shards of a run into one run folder, which then is as any: reported, resumed, extended."""
 
-import json
 import os
 import secrets
 import shutil
@@ -16,16 +15,17 @@ from benchnav.eval.folder.folder import (
     Run,
     about_unit,
     copy_unit,
-    merge_tables,
+    finish_run,
     open_run,
     unit_rows,
+    write_run,
 )
 from benchnav.eval.folder.sameness import differences
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.driven_ground import keep_ground
 from benchnav.eval.unit import Unit, in_table_order, units
-from benchnav.files import replacing, sole_writer, write_text
+from benchnav.files import replacing, sole_writer
 from benchnav.share import Share
 
 _NOT_OF_UNITS = ("units", "figures")
@@ -57,7 +57,7 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         if partial.exists():
             shutil.rmtree(partial)
         about = _about(runs)
-        write_text(partial / RUN, json.dumps(about, indent=1))
+        write_run(partial, about)
         yield 0, len(every)
         for done, (unit, run) in enumerate(found, start=1):
             assert run is not None
@@ -66,9 +66,20 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         for run in runs:
             _copy_rest(run.folder, partial)
         align_steps(partial, every)
-        merge_tables(partial, every, about["run_id"])
+        finish_run(partial, every)
         keep_ground(partial)
+        _take_place(partial, target)
+
+
+def _take_place(partial: Path, target: Path) -> None:
+    """Gives a whole run its name; an empty folder that is there is filled, since it may be the one the user is in."""
+    if not target.exists():
         os.replace(partial, target)
+        return
+    # `run.json` last, which makes it a run.
+    for path in sorted(partial.iterdir(), key=lambda path: path.name == RUN):
+        os.replace(path, target / path.name)
+    partial.rmdir()
 
 
 def _check_new(folder: Path) -> None:
@@ -165,10 +176,21 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run], of: int) -> None:
 
 
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
-    """`run.json` of the whole: that of the first shard, with the commands of all."""
+    """`run.json` of the whole: that of the first shard, with what was measured, said and commanded of all."""
     about = {name: value for name, value in runs[0].about.items() if name != "shard"}
-    commands = dict.fromkeys(line for run in runs for line in run.about["commands"])
-    return {**about, "run_id": secrets.token_hex(8), "commands": provenance.command_lines(commands)}
+    trials = {i: dict(entry) for i, entry in about["trials"].items()}
+    for run in runs:
+        for trial_id, entry in run.about["trials"].items():
+            if "latency" in entry:
+                trials[trial_id].setdefault("latency", entry["latency"])
+    joined: dict[str, list[Any]] = {
+        name: provenance.join(*(run.about.get(name, ()) for run in runs))
+        for name in ("warnings", "dropped", "history")
+    }
+    commands = provenance.command_lines(provenance.join(*(run.about["commands"] for run in runs)))
+    history = provenance.extend_history(joined["history"], about["suite"])
+    given = {"run_id": secrets.token_hex(8), "trials": trials, "commands": commands}
+    return {**about, **given, **joined, "history": history}
 
 
 def _copy_rest(part: Path, folder: Path) -> None:

@@ -17,13 +17,14 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.device import device_of_run
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, RUN, Run, open_run, read_table
+from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, RUN, Run, making, open_run, read_table
 from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_everywhere
 from benchnav.eval.run.check_world import Say
 from benchnav.eval.run.runner import Work, Workers, run_work
 from benchnav.eval.trial import PART_KINDS, Trial
+from benchnav.eval.unit import units
 from benchnav.files import sole_writer
 
 _SHOWN = 5
@@ -36,17 +37,19 @@ class Comparison:
     Args:
         episodes: how many were compared.
         different: those that are not the same.
+        columns: those that only one of the two tables has.
         lines: all that is to be told.
     """
 
     episodes: int
     different: tuple[Difference, ...]
+    columns: tuple[str, ...]
     lines: tuple[str, ...]
 
     @property
     def same(self) -> bool:
-        """Whether every row came out the same."""
-        return not self.different
+        """Whether every row came out the same, in all columns of either table."""
+        return not self.different and not self.columns
 
 
 def rerun(
@@ -67,6 +70,8 @@ def rerun(
     run = _open(run_folder)
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
+    if not overwrite:
+        _check_no_copy(run, folder)
     _check_there(run)
     if not overwrite and (folder / RUN).exists() and set(open_run(folder).trials) != set(run.trials):
         raise ConfigError(
@@ -78,6 +83,8 @@ def rerun(
     work = Work(
         suite=run.about["suite"],
         trials=run.trials,
+        dropped=tuple(run.about.get("dropped", ())),
+        warnings=tuple(run.about.get("warnings", ())),
         keep=Keep(),
         planner_limit_s=run.about["planner_limit_s"],
         device=device_of_run(run.about).type,
@@ -98,14 +105,14 @@ def compare(run_folder: Path, folder: Path) -> Comparison:
     """
     run, again = _open(run_folder), open_run(folder)
     first, second = read_table(run_folder, EPISODES), read_table(folder, EPISODES)
-    different = differences(first, second)
+    different, columns = differences(first, second), differing_columns(first, second)
     trials = {trial_id: trial for trial_id, (trial, _) in (*again.trials.items(), *run.trials.items())}
-    lines = _verdict(trials, len(first), different)
-    lines += [
-        f"only one of the two tables has the column {name}" for name in differing_columns(first, second)
-    ]
+    lines = [] if columns and not different else _verdict(trials, len(first), different)
+    lines += [f"only one of the two tables has the column {name}" for name in columns]
     lines += _environment(run.about, again.about)
-    return Comparison(episodes=len(first), different=tuple(different), lines=tuple(lines))
+    return Comparison(
+        episodes=len(first), different=tuple(different), columns=tuple(columns), lines=tuple(lines)
+    )
 
 
 def _open(folder: Path) -> Run:
@@ -116,6 +123,18 @@ def _open(folder: Path) -> Run:
         )
     read_table(folder, EPISODES)
     return run
+
+
+def _check_no_copy(run: Run, folder: Path) -> None:
+    """Refuses a folder with units that were copied from the run: to compare a run with itself certifies nothing."""
+    every = units(run.trials, Keep()) if folder.is_dir() else []
+    made = [(making(run.folder, unit), making(folder, unit)) for unit in every]
+    copied = sum(one is not None and one == other for one, other in made)
+    if copied:
+        raise ConfigError(
+            f"Expected `out` to be new or an earlier rerun of {run.folder}, but {copied} of the {len(every)} units in "
+            f"{folder} are copies of its own, which repeat nothing. Choose another `out`, or pass --overwrite."
+        )
 
 
 def _check_there(run: Run) -> None:

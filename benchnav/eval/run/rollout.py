@@ -123,6 +123,7 @@ def run_episodes(
     generator: torch.Generator,
     watch: Watcher | None = None,
     watch_every: int = 1,
+    enough: Callable[[int], bool] = lambda step: False,
 ) -> Episodes:
     """Runs a batch of episodes to the end of the last.
 
@@ -136,6 +137,8 @@ def run_episodes(
         generator: the planner's randomness.
         watch: is called with a step's number, its plan and the episodes that it is for, before the step is taken.
         watch_every: of so many steps one is watched, from the first on.
+        enough: is asked before each step, by its number, whether to leave it there; episodes that still run are then
+            left running.
 
     Returns:
         What happened.
@@ -154,6 +157,8 @@ def run_episodes(
             plan_state = begin(planner, problem, generator)
         batch = _Batch(planner, problem, plan_state)
         for count in itertools.count():
+            if enough(count):
+                break
             if count % look_every == 0:
                 running = now.running.cpu()
                 if not bool(running.any()):

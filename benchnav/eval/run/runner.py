@@ -6,18 +6,19 @@ A row does not depend on the number of workers, on the order of units, or on int
 import json
 import os
 import secrets
-import shutil
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import joblib
+import pandas as pd
 import torch
 
 from benchnav.device import find_device, gpu_name
@@ -30,13 +31,16 @@ from benchnav.eval.folder.folder import (
     FORMAT_VERSION,
     RUN,
     about_unit,
+    caveats,
+    finish_run,
     has_all,
     kept,
-    merge_tables,
     open_run,
     write_errors,
+    write_run,
     write_unit,
 )
+from benchnav.eval.folder.schema import SEAL
 from benchnav.eval.folder.steps import align_steps, write_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_suite
@@ -44,6 +48,7 @@ from benchnav.eval.run.check_world import Say
 from benchnav.eval.run.cluster import connected, run_on_cluster
 from benchnav.eval.run.driven_ground import keep_ground
 from benchnav.eval.run.episode import (
+    Block,
     PredictionError,
     build,
     one_thread,
@@ -51,12 +56,13 @@ from benchnav.eval.run.episode import (
     simulate,
     time_budgets,
 )
+from benchnav.eval.run.latency import measure_latencies
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial, check_labels
 from benchnav.eval.unit import Extent, Unit, in_table_order, units
-from benchnav.files import sole_writer, write_text
+from benchnav.files import sole_writer
 from benchnav.planning.world.outcome import Outcome
 from benchnav.share import Share
 from benchnav.workers import end_with
@@ -75,6 +81,8 @@ class Work:
         planner_limit_s: time limit of each call of a planner; 0 for none.
         shard: which share of the units is run; None for all.
         device: where all is computed, "cpu" or "cuda".
+        dropped: pairs of planner and robot that were left out, as `check.Checked` has them.
+        warnings: what readers of the results should know.
     """
 
     suite: Mapping[str, Any]
@@ -83,6 +91,8 @@ class Work:
     planner_limit_s: float = 0.0
     shard: Share | None = None
     device: str = "cpu"
+    dropped: tuple[Mapping[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,10 +144,14 @@ def run_suite(
     """
     workers, found = Workers(jobs=jobs, scheduler=scheduler), find_device(device)
     with sole_writer(folder, str(folder)):
-        wanted = check_suite(suite, workers.elsewhere or planner_limit_s > 0, say)
+        checked = check_suite(suite, workers.elsewhere or planner_limit_s > 0)
+        for line in caveats({"warnings": checked.warnings, "dropped": checked.dropped}):
+            say(line)
         work = Work(
             suite=suite.to_dict(),
-            trials=wanted,
+            trials=checked.trials,
+            dropped=checked.dropped,
+            warnings=checked.warnings,
             keep=suite.keep,
             planner_limit_s=planner_limit_s,
             shard=shard,
@@ -185,9 +199,10 @@ def run_work(
             done += 1
             yield done, len(own)
     _check_unchanged(folder)
+    _measure_latencies(folder, {unit.trial.id for unit in own})
     if work.shard is None:
         align_steps(folder, every)
-        merge_tables(folder, in_table_order(every, trials), about["run_id"])
+        finish_run(folder, in_table_order(every, trials))
         keep_ground(folder)
     else:
         write_errors(folder, in_table_order(own, trials), about["run_id"])
@@ -213,7 +228,7 @@ def run_unit(
         except PredictionError as error:
             about |= {"traceback": traceback.format_exc(), "errors": [str(error)]}
             rows = error_rows(unit, time_budgets(unit, run_id), str(error))
-            write_unit(folder, unit, rows, about)
+            write_unit(folder, unit, _grouped(rows, read_block(unit, run_id)), about)
             return
         watched = unit.keep.watched(len(unit.instances))
         recorder = Recorder(unit, problem, simulation, read_block(unit, run_id, place).terrain, watched)
@@ -225,10 +240,31 @@ def run_unit(
     if stored := unit.keep.with_steps(succeeded):
         write_steps(folder, unit, step_table(unit, problem, episodes, stored))
     about |= {"traceback": episodes.traceback, "errors": sorted({e for e in episodes.errors if e})}
-    reference = read_block(unit, run_id, place).places.reference_time_s.cpu().numpy()
+    block = read_block(unit, run_id, place)
+    reference = block.places.reference_time_s.cpu().numpy()
     redrawn = (simulation.attempts - 1).tolist()
     rows = episode_rows(unit, problem, episodes, reference, redrawn, compiled)
-    write_unit(folder, unit, rows, about)
+    write_unit(folder, unit, _grouped(rows, block), about)
+
+
+def _grouped(rows: pd.DataFrame, block: Block) -> pd.DataFrame:
+    """Rows of a unit with the groups of their maps."""
+    rows.insert(rows.columns.get_loc("instance") + 1, "group", block.groups)
+    return rows
+
+
+def _measure_latencies(folder: Path, chosen: Collection[str]) -> None:
+    """Measures the planners of some trials alone and writes it into `run.json`, where it is not there yet."""
+    run = open_run(folder)
+    entries = run.about["trials"]
+    known = {i: entry["latency"] for i, entry in entries.items() if "latency" in entry}
+    trials = {i: entry for i, entry in run.trials.items() if i in chosen}
+    given = run.about["run_id"], run.about["planner_limit_s"], run.about["device"]
+    latencies = measure_latencies(trials, known, *given)
+    if latencies != {i: about for i, about in known.items() if i in trials}:
+        for trial_id, latency in latencies.items():
+            entries[trial_id]["latency"] = latency
+        write_run(folder, run.about)
 
 
 def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs: int) -> Iterator[None]:
@@ -264,11 +300,14 @@ def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: 
 
 
 def _drop(folder: Path) -> None:
+    """Empties a run folder, which stays what it is: a link, another file system, the folder that the user is in."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         open_run(folder)  # Only what is a run folder may be dropped.
-        dropped = folder.with_name(f".{folder.name}.{os.getpid()}.dropped")
-        os.replace(folder, dropped)
-        shutil.rmtree(dropped)
+        place = folder.resolve()
+        with TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.dropped-") as dropped:
+            # `run.json` last, so that a kill leaves a run that can be dropped or gone on with.
+            for path in sorted(place.iterdir(), key=lambda path: path.name == RUN):
+                os.replace(path, Path(dropped, path.name))
 
 
 def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
@@ -278,8 +317,8 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
             raise ConfigError(
                 f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
             )
-        about = _about(secrets.token_hex(8), work, work.trials, [])
-        write_text(folder / RUN, json.dumps(about, indent=1))
+        about = _about({"run_id": secrets.token_hex(8)}, work, work.trials)
+        write_run(folder, about)
         return about, work.trials
     earlier = open_run(folder)
     if earlier.version < FORMAT_VERSION:
@@ -292,9 +331,9 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
             f"Expected `out` to be new or to hold {_share(work.shard)}, but {folder} holds "
             f"{_share(earlier.shard)}. Choose another `out`."
         )
+    check_labels(trial for trials in (earlier.trials, work.trials) for trial, _ in trials.values())
     trials = _joined(earlier.trials, work.trials)
-    check_labels(trial for trial, _ in trials.values())
-    now = _about(earlier.about["run_id"], work, trials, earlier.about["commands"])
+    now = _about(earlier.about, work, trials)
     changed = provenance.differences(earlier.about, now)
     if changed:
         raise ConfigError(
@@ -307,7 +346,9 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
         more = {0: "by more episodes", 1: "by 1 new trial"}.get(new, f"by {new} new trials")
         say(f"{folder} is extended {more}")
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
-        write_text(folder / RUN, json.dumps(now, indent=1))
+        write_run(folder, now)
+    elif now != {name: value for name, value in earlier.about.items() if name not in (SEAL, "tables")}:
+        write_run(folder, {**now, "tables": earlier.about.get("tables", {})})
     return now, trials
 
 
@@ -342,24 +383,32 @@ def _check_unchanged(folder: Path) -> None:
         )
 
 
-def _about(run_id: str, work: Work, trials: Trials, commands: list[str]) -> dict[str, Any]:
+def _about(earlier: Mapping[str, Any], work: Work, trials: Trials) -> dict[str, Any]:
+    """What `run.json` is to hold, of which the folder may hold an earlier state; of a new run that is its id alone."""
+    known = earlier.get("trials", {})
     entries = {
-        trial_id: {"value": trial.value, "labels": trial.labels, **_notes(trial), **extent.to_dict()}
+        trial_id: {
+            **{"value": trial.value, "labels": trial.labels, **_notes(trial), **extent.to_dict()},
+            **{key: known[trial_id][key] for key in ("latency",) if key in known.get(trial_id, {})},
+        }
         for trial_id, (trial, extent) in trials.items()
     }
     about = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "run_id": run_id,
+        "run_id": earlier["run_id"],
         **({"shard": work.shard.to_dict()} if work.shard else {}),
         "suite": dict(work.suite),
         "trials": entries,
+        "dropped": provenance.join(earlier.get("dropped", ()), work.dropped),
+        "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),
         "planner_limit_s": work.planner_limit_s,
         "device": work.device,
         "gpu": gpu_name(work.device),
         **provenance.describe(trials),
         "machine": provenance.describe_machine(),
-        "commands": provenance.command_lines(commands),
+        "commands": provenance.command_lines(earlier.get("commands", ())),
+        "history": provenance.extend_history(earlier.get("history", ()), work.suite),
     }
     return json.loads(json.dumps(about))
 

@@ -23,6 +23,12 @@ def episodes() -> pd.DataFrame:
     )
 
 
+def draws(rows: pd.DataFrame) -> list[list[int]]:
+    """How often a trial was run, as `run.json` says it."""
+    counted = rows.groupby(["seed", "realisation"], sort=False)["instance"].nunique()
+    return [[seed, realisation, count] for (seed, realisation), count in counted.items()]
+
+
 def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
     """A run folder with what a report reads of it; parts of the trials stand in for any."""
     parts = {
@@ -33,7 +39,7 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         name: about
         | {
             "value": {"data": "paper-v1", "split": "test/std", **parts, **made.PAPER},
-            "draws": [[0, 0, 2], [7, 0, 2]],
+            "draws": draws(rows[rows["trial"] == name]),
         }
         for name, about in known.items()
     }
@@ -133,7 +139,7 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
 
 
 def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
-    rows = made.rows(made.row(made.trial(world="stakes"), 4, None, outcome="immobilised"))
+    rows = made.rows(made.row(made.trial(world="stakes"), i, None, outcome="immobilised") for i in range(5))
     folder = run_folder(tmp_path / "run", rows)
     about = {**made.held_recording().about, "trial": rows["trial"][0]}
     write_playback(folder, "a", made.held_recording(about=about))
