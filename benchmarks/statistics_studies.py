@@ -4,9 +4,9 @@
     python benchmarks/statistics_studies.py --studies 2000 --parts best --json best.json
 
 Maps have a chance of success of their own (beta, with a given correlation within a map), and conditions have their
-chances and their noise partly in common. Times of arrival are lognormal, half of their spread the map's, longer where the
-chance is low, and a failure counts as T = 100 s. Printed is how often an interval covers the truth, and how often a family of
-comparisons in which nothing differs finds a difference.
+chances and their noise partly in common. Times of arrival are lognormal, half of their spread the map's, longer where
+the chance is low, and a failure counts as T = 100 s. Printed is how often an interval covers the truth, and how often a
+family of comparisons in which nothing differs finds a difference.
 """
 
 import argparse
@@ -285,7 +285,7 @@ STUDIES: dict[str, tuple[Callable[[int, int], list[dict[str, object]]], str]] = 
     ),
     "best": (
         study_best,
-        "How often a condition as good as the best is called worse [%], with its 95 % interval; power [%] at 10 points.",
+        "How often a condition as good as the best is called worse [%], with its 95 % interval; power at 10 points [%].",
     ),
 }
 

@@ -94,7 +94,8 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
     test = f"max-T sign-flip test by {unit} over {settings}"
     if worse.empty:
         shown, p = others["best_shown"].max(), others["best_p"].min()
-        power = f"; {int(best['best_maps'])} {unit}s detect differences of {100 * shown:.0f} points or more with 80 % power"
+        maps = f"{int(best['best_maps'])} {unit}s"
+        power = f"; {maps} detect differences of {100 * shown:.0f} points or more with 80 % power"
         yield (
             f"No setting is significantly worse ({test}, p ≥ {max(np.floor(100 * p) / 100, ALPHA):g}"
             f"{power if shown <= 1 else ''}): the run does not say which is best."
@@ -110,10 +111,11 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
         yield f"{verb} not significantly worse (p ≥ {ALPHA}): {'; '.join(listed[:_MOST_NAMED])}{more}."
     following = worse.iloc[0]
     place = "The next" if alike.empty else "The next that is significantly worse"
+    low, high = 100 * following["best_low"], 100 * following["best_high"]
     yield (
         f"{place} is {names[following['trial']]} with {_rate(following)}: the difference is "
-        f"{100 * following['best_difference']:.1f} points (95 % interval of the pair alone {100 * following['best_low']:.1f} "
-        f"to {100 * following['best_high']:.1f}), {p_in_words(following['best_p'])} ({test})."
+        f"{100 * following['best_difference']:.1f} points (95 % interval of the pair alone {low:.1f} to "
+        f"{high:.1f}), {p_in_words(following['best_p'])} ({test})."
     )
 
 

@@ -33,8 +33,8 @@ _COLUMNS = {
     "Succ. [%]": "share of episodes that reached the goal.",
     "95 % interval": "of the success rate: Wilson's, with maps as the unit, so that episodes on one map count as fewer "
     "the more alike they end.",
-    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from those of the "
-    f"success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
+    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from those of "
+    f"the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
     "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
     "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
     "planning [ms]": "wall time of planning one step of one robot, from the second step on: the median over an "
@@ -79,7 +79,7 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
-    grouped = (summary["n_groups"] < summary["n_maps"]).any()
+    grouped = is_grouped(summary)
     counts = [
         name for name in ("n_groups", "n_maps", "n_episodes")
         if summary[name].nunique() > 1 and (grouped or name != "n_groups")
@@ -123,7 +123,7 @@ def bold_note(summary: pd.DataFrame) -> str:
         summary: as in `result_table`.
     """
     words = ["not significantly worse than the highest success rate of its block"]
-    by = "group" if (summary["n_groups"] < summary["n_maps"]).any() else "map"
+    by = "group" if is_grouped(summary) else "map"
     words.append(
         f"(max-T sign-flip test by {by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
         "significantly worse none is bold"
@@ -137,6 +137,11 @@ def bold_note(summary: pd.DataFrame) -> str:
         out = ", ".join(dict.fromkeys(told["model"]))
         words.append(f"; what is told the truth ({out}) does not compete")
     return " ".join(words).replace(" ;", ";") + "."
+
+
+def is_grouped(summary: pd.DataFrame) -> bool:
+    """Whether the unit of the statistics is a group of maps."""
+    return bool((summary["n_groups"] < summary["n_maps"]).any())
 
 
 def maps_in_words(maps: int | str, groups: int | str) -> str:

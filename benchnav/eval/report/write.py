@@ -3,8 +3,8 @@
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from benchnav.eval.report.charts.curves import curve_figure, sweep_name
 from benchnav.eval.report.charts.distributions import distribution_figure
 from benchnav.eval.report.charts.driven import write_driven
 from benchnav.eval.report.charts.failure_sheet import failure_sheet
+from benchnav.eval.report.charts.forest import forest_figure
 from benchnav.eval.report.charts.outcomes import outcome_figure
 from benchnav.eval.report.charts.success import success_figure
 from benchnav.eval.report.charts.sweeps import find_sweeps
@@ -26,21 +27,28 @@ from benchnav.eval.report.failure_choice import GroundOf, Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.figure_style import STYLE, save
 from benchnav.eval.report.findings import Finding, findings
+from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.page import Drawn, write_page
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recorded.recording import read_snapshots
-from benchnav.eval.report.rendering import markdown, to_markdown, to_terminal
-from benchnav.eval.report.tables import NOT_USED, ResultTable, maps_in_words, result_table
+from benchnav.eval.report.rendering import markdown, to_latex, to_markdown, to_terminal
+from benchnav.eval.report.tables import NOT_USED, ResultTable, is_grouped, maps_in_words, result_table
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.stats.best import against_best, told_the_truth
+from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
 
 PAGE = "report.html"
 
 _SUCCESS = (
-    "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where another "
-    "is; grey: planners that look at nothing predicted."
+    "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where "
+    "another is; grey: planners that look at nothing predicted."
+)
+_HYPOTHESES = "Hypotheses that were fixed before the run, and their tests."
+_FOREST = (
+    "Paired differences of all hypotheses, which were fixed before the run; p after Holm's correction over them. "
+    "Filled: supported; thick and thin: 90 % and 95 % intervals of one difference alone."
 )
 _OUTCOMES = "How episodes ended."
 _DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean λ met."
@@ -63,6 +71,7 @@ class Report:
         table: a row a trial.
         warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
+        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; none where the suite held none.
         episodes: the rows behind the summary.
         failures: a row a failed episode.
         sheets: failures on their ground.
@@ -74,6 +83,7 @@ class Report:
     table: ResultTable
     warnings: tuple[str, ...]
     summary: pd.DataFrame
+    tests: pd.DataFrame
     episodes: pd.DataFrame
     failures: pd.DataFrame
     sheets: Sheets
@@ -97,6 +107,10 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
         about = {**about, **convert_about(about, episodes)}
     worlds = {trial: entry["value"]["world"] for trial, entry in about["trials"].items()}
     summary = summarise(episodes, worlds)
+    tests = (
+        test_hypotheses(about["hypotheses"], episodes, worlds) if "hypotheses" in about else pd.DataFrame()
+    )
+    grouped = is_grouped(summary)
     best = against_best(episodes, summary, told_the_truth(about["trials"]))
     summary = summary.merge(best, on="trial", how="left", validate="1:1")
     failures = failures_table(folder, episodes)
@@ -104,10 +118,11 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     left_out = [sheets.left_out] if sheets.left_out else []
     return Report(
         header=(*_header(summary, about), *_redrawn(episodes, about["trials"])),
-        findings=tuple(findings(summary, failures, sheets.told)),
+        findings=_findings(findings(summary, failures, sheets.told), tests, about, grouped),
         table=result_table(summary, about["trials"]),
         warnings=(*_warnings(summary, folder), *left_out),
         summary=summary,
+        tests=tests,
         episodes=episodes,
         failures=failures,
         sheets=sheets,
@@ -130,6 +145,10 @@ def write_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     write_text(folder / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(folder / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
     write_text(folder / "summary.tex", _as_latex(report, name))
+    if not report.tests.empty:
+        write_text(folder / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
+        shown = hypothesis_table(report.tests, is_grouped(report.summary))
+        write_text(folder / "hypotheses.tex", to_latex(shown, _HYPOTHESES, f"{name}-hypotheses"))
     figures = [*_charts(folder, report), *_trajectories(folder, report.summary), *_driven(folder)]
     write_text(folder / "summary.md", _as_markdown(report, figures))
     page = write_page(
@@ -148,13 +167,24 @@ def print_report(report: Report) -> None:
     print("\n".join([*report.header, table, *said, *report.warnings]))
 
 
+def _findings(
+    explored: Sequence[Finding], tests: pd.DataFrame, about: Mapping[str, Any], grouped: bool
+) -> tuple[Finding, ...]:
+    """What a run says; beside hypotheses that were fixed before it all else is exploratory."""
+    if tests.empty:
+        return tuple(explored)
+    rest = (replace(finding, title=f"Exploratory: {finding.title}") for finding in explored)
+    return (hypothesis_finding(tests, about, grouped), *rest)
+
+
 def _charts(folder: Path, report: Report) -> list[Drawn]:
     """Draws the figures at the width of a column."""
     summary = report.summary
     marked = set(summary.loc[summary["best_marked"], "trial"])
-    made: list[tuple[str, str, Callable[[], Figure]]] = [
-        ("success", _SUCCESS, partial(success_figure, summary, marked))
-    ]
+    made: list[tuple[str, str, Callable[[], Figure]]] = []
+    if not report.tests.empty:
+        made.append(("forest", _FOREST, partial(forest_figure, report.tests)))
+    made.append(("success", _SUCCESS, partial(success_figure, summary, marked)))
     sweeps = find_sweeps(report.about["trials"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
     for sweep in sweeps:
@@ -261,6 +291,13 @@ def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
             f"**{markdown(finding.title)}**",
             "",
             *(f"- {markdown(said)}" for said in finding.sentences),
+            "",
+        ]
+    if not report.tests.empty:
+        lines += [
+            "## Hypotheses",
+            "",
+            to_markdown(hypothesis_table(report.tests, is_grouped(report.summary))),
             "",
         ]
     lines += ["## Results", "", *(f"- {markdown(line)}" for line in (*report.header, *report.warnings)), ""]

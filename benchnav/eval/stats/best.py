@@ -1,8 +1,8 @@
 """The best condition of each block of a run, and which others are significantly worse.
 
 One max-T test looks at all pairs of a block's conditions at once: on each map the signs of all differences are flipped
-together, so that what the conditions share counts. It goes step by step, as the model confidence set does: the condition
-that another beats by most is set aside while p < 0.05, and the rest are compared anew. So the chance that any condition
+together, so that what the conditions share counts. It goes step by step, as the model confidence set does: the
+condition that another beats by most is set aside, and the rest are compared anew. So the chance that any condition
 which is as good as the best is called worse is about 5 % however many there are (`benchmarks/statistics_studies.py`).
 Sources: Westfall and Young (1993), "Resampling-Based Multiple Testing", 2.3 and 2.6; Hansen, Lunde and Nason (2011),
 "The model confidence set", for the order.
@@ -85,7 +85,8 @@ def best_set_p(values: np.ndarray, flips: np.ndarray) -> tuple[np.ndarray, float
 
     Returns:
         p by condition, corrected for their number, shape [K], 1 for the best; and the least |t| that would be
-        significant in the first step, where t is the sum of a pair's differences over the root of that of their squares.
+        significant in the first step, where t is the sum of a pair's differences over the root of that of their
+        squares.
     """
     gaps = values[:, :, None] - values[:, None, :]
     norms = np.sqrt((gaps**2).sum(0))
@@ -127,8 +128,8 @@ def against_best(
     Returns:
         A row a trial, in the order of the summary: `trial`; `told`, what is told the truth, of `TOLD`, empty
         where nothing is; `best`, the trial that is the best of its block; `best_rivals`, how many others compete;
-        `best_episodes`, of each of them in common, on `best_maps`, of which a group counts as one; `best_difference`, by how much the best's success rate is higher,
-        with its 95 % interval `_low`, `_high`, of the pair alone; `best_p`, from `best_set_p`; `best_shown`, the
+        `best_episodes`, of each of them in common, on `best_maps`, of which a group counts as
+        one; `best_difference`, by how much the best's success rate is higher, with its 95 % interval `_low`, `_high`, of the pair alone; `best_p`, from `best_set_p`; `best_shown`, the
         minimum detectable difference with 80 % power; `best_alike`, true where it competes and is not significantly
         worse than the best; and `best_marked`, true where it is alike and something in its block is worse. NaN where a
         trial does not compete, and for the best itself.

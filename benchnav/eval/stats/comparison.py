@@ -69,10 +69,12 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float
         arrival_s.append(rows.loc[success, f"total_time_s{suffix}"])
         budget_s.append(rows[f"time_budget_s{suffix}"])
     arrivals = pd.concat(arrival_s)
+    # No arrival takes less than nothing, where there is none to go by.
+    arrival = arrivals.mean() if len(arrivals) else 0.0
     gain, draws = _gain(rows)
     _, low, high = success_interval(gain, draws, confidence)
     mean, low_s, high_s = total_time_interval(
-        _late(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - (arrivals.mean() if len(arrivals) else 0),
+        _late(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - arrival,
         len(set.intersection(*arrived)), confidence,
     )  # fmt: skip
     return float(mean), float(low_s), float(high_s)

@@ -75,8 +75,8 @@ def standard_deviation(gain: np.ndarray, draws: float) -> np.ndarray:
     return np.sqrt(((share**2).sum(-1) + 2 / draws**2) / maps - (share.sum(-1) / maps) ** 2)
 
 
-def sign_flip_p(gain: np.ndarray) -> float:
-    """Two-sided p of no difference in success, if on each map either trial might have been the other.
+def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
+    """p of no difference in success, if on each map either trial might have been the other.
 
     The sign of each map's gain is flipped in all ways, and each way counted, however many maps there are: of
     n maps with the same size of gain the number of those kept positive is binomial, so that the sum over all maps
@@ -85,9 +85,10 @@ def sign_flip_p(gain: np.ndarray) -> float:
 
     Args:
         gain: successes of the one trial less those of the other by map, whole numbers, shape [M].
+        direction: in which the one is thought to lie, `higher` or `lower`; two-sided when empty.
 
     Returns:
-        Share of all ways with a sum at least as far from 0.
+        Share of all ways with a sum at least as far from 0, or as far in the direction.
     """
     sizes, counts = np.unique(np.abs(gain[gain != 0]), return_counts=True)
     chances = np.ones(1)
@@ -96,7 +97,8 @@ def sign_flip_p(gain: np.ndarray) -> float:
         spread[:: 2 * size] = binom.pmf(np.arange(count + 1), count, 0.5)
         chances = np.convolve(chances, spread)
     total = np.abs(gain).sum()
-    far = np.abs(np.arange(-total, total + 1)) >= abs(gain.sum())
+    sums, seen = np.arange(-total, total + 1), gain.sum()
+    far = {"higher": sums >= seen, "lower": sums <= seen}.get(direction, np.abs(sums) >= abs(seen))
     return min(float(chances[far].sum()), 1.0)
 
 

@@ -42,8 +42,8 @@ class Pair:
         one: what is compared.
         other: with what.
         shared: labels of the two; of a label that one of them does not use, the other's.
-        episodes: of both, one's `success`, `total_time_s` and `time_budget_s`, the other's with `_other`; maps of which one trial
-            has fewer episodes are left out.
+        episodes: of both, one's `success`, `total_time_s` and `time_budget_s`, the other's with `_other`; maps of
+            which one trial has fewer episodes are left out.
         left_out: episodes of either trial that the other does not have.
     """
 
