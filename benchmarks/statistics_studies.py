@@ -22,6 +22,7 @@ from scipy.stats import beta, binomtest, bootstrap, norm
 from benchnav.eval.stats.best import best_set_p
 from benchnav.eval.stats.comparison import ALPHA, time_difference
 from benchnav.eval.stats.difference import sign_flip_p, sign_flips, signed_rank_p, success_interval
+from benchnav.eval.stats.hypotheses import METRICS, Hypothesis, p_of
 from benchnav.eval.stats.summary import cautious_design_effect, total_time_mean, wilson_interval
 
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
@@ -139,17 +140,12 @@ def cover_of_times(
         resampled: of so many studies also of a bootstrap (BCa) over maps.
     """
     found: dict[str, list[float]] = {}
-    maps_of = np.repeat(np.arange(maps), draws)
     for like in LIKENESS:
         _, far = drives(generator, rates, (1, 400_000), 1, like)
         truths = {"time": float(far[0, 0].mean()), "difference": float((far[0, 0] - far[0, 1]).mean())}
         success, taken = drives(generator, rates, (studies, maps), draws, like)
         for study in range(studies):
-            rows = pd.DataFrame({"instance": maps_of})
-            for suffix, condition in (("", 0), ("_other", 1)):
-                rows[f"success{suffix}"] = success[study, condition].ravel()
-                rows[f"total_time_s{suffix}"] = taken[study, condition].ravel()
-                rows[f"time_budget_s{suffix}"] = TIME_BUDGET_S
+            rows = _rows(success[study], taken[study])
             by_map = taken[study].mean(-1)
             for name, interval, values in (
                 ("time", total_time_mean(rows, {"time_budget_s": TIME_BUDGET_S}), by_map[0]),
@@ -268,6 +264,39 @@ def study_best(studies: int, seed: int) -> list[dict[str, object]]:
     return rows
 
 
+def study_hypotheses(studies: int, seed: int) -> list[dict[str, object]]:
+    """How often a single hypothesis is held for shown where the truth lies on the margin, or is no difference."""
+    rows = []
+    for maps, draws, rate in product((20, 50, 200), DRAWS, (0.8, 0.95)):
+        generator = np.random.default_rng([seed, maps, draws, round(100 * rate), 1])
+        row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
+        one, other, like = rate - 0.1, rate, LIKENESS[1]
+        _, far = drives(generator, (one, other), (1, 400_000), 1, like)
+        margins = {"success": 10.0, "T_total": float((far[0, 0] - far[0, 1]).mean())}
+        alike = drives(generator, (other, other), (studies, maps), draws, like)
+        apart = drives(generator, (one, other), (studies, maps), draws, like)
+        for metric, margin in margins.items():
+            for kind, drawn in (("difference", alike), ("non-inferiority", apart), ("equivalence", apart)):
+                test = Hypothesis(
+                    one="a", other="b", names=("a", "b"), metric=metric, kind=kind, margin=margin,
+                    direction=METRICS[metric].better if kind == "non-inferiority" else "",
+                )  # fmt: skip
+                shown = [p_of(test, _rows(*study)) < ALPHA for study in zip(*drawn, strict=True)]
+                row[f"{kind}, {metric}"] = _share(np.array(shown))
+        rows.append(row)
+    return rows
+
+
+def _rows(success: np.ndarray, total_time_s: np.ndarray) -> pd.DataFrame:
+    """Episodes of two conditions side by side, of arrays of shape [conditions, maps, draws]."""
+    rows = pd.DataFrame({"instance": np.repeat(np.arange(success.shape[1]), success.shape[2])})
+    for place, suffix in enumerate(("", "_other")):
+        rows[f"success{suffix}"] = success[place].ravel()
+        rows[f"total_time_s{suffix}"] = total_time_s[place].ravel()
+        rows[f"time_budget_s{suffix}"] = TIME_BUDGET_S
+    return rows
+
+
 def _share(found: np.ndarray) -> str:
     """A share in per cent with its 95 % interval of Clopper and Pearson."""
     ends = binomtest(int(found.sum()), len(found)).proportion_ci()
@@ -283,9 +312,13 @@ STUDIES: dict[str, tuple[Callable[[int, int], list[dict[str, object]]], str]] = 
         study_times,
         "Cover of 95 % intervals [%] and mean width, the other condition 10 points worse.",
     ),
+    "hypotheses": (
+        study_hypotheses,
+        "How often a hypothesis is shown that is false, the truth being no difference or on the margin [%].",
+    ),
     "best": (
         study_best,
-        "How often a condition as good as the best is called worse [%], with its 95 % interval; power at 10 points [%].",
+        "How often a condition as good as the best is called worse [%], with its 95 % interval; power at 10 points.",
     ),
 }
 

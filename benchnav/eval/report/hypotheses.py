@@ -75,7 +75,8 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> ResultTable:
         f"Tests: {'; '.join(used).format(unit=headings[2].removesuffix('s'))}. p is after Holm's correction over "
         f"{_count(len(tests))}; supported where it is under {ALPHA}.",
         "Intervals are of one difference alone: 95 % of a difference, and 90 % where a margin is tested, whose end "
-        f"beyond the margin decides the test before the correction. Under {LEAST_MAPS} {headings[2]} success alone has one.",
+        "beyond the margin decides the test before the correction. "
+        f"Under {LEAST_MAPS} {headings[2]} success alone has one.",
     ]
     if (tests["metric"] == "path_length").any():
         notes.append("Path length: of the episodes in which both arrived.")

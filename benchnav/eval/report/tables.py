@@ -33,8 +33,8 @@ _COLUMNS = {
     "Succ. [%]": "share of episodes that reached the goal.",
     "95 % interval": "of the success rate: Wilson's, with maps as the unit, so that episodes on one map count as fewer "
     "the more alike they end.",
-    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from those of "
-    f"the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
+    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from "
+    f"those of the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
     "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
     "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
     "planning [ms]": "wall time of planning one step of one robot, from the second step on: the median over an "

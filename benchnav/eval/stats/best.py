@@ -128,11 +128,12 @@ def against_best(
     Returns:
         A row a trial, in the order of the summary: `trial`; `told`, what is told the truth, of `TOLD`, empty
         where nothing is; `best`, the trial that is the best of its block; `best_rivals`, how many others compete;
-        `best_episodes`, of each of them in common, on `best_maps`, of which a group counts as
-        one; `best_difference`, by how much the best's success rate is higher, with its 95 % interval `_low`, `_high`, of the pair alone; `best_p`, from `best_set_p`; `best_shown`, the
-        minimum detectable difference with 80 % power; `best_alike`, true where it competes and is not significantly
-        worse than the best; and `best_marked`, true where it is alike and something in its block is worse. NaN where a
-        trial does not compete, and for the best itself.
+        `best_episodes`, of each of them in common, on `best_maps`, of which a group counts as one;
+        `best_difference`, by how much the best's success rate is higher, with its 95 % interval `_low`, `_high`, of
+        the pair alone; `best_p`, from `best_set_p`; `best_shown`, the minimum detectable difference with 80 % power;
+        `best_alike`, true where it competes and is not significantly worse than the best; and `best_marked`, true
+        where it is alike and something in its block is worse. NaN where a trial does not compete, and for the best
+        itself.
     """
     groups = dict(list(episodes.groupby("trial", sort=False)))
     summary = summary.assign(told=summary["trial"].map(told or {}).fillna(""))

@@ -195,7 +195,7 @@ def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
     for suffix, confidence in (("_90", 0.9), ("", 0.95)):
         difference, low, high = _interval(rows, test.metric, confidence)
         row |= {"difference": difference, f"low{suffix}": low, f"high{suffix}": high}
-    return row | {"p": _p(test, rows)}
+    return row | {"p": p_of(test, rows)}
 
 
 def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> tuple[float, float, float]:
@@ -226,8 +226,13 @@ def _sums(rows: pd.DataFrame, metric: str) -> np.ndarray:
     return pd.Series(_late(rows, metric)).groupby(units_of(rows).to_numpy()).sum().to_numpy()
 
 
-def _p(test: Hypothesis, rows: pd.DataFrame) -> float:
-    """p of the hypothesis that is to be rejected; 1 where there are too few maps to tell."""
+def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
+    """p of a hypothesis before any correction; 1 where there are too few maps to tell.
+
+    Args:
+        test: what is claimed.
+        rows: episodes of the two conditions side by side, the other's columns ending in `_other`.
+    """
     if test.kind == "difference":
         return _difference_p(test, rows)
     sides = {"higher": (-1.0,), "lower": (1.0,)}.get(test.direction, (-1.0, 1.0))
