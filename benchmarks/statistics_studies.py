@@ -16,14 +16,18 @@ from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from scipy.stats import beta, binomtest, bootstrap, norm
 
 from benchnav.eval.stats.best import best_set_p
-from benchnav.eval.stats.comparison import ALPHA, time_difference
-from benchnav.eval.stats.difference import sign_flip_p, sign_flips, signed_rank_p, success_interval
-from benchnav.eval.stats.hypotheses import METRICS, Hypothesis, p_of
-from benchnav.eval.stats.summary import cautious_design_effect, total_time_mean, wilson_interval
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.difference import (
+    sign_flip_p,
+    sign_flips,
+    signed_rank_p,
+    success_interval,
+    total_time_interval,
+)
+from benchnav.eval.stats.summary import cautious_design_effect, wilson_interval
 
 RATES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
 MAPS = (50, 100, 200)
@@ -121,6 +125,44 @@ def cover_of_differences(
         yield float(np.mean((low <= one - other) & (one - other <= high)))
 
 
+def time_intervals(
+    success: np.ndarray, taken: np.ndarray, confidence: float = 0.95
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Intervals of T_total of the first condition and of its difference from the second.
+
+    As `summary.total_time_mean` and `comparison.time_difference` make them, of many studies at once.
+
+    Args:
+        success: bool, shape [studies, 2, maps, draws].
+        taken: T_total in seconds, of the same shape.
+        confidence: coverage asked for; that of T_total itself is 95 %.
+
+    Returns:
+        Mean and ends of `time` and `difference`, each of shape [studies].
+    """
+    maps, draws = success.shape[2:]
+    member = np.repeat(np.arange(maps), draws)
+    arrivals = np.where(success, taken, 0.0).sum((2, 3)), success.sum((2, 3))
+    failed, by_map = 1.0 - success.mean(-1), taken.mean(-1)
+    effects = [cautious_design_effect(study.ravel(), member) for study in success[:, 0]]
+    rates = success[:, 0].mean((1, 2))
+    ends = np.array(
+        [wilson_interval(rate, maps * draws / effect) for rate, effect in zip(rates, effects, strict=True)]
+    )
+    penalty_s = TIME_BUDGET_S - arrivals[0][:, 0] / np.maximum(arrivals[1][:, 0], 1)
+    some = success.any(-1)
+    own = total_time_interval(
+        by_map[:, 0], failed[:, 0], (1 - ends[:, 1], 1 - ends[:, 0]), penalty_s, some[:, 0].sum(-1)
+    )
+    gain = success[:, 0].sum(-1) - success[:, 1].sum(-1)
+    _, low, high = success_interval(gain, draws, confidence)
+    penalty_s = TIME_BUDGET_S - arrivals[0].sum(1) / np.maximum(arrivals[1].sum(1), 1)
+    both = some.all(1).sum(-1)
+    late, fewer = by_map[:, 0] - by_map[:, 1], failed[:, 0] - failed[:, 1]
+    difference = total_time_interval(late, fewer, (-high, -low), penalty_s, both, confidence)
+    return {"time": own, "difference": difference}
+
+
 def cover_of_times(
     generator: np.random.Generator,
     studies: int,
@@ -133,32 +175,31 @@ def cover_of_times(
 
     Args:
         generator: of all that is drawn.
-        studies: how many.
+        studies: how many of each likeness.
         maps: of a study.
         draws: episodes a map.
         rates: of success; T_total is that of the first.
         resampled: of so many studies also of a bootstrap (BCa) over maps.
     """
-    found: dict[str, list[float]] = {}
+    found: dict[str, list[np.ndarray]] = {}
     for like in LIKENESS:
         _, far = drives(generator, rates, (1, 400_000), 1, like)
-        truths = {"time": float(far[0, 0].mean()), "difference": float((far[0, 0] - far[0, 1]).mean())}
+        truths = {"time": far[0, 0].mean(), "difference": (far[0, 0] - far[0, 1]).mean()}
         success, taken = drives(generator, rates, (studies, maps), draws, like)
-        for study in range(studies):
-            rows = _rows(success[study], taken[study])
-            by_map = taken[study].mean(-1)
-            for name, interval, values in (
-                ("time", total_time_mean(rows, {"time_budget_s": TIME_BUDGET_S}), by_map[0]),
-                ("difference", time_difference(rows), by_map[0] - by_map[1]),
-            ):
-                ends = {"": interval[1:]}
-                if study < resampled and np.ptp(values) > 0:
-                    drawn = bootstrap((values,), np.mean, n_resamples=999, rng=generator).confidence_interval
-                    ends["_bootstrap"] = (drawn.low, drawn.high)
-                for how, (low, high) in ends.items():
-                    found.setdefault(f"{name}_cover{how}", []).append(low <= truths[name] <= high)
-                    found.setdefault(f"{name}_width{how}", []).append(high - low)
-    return {name: float(np.mean(values)) for name, values in found.items()}
+        by_map = taken.mean(-1)
+        values = {"time": by_map[:, 0], "difference": by_map[:, 0] - by_map[:, 1]}
+        for name, interval in time_intervals(success, taken).items():
+            ends = {"": interval[1:]}
+            if resampled:
+                drawn = bootstrap(
+                    (values[name][:resampled],), np.mean, axis=-1, n_resamples=999, rng=generator
+                )
+                ends["_bootstrap"] = (drawn.confidence_interval.low, drawn.confidence_interval.high)
+            for how, (low, high) in ends.items():
+                held = (low <= truths[name]) & (truths[name] <= high)
+                found.setdefault(f"{name}_cover{how}", []).append(held)
+                found.setdefault(f"{name}_width{how}", []).append(high - low)
+    return {name: float(np.concatenate(parts).mean()) for name, parts in found.items()}
 
 
 def false_findings(
@@ -265,35 +306,25 @@ def study_best(studies: int, seed: int) -> list[dict[str, object]]:
 
 
 def study_hypotheses(studies: int, seed: int) -> list[dict[str, object]]:
-    """How often a single hypothesis is held for shown where the truth lies on the margin, or is no difference."""
+    """How often a single hypothesis is shown where it is false: no difference, or one as large as the margin."""
     rows = []
     for maps, draws, rate in product((20, 50, 200), DRAWS, (0.8, 0.95)):
         generator = np.random.default_rng([seed, maps, draws, round(100 * rate), 1])
         row: dict[str, object] = {"maps": maps, "episodes a map": draws, "success": rate}
         one, other, like = rate - 0.1, rate, LIKENESS[1]
+        success, taken = drives(generator, (other, other), (studies, maps), draws, like)
+        wins = success[:, 0].sum(-1) - success[:, 1].sum(-1)
+        row["difference, success"] = _share(np.array([sign_flip_p(gain) < ALPHA for gain in wins]))
         _, far = drives(generator, (one, other), (1, 400_000), 1, like)
-        margins = {"success": 10.0, "T_total": float((far[0, 0] - far[0, 1]).mean())}
-        alike = drives(generator, (other, other), (studies, maps), draws, like)
-        apart = drives(generator, (one, other), (studies, maps), draws, like)
-        for metric, margin in margins.items():
-            for kind, drawn in (("difference", alike), ("non-inferiority", apart), ("equivalence", apart)):
-                test = Hypothesis(
-                    one="a", other="b", names=("a", "b"), metric=metric, kind=kind, margin=margin,
-                    direction=METRICS[metric].better if kind == "non-inferiority" else "",
-                )  # fmt: skip
-                shown = [p_of(test, _rows(*study)) < ALPHA for study in zip(*drawn, strict=True)]
-                row[f"{kind}, {metric}"] = _share(np.array(shown))
+        success, taken = drives(generator, (one, other), (studies, maps), draws, like)
+        wins = success[:, 0].sum(-1) - success[:, 1].sum(-1)
+        _, low, _ = success_interval(wins, draws, 1 - 2 * ALPHA)
+        row["non-inferiority, success"] = _share(low > -0.1)
+        _, low, high = time_intervals(success, taken, 1 - 2 * ALPHA)["difference"]
+        margin = (far[0, 0] - far[0, 1]).mean()
+        row["non-inferiority, T_total"] = _share(high < margin)
+        row["equivalence, T_total"] = _share((high < margin) & (low > -margin))
         rows.append(row)
-    return rows
-
-
-def _rows(success: np.ndarray, total_time_s: np.ndarray) -> pd.DataFrame:
-    """Episodes of two conditions side by side, of arrays of shape [conditions, maps, draws]."""
-    rows = pd.DataFrame({"instance": np.repeat(np.arange(success.shape[1]), success.shape[2])})
-    for place, suffix in enumerate(("", "_other")):
-        rows[f"success{suffix}"] = success[place].ravel()
-        rows[f"total_time_s{suffix}"] = total_time_s[place].ravel()
-        rows[f"time_budget_s{suffix}"] = TIME_BUDGET_S
     return rows
 
 

@@ -24,7 +24,7 @@ def compared(planner: str = "mppi", risk: str = "mean", **changes: Any) -> Compa
         labels={**names, "run": given["run"]},
         world=given["world"],
         maps=given["maps"],
-        episodes=rows(episodes),
+        episodes=rows(episodes).assign(time_budget_s=100.0),
     )
 
 
