@@ -22,12 +22,14 @@ def by_map(values: np.ndarray, maps: np.ndarray) -> np.ndarray:
     Source: Cochran (1977), "Sampling Techniques", 6.3.
 
     Args:
-        values: one an episode, shape [N], N ≥ 1.
+        values: one an episode, shape [N].
         maps: which map each was on, any labels, shape [N].
 
     Returns:
         Shape [M], in the order of sorted labels.
     """
+    if not len(values):
+        return np.empty(0)
     _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
     mean = values.mean()
     return mean + np.bincount(member, weights=values - mean) / size.mean()

@@ -62,7 +62,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "planning_ms_p95_median",
         "planning_start_ms_median",
         "best_difference",
-        "best_p_holm",
+        "best_p",
         "best_alike",
     } <= set(summary.columns)
     again = pd.read_csv(folder / "summary.csv")
@@ -77,7 +77,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "    benchnav-eval run --seeds '[0,7]'",
     ):
         assert line in text.splitlines()
-    assert "| std | cl_rrt¹ | cvar | **100** |" in text
+    assert "| std | cl_rrt¹ | cvar | 100 |" in text
     assert "The highest success rate is that of " in text.partition("## Results")[0]
     assert "figures/success.png" in text
     assert "trajectories" not in text

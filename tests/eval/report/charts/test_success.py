@@ -112,7 +112,7 @@ def points_by_height(panel: Axes) -> list[float]:
     return [float(line.get_xdata()[0]) for line in sorted(marked, key=lambda line: line.get_ydata()[0])]
 
 
-def test_points_are_filled_where_the_test_does_not_tell_them_from_the_best() -> None:
+def test_points_are_filled_where_they_are_marked() -> None:
     summary = made.summarised(made.rows(shares(made.trial(risk="a"), 9), shares(made.trial(risk="b"), 2)))
     (panel,) = panels(success_figure(summary, {summary["trial"][0]}))
     marked = [line for line in panel.lines if line.get_marker() == "o"]
