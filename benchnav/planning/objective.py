@@ -1,10 +1,11 @@
 """Objectives J: what a planner minimises.
 
 An objective is any object with `stage` and `terminal`. `target` is the goal, or a local planner's
-way-point; traversability is read at the state before the move. Ground that is not free is no concern of
-J: the `Problem` adds its price. An objective whose constructor has a parameter `robot` is given the
-task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading dimensions, S state and A action
-dimensions.
+way-point; traversability is read at the state before the move, as the risk setting gives it: the least λ̂
+that motion is given does not bound it. In the Gymnasium environment J is given the λ that the robot met.
+Ground that is not free is no concern of J: the `Problem` adds its penalty. An objective whose constructor
+has a parameter `robot` is given the task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading
+dimensions, S state and A action dimensions.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ class Objective(Protocol):
         Args:
             state: shape [*B, S], beginning with (x, y, θ).
             action: shape [*B, A].
-            traversability: λ̂ at the state, shape [*B].
+            traversability: λ̂ at the state, in [0, 1] and not clamped, 0 off the map, shape [*B].
             target: (x, y) to be reached, shape [*B, 2].
 
         Returns:

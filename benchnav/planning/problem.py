@@ -21,6 +21,9 @@ from benchnav.terrain import Observation
 
 T = TypeVar("T")
 
+# Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free and 0 is off the map.
+_ZERO = 1e-30
+
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
@@ -111,17 +114,21 @@ class Problem:
 
     @cached_property
     def traversability(self) -> Tensor:
-        """The λ̂ that motion and path costs are given: at least `slowest`, shape [B, H, W]."""
+        """The λ̂ that motion and path costs are given: at least `slowest`, shape [B, H, W].
+
+        J is given `risk_map` itself, so that a cost of low λ̂ is not lost.
+        """
         return self.risk_map.clamp(min=self.task.rules.slowest)
 
     @cached_property
     def padded_ground(self) -> Tensor:
         """λ̂ and free space in one map framed for lookups: λ̂ where free, −λ̂ where not, −0 off the map.
 
-        One lookup a step serves both motion and price; see `traversability_at` and `free_at`.
+        One lookup a step serves motion, J and the price of ground that is not free; see `motion_traversability`,
+        `stage_cost` and `free_at`.
         """
-        signed = torch.where(self.free, self.traversability, -self.traversability)
-        return self.grid.pad(signed, outside=-0.0)
+        magnitude = self.risk_map.clamp(min=_ZERO)
+        return self.grid.pad(torch.where(self.free, magnitude, -magnitude), outside=-0.0)
 
     @cached_property
     def action_bounds(self) -> tuple[Tensor, Tensor]:
@@ -137,7 +144,7 @@ class Problem:
 
     def traversability_at(self, state: Tensor) -> Tensor:
         """λ̂ of motion where the robots stand, 0 off the map; shapes as for `ground_at`."""
-        return self.ground_at(state).abs()
+        return motion_traversability(self.ground_at(state), self.task.rules.slowest)
 
     def free_at(self, state: Tensor) -> Tensor:
         """Tells which robots stand on free ground, bool; shapes as for `ground_at`."""
@@ -178,14 +185,33 @@ class Problem:
         return with_tensors(self, lambda value: value.to(device))
 
 
+def motion_traversability(ground: Tensor, slowest: float) -> Tensor:
+    """λ̂ that motion is given: at least `slowest` on the map, 0 off it.
+
+    Args:
+        ground: read from `Problem.padded_ground`, any shape.
+        slowest: of the task's rules.
+
+    Returns:
+        Shape of `ground`.
+    """
+    return torch.where(ground == 0, 0, ground.abs().clamp(min=slowest))
+
+
+def _predicted(ground: Tensor) -> Tensor:
+    """λ̂ as the risk setting gives it, 0 off the map, from values of `Problem.padded_ground`."""
+    magnitude = ground.abs()
+    return torch.where(magnitude <= _ZERO, 0, magnitude)
+
+
 def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
     """J of a step and the price of ground that is not free; see `Problem.stage_cost`."""
-    return objective.stage(state, action, ground.abs(), target) + PRICE * (ground <= 0)
+    return objective.stage(state, action, _predicted(ground), target) + PRICE * (ground <= 0)
 
 
 def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: Tensor) -> Tensor:
     """J of the last state and the price of ground that is not free; see `Problem.terminal_cost`."""
-    return objective.terminal(state, ground.abs(), target) + PRICE * (ground <= 0)
+    return objective.terminal(state, _predicted(ground), target) + PRICE * (ground <= 0)
 
 
 def pose_problem(

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,6 +9,9 @@ from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PRICE, FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import GoalDistance
+from benchnav.planning.planners.astar.dwa import DWAConfig, held_paths, judge
+from benchnav.planning.planners.mppi import rollout_cost, rollout_path
+from benchnav.planning.problem import Problem
 from tests import factories
 
 
@@ -95,7 +100,7 @@ def test_ground_that_is_not_free_costs_its_price_a_step_beside_j() -> None:
     torch.testing.assert_close(problem.terminal_cost(state, target), expected.expand(2, 3))
 
 
-def test_a_users_objective_is_given_clamped_ground_and_the_price_is_added_to_it() -> None:
+def test_a_users_objective_is_given_the_risk_map_and_the_price_is_added_to_it() -> None:
     class Ground(GoalDistance):
         def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
             return traversability
@@ -104,14 +109,69 @@ def test_a_users_objective_is_given_clamped_ground_and_the_price_is_added_to_it(
             return 2 * traversability
 
     ground = torch.full((1, 16, 16), 0.8)
-    ground[0, 2] = 0.1
+    ground[0, 2], ground[0, 3] = 0.1, 0.0
     problem = factories.problem(ground, objective=Ground(), rules=Rules(slowest=0.2))
-    state = torch.tensor([[[1.25, 1.25, 0.0], [1.25, 2.25, 0.0]]])
-    stage = problem.stage_cost(state, torch.zeros(1, 2, 2), problem.ground_at(state), problem.goal_m[:, None])
-    assert stage[0].tolist() == pytest.approx([PRICE + 0.2, 0.8])
-    assert problem.terminal_cost(state, problem.goal_m[:, None])[0].tolist() == pytest.approx(
-        [PRICE + 0.4, 1.6]
+    # On bad ground, on ground of λ̂ = 0, on good ground, off the map.
+    state = torch.tensor([[[1.25, 1.25, 0.0], [1.25, 1.75, 0.0], [1.25, 2.25, 0.0], [-1.0, 2.25, 0.0]]])
+    stage = problem.stage_cost(state, torch.zeros(1, 4, 2), problem.ground_at(state), problem.goal_m[:, None])
+    low = float(torch.tensor(PRICE) + 0.1)
+    assert stage[0].tolist() == [low, PRICE, pytest.approx(0.8), PRICE]
+    terminal = problem.terminal_cost(state, problem.goal_m[:, None])[0].tolist()
+    assert terminal == [float(torch.tensor(PRICE) + 0.2), PRICE, pytest.approx(1.6), PRICE]
+
+
+class DreadsLowGround(GoalDistance):
+    """Costs 50 a step where λ̂ < 0.2, which the least λ̂ of motion, 0.3, would hide."""
+
+    def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+        return super().stage(state, action, traversability, target) + 50 * (traversability < 0.2)
+
+
+def low_field(objective: GoalDistance) -> Problem:
+    """A field of λ̂ = 0.1 that is free by the mean, so that no price adds to J; the robot stands in it."""
+    ground = torch.full((1, 16, 16), 0.9)
+    ground[0, 1:4, 1:4] = 0.1
+    problem = factories.problem(ground, objective=objective)
+    return replace(problem, free=torch.ones(1, 16, 16, dtype=torch.bool))
+
+
+def steps_on_low_ground(problem: Problem, paths: Tensor, steps: int) -> Tensor:
+    """Of positions [1, K, T + 1, 2], how many of the first T lie on low ground, shape [1, K]."""
+    ground = problem.grid.lookup(problem.grid.pad(problem.risk_map, 0.0), paths[..., 0], paths[..., 1])
+    return (ground[..., :steps] < 0.2).sum(-1)
+
+
+def test_dwa_minimises_a_cost_of_ground_below_the_least_traversability_of_motion() -> None:
+    config = DWAConfig()
+    plain, dread = low_field(GoalDistance()), low_field(DreadsLowGround())
+    pairs = torch.tensor([[[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [1.0, 0.4]]])
+    paths = held_paths(plain, plain.start, pairs, 50)
+    extra = judge(dread, dread.start, pairs, dread.goal_m, config) - judge(
+        plain, plain.start, pairs, plain.goal_m, config
     )
+    low = steps_on_low_ground(plain, paths, 50)
+    assert extra[0].tolist() == pytest.approx((50 * low[0]).tolist(), rel=1e-5)
+    assert (
+        low[0, 0] == 50 > low[0, 2] > 0
+    )  # one that stands pays at each step, one that drives until it is out
+
+
+def test_mppi_minimises_a_cost_of_ground_below_the_least_traversability_of_motion() -> None:
+    plain, dread = low_field(GoalDistance()), low_field(DreadsLowGround())
+    mean = torch.tensor([0.8, 0.0]).expand(1, 80, 2)
+    noise = 0.3 * torch.randn(80, 2, 20, generator=torch.Generator().manual_seed(0))
+    costs = [rollout_cost(p, p.start, mean, noise, p.goal_m) for p in (plain, dread)]
+    low, high = plain.action_bounds
+    actions = (mean[..., None] + noise).clamp(low[:, None], high[:, None])
+    steps = steps_on_low_ground(plain, rollout_path(plain, plain.start, actions), 80)
+    assert (costs[1] - costs[0])[0].tolist() == pytest.approx((50 * steps[0]).tolist(), rel=1e-4)
+    assert 0 < steps.min() < steps.max()
+
+
+def test_ground_that_is_free_by_the_mean_is_free_where_the_risk_map_is_0() -> None:
+    problem = replace(factories.problem(torch.zeros(1, 16, 16)), free=torch.ones(1, 16, 16, dtype=torch.bool))
+    assert problem.free_at(problem.start).all()
+    assert problem.traversability_at(problem.start).tolist() == pytest.approx([0.3])
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem, stage_cost, terminal_cost
+from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
@@ -208,6 +208,7 @@ def roll_out(
         states, cost = advance(
             states, cost, mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds,
             problem.padded_ground, target, problem.grid, problem.robot, problem.objective,
+            problem.task.rules.slowest,
         )  # fmt: skip
     return states, cost
 
@@ -233,14 +234,14 @@ def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
 
 def advance_chunk(
     states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective,
+    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective, slowest: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Rolls samples out over a chunk of the horizon, adding up their costs; takes a problem in its parts."""
     for step in range(mean.shape[1]):
         action = _perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, action, ground, target)
-        states = robot(states, action, ground.abs())
+        states = robot(states, action, motion_traversability(ground, slowest))
     return component_wise(states), cost
 
 

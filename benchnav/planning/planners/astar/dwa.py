@@ -21,7 +21,7 @@ from benchnav.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem, stage_cost, with_tensors
+from benchnav.planning.problem import Problem, motion_traversability, stage_cost, with_tensors
 from benchnav.planning.robots import Robot, action_limits, component_wise
 
 # A chunk of the horizon compiles in seconds.
@@ -198,7 +198,8 @@ def judge(
     for first in range(0, config.horizon, _CHUNK_STEPS):
         states, cost, under_way = advance(
             states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
-            problem.objective, config.arrival_m, min(_CHUNK_STEPS, config.horizon - first),
+            problem.objective, problem.task.rules.slowest, config.arrival_m,
+            min(_CHUNK_STEPS, config.horizon - first),
         )  # fmt: skip
     terminal = problem.terminal_cost(states, target)
     heading = config.heading_weight * _heading_error(state, states, target)
@@ -207,13 +208,13 @@ def judge(
 
 def hold(
     states: Tensor, cost: Tensor, under_way: Tensor, pairs: Tensor, padded_ground: Tensor, target: Tensor,
-    grid: Grid, robot: Robot, objective: Objective, arrival_m: float, steps: int,
+    grid: Grid, robot: Robot, objective: Objective, slowest: float, arrival_m: float, steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Holds each pair for some steps, adding up costs of those under way; takes a problem in its parts."""
     for _ in range(steps):
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, pairs, ground, target) * under_way
-        states = robot(states, pairs, ground.abs())
+        states = robot(states, pairs, motion_traversability(ground, slowest))
         offset = states[..., :2] - target
         under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
     return component_wise(states), cost, under_way

@@ -24,7 +24,7 @@ from torch import Tensor
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.planners.cl_rrt.pursuit import PathFollower, Reference, Tracking
-from benchnav.planning.problem import Problem
+from benchnav.planning.problem import Problem, motion_traversability
 
 SPACING_M = 0.1  # between the points of a reference
 DRAWN_M = 0.5  # between the drawn points of an edge
@@ -172,7 +172,7 @@ def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: T
         if step % _CHECK_STEPS == 0 and bool(((progress >= end_m) | collided).all()):
             break
         action, tracking = follower.act(reference, state, tracking, progress)
-        state = problem.robot(state, action, ground.abs())
+        state = problem.robot(state, action, motion_traversability(ground, problem.task.rules.slowest))
     return [torch.stack(values) for values in zip(*log, strict=True)]
 
 
