@@ -14,7 +14,8 @@ from tests.eval.report.test_write import run_folder
 
 def a_test(**changes: Any) -> dict[str, Any]:
     return {
-        "one": "a", "other": "b", "names": ("cvar", "mean"), "metric": "T_total", "kind": "equivalence", "direction": "",
+        "one": "a", "other": "b", "names": ("cvar", "mean"), "metric": "T_total", "kind": "equivalence",
+        "direction": "",
         "margin": 0.5, "claim": "T_total of cvar and of mean differs by less than 0.5 s", "unit": "s", "n_maps": 40,
         "n_episodes": 80, "mean_one": 35.2, "mean_other": 35.1, "difference": 0.1, "low": -0.25, "high": 0.45,
         "low_90": -0.2, "high_90": 0.4, "p": 0.01, "p_holm": 0.02, "supported": True,
