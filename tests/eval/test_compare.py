@@ -72,7 +72,7 @@ def test_the_numbers_are_those_of_the_pairs_of_the_run(tmp_path: Path) -> None:
     trials = [
         Compared(
             labels={**trial("mppi", risk), "run": NOT_USED}, world={}, maps=["m"] * MAPS,
-            episodes=episodes[(episodes["planner"] == "mppi") & (episodes["risk"] == risk)],
+            episodes=episodes[(episodes["planner"] == "mppi") & (episodes["risk"] == risk)].assign(time_budget_s=100.0),
         )
         for risk in ("mean", "cvar", "var")
     ]  # fmt: skip
