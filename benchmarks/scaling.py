@@ -2,7 +2,8 @@
 
     python benchmarks/scaling.py OUT.png
 
-One thread, medians. Each curve changes one setting of: 5 000 samples, 50 steps, 20 episodes, a map of 64 × 64 cells.
+One thread, medians. Each curve changes one setting of: 5 000 samples, 5 s (50 steps), 20 episodes, a map of 64 × 64
+cells.
 """
 
 import sys
@@ -25,7 +26,7 @@ from benchnav.planning.robots import Unicycle
 from benchnav.terrain import Observation
 
 SAMPLES = (2000, 5000, 10_000, 20_000, 50_000)
-HORIZONS = (10, 20, 50, 100, 200)
+HORIZONS_S = (1, 2, 5, 10, 20)
 EPISODES = (1, 2, 5, 10, 20, 50, 100)
 SIZES = (64, 128, 256, 512, 1024)
 
@@ -57,7 +58,7 @@ def main() -> None:
     small = problem_of(20, 64)
     curves = {
         "samples": {n: plan_ms(MPPI(MPPIConfig(samples=n)), small) for n in track(SAMPLES)},
-        "horizon [steps]": {n: plan_ms(MPPI(MPPIConfig(horizon=n)), small) for n in track(HORIZONS)},
+        "horizon [s]": {s: plan_ms(MPPI(MPPIConfig(horizon_s=s)), small) for s in track(HORIZONS_S)},
         "episodes": {n: plan_ms(MPPI(), problem_of(n, 64)) for n in track(EPISODES)},
         "cells along a side of the map": {n: plan_ms(MPPI(), problem_of(20, n)) for n in track(SIZES)},
     }

@@ -132,11 +132,17 @@ def explain(message: str, words: Sequence[str], known: Known) -> str:
         return f"Expected flags that `{known.program}` has, got {found[1]!r}.{hint(found[1], known.kinds)}"
     key = re.search(r'Parser key "([^"]+)"', message)
     value = re.search(
-        r"(?:Got value|Given value|Unable to load config): ?(.*)|Unable to load config '(.*?)'", message
+        r"(?:Got value|Given value|Unable to load config): ?(.*?)(?: - Expected .*)?$|Unable to load config '(.*?)'",
+        message,
     )
-    if key and value and (name := key[1].removeprefix(f"{known.program.split()[-1]}.")) in known.kinds:
-        typed = any(word.partition("=")[0][2:].replace("-", "_") == name for word in words)
-        kind, got = known.kinds[name], value[1] or value[2]
+    # The parser's key begins with the name of the command, which a setting may have too.
+    names = [key[1], key[1].removeprefix(f"{known.program.split()[-1]}.")] if key else []
+    if name := next((name for name in names if name in known.kinds), ""):
+        given = [flag.value for flag in _read(words, known)[0] if flag.name == name]
+        typed = bool(given)
+        kind = known.kinds[name]
+        # What the user typed reads better than what the parser made of it.
+        got = given[-1] if typed else (value[1] or value[2]) if value else message
         where = f"--{name}" if typed else f"`{name}`{_in_files(words)}"
         near = hint(got, [member for member in _members(kind) if isinstance(member, str)])
         return f"Expected {where} as {in_words(kind)}, got {got!r}.{near}"
@@ -192,7 +198,7 @@ def _read(words: Sequence[str], known: Known) -> tuple[list[_Flag], list[str]]:
                 expected = "" if kind is Any else f" ({in_words(kind)})"
                 raise ConfigError(f"Expected a value after {flag}{expected}, got none.")
             value = rest.pop(0)
-        if _is_list(kind) and not value.lstrip().startswith(("[", "(")):
+        if _is_list(kind) and str not in _members(kind) and not value.lstrip().startswith(("[", "(")):
             value = f"[{value}]"
         given.append(_Flag(name, keys, value))
     return given, places

@@ -111,7 +111,7 @@ class Cells:
 
 def mean(cells: Cells) -> Tensor:
     """Computes E[λ], with its gradient in the parameters, shape [N]."""
-    return 1 - (cells.integral(1.0) - cells.integral(0.0))
+    return (1 - (cells.integral(1.0) - cells.integral(0.0))).clamp(0, 1)  # rounding is by up to 1e-16
 
 
 @torch.no_grad()

@@ -2,11 +2,12 @@
 
 import fcntl
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from benchnav.errors import BenchnavError
+from benchnav.errors import BenchnavError, ConfigError
 
 
 @contextmanager
@@ -30,6 +31,19 @@ def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def output_path(name: str) -> Path:
+    """The place on this machine that a user names for an output.
+
+    Raises:
+        ConfigError: it is an address, such as s3://bucket/name, which would become a folder `s3:`.
+    """
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:/", name):
+        raise ConfigError(
+            f"Expected `out` as a place on this machine, got the address {name!r}. Write to a folder here, and copy it."
+        )
+    return Path(name).expanduser()
 
 
 def write_text(path: Path, text: str) -> None:

@@ -40,7 +40,8 @@ class TraversabilityMixture:
     """A Gaussian mixture clipped to [0, 1] in each cell of a map.
 
     Args:
-        weights: probability of each component, summing to 1 over K, shape [*B, K, H, W].
+        weights: probability of each component, summing to 1 over K up to rounding, by which they are divided;
+            shape [*B, K, H, W].
         means: component means before clipping, shape [*B, K, H, W].
         stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
         group: K numbers: in a cell the components of one number belong to one terrain class together; None
@@ -127,7 +128,7 @@ class TraversabilityMixture:
         if value <= 0:
             return torch.ones_like(self.weights.select(-3, 0))
         below = self._uncensored_cdf(torch.tensor(value, dtype=torch.float64, device=self.weights.device))
-        return (1 - below).clamp(0, 1).to(self.weights.dtype)
+        return (1 - below).to(self.weights.dtype)
 
     def harmonic_mean(self, floor: float) -> Tensor:
         """1 / E[1 / max(λ, floor)]: the speed, as a share, that gives the expected time over the ground.
@@ -264,18 +265,20 @@ class TraversabilityMixture:
         for start in range(0, max(1, total), size):
             piece = slice(start, start + size)
             weights, means, stds = (values[:, piece].to(torch.float64) for values in parameters)
-            cells = Cells(weights, means, math.sqrt(0.5) / stds.clamp(min=_SMALLEST_STD), deep)
+            cells = Cells(
+                weights / added(weights), means, math.sqrt(0.5) / stds.clamp(min=_SMALLEST_STD), deep
+            )
             done.append(work(cells, *(layer[piece] for layer in flat)))
         return torch.cat(done).view(self.weights.select(-3, 0).shape).to(self.weights.dtype)
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
-        return weights, means, stds.clamp(min=_SMALLEST_STD)
+        return weights / weights.sum(-3, keepdim=True), means, stds.clamp(min=_SMALLEST_STD)
 
     def _uncensored_cdf(self, value: Tensor) -> Tensor:
         weights, means, stds = self._parameters()
         at = value.unsqueeze(-3) if value.ndim else value
-        return (weights * _probability((at - means) / stds)).sum(-3)
+        return (weights * _probability((at - means) / stds)).sum(-3).clamp(0, 1)
 
 
 def _harmonic_mean(cells: Cells, floor: float) -> Tensor:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import PurePath
-from types import NoneType, SimpleNamespace, UnionType
+from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from benchnav.errors import BenchnavError, ConfigError
@@ -93,7 +93,7 @@ def typed(owner: str, name: str, option: Option, value: Any) -> Any:
     config = dataclass_in(option.kind)
     if config and isinstance(value, Mapping):
         known = list_options(config)
-        refuse_unknown(owner, value, known, f"{name}.")
+        refuse_unknown(owner, value, known, f"{name}.", gone_options(config))
         given = {key: typed(owner, f"{name}.{key}", known[key], item) for key, item in value.items()}
         return call(f"option {name!r} of {owner}", config, given)
     if option.kind is Any or (isinstance(option.kind, type) and type(value) is option.kind):
@@ -120,10 +120,19 @@ def from_text(owner: str, name: str, option: Option, text: str) -> Any:
     return get_loader("yaml")(text)
 
 
+def gone_options(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Mapping[str, str]:
+    """Options that were once there and what does their work now: `gone` of a class or of its `config`."""
+    return getattr(config_class(target, skipped) or target, "gone", {})
+
+
 def refuse_unknown(
-    owner: str, given: Mapping[str, Any], known: Mapping[str, Option], prefix: str = ""
+    owner: str,
+    given: Mapping[str, Any],
+    known: Mapping[str, Option],
+    prefix: str = "",
+    gone: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Refuses names that are no options, with the nearest that is.
+    """Refuses names that are no options, with what does their work now or the nearest name that is one.
 
     Raises:
         ConfigError: there is such a name.
@@ -131,9 +140,8 @@ def refuse_unknown(
     for name in map(str, given):
         if name not in known:
             among = f"among {', '.join(prefix + other for other in known)}" if known else "none: it has none"
-            raise ConfigError(
-                f"Expected options of {owner} {among}; got {prefix + name!r}.{hint(name, known, prefix)}"
-            )
+            remedy = f" {gone[name]}" if name in gone else hint(name, known, prefix)
+            raise ConfigError(f"Expected options of {owner} {among}; got {prefix + name!r}.{remedy}")
 
 
 def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:

@@ -12,12 +12,18 @@ of four forms:
 What stands at the name is a class or a function. Its keyword parameters are its options; where the one
 parameter is a dataclass named `config`, the fields of that are. A class is made with them; a risk measure
 that is a function is called with them beside its mixture.
+
+A part is identified by its source and all that this imports, by every file or folder that an option names, and by
+those that its class or function lists as `files`, relative to its own file: `files = ("weights.npz",)`. Options that
+name what it writes stand in `writes`: `writes = ("log",)`.
 """
 
 import importlib
 import inspect
+import os
+import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
@@ -32,6 +38,7 @@ from benchnav.options import (
     call,
     config_class,
     from_text,
+    gone_options,
     hint,
     list_options,
     one_line,
@@ -44,7 +51,9 @@ from benchnav.options import (
 from benchnav.sources import (
     attribute,
     digest_of,
-    digest_of_package,
+    digest_of_file_part,
+    digest_of_modules,
+    digest_of_path,
     digest_of_target,
     distribution_of,
     load_file,
@@ -61,6 +70,7 @@ __all__ = [
     "hint",
     "make",
     "names",
+    "option_files",
     "options_of",
     "read_part",
     "register",
@@ -69,7 +79,8 @@ __all__ = [
 
 KINDS = ("planner", "model", "risk", "robot", "objective")
 
-_GIVEN = ("robot",)  # parameters that the program gives, so no options
+# Parameters that the program gives, so no options.
+_GIVEN: Mapping[str, tuple[str, ...]] = {"objective": ("robot", "goal_radius_m")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,17 +105,27 @@ class Found:
     Args:
         target: the class or function.
         origin: where it comes from, for people.
-        digest: SHA-256 of the file or of the packages it comes from; empty for the parts of this package,
-            and where no source is to be had.
+        source_digest: gives the digest of its source and of what that imports; empty for the parts of this
+            package, and where no source is to be had.
         shipped: it is one of ours.
         everywhere: other processes find it too.
     """
 
     target: Any
     origin: str
-    digest: str
+    source_digest: Callable[[], str] = str
     shipped: bool = False
     everywhere: bool = True
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its source, of what that imports, and of the `files` that it lists.
+
+        Raises:
+            ConfigError: a file that it lists is not there.
+        """
+        listed = [digest for pair in _listed_files(self.target) for digest in pair]
+        return digest_of(map(str.encode, (self.source_digest(), *listed))) if listed else self.source_digest()
 
 
 _REGISTERED: dict[tuple[str, str], Any] = {}
@@ -173,8 +194,8 @@ def complete(kind: str, part: Part) -> Part:
         ConfigError: there is no such part or option, or a value is of another type.
     """
     owner = f"{kind} {part.part!r}"
-    known = options_of(kind, find(kind, part.part).target)
-    given = _typed_options(kind, part, known)
+    target = find(kind, part.part).target
+    known, given = options_of(kind, target), _typed_options(kind, part, target)
     options = {}
     for name, option in known.items():
         value = given.get(name, option.default)
@@ -195,7 +216,7 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     Args:
         kind: one of `KINDS`.
         part: which, in any form that `read_part` reads.
-        given: what the part is made for, such as `robot`; passed on where a parameter bears the name.
+        given: what the part is made for, such as an objective's `robot`; passed on where a parameter bears the name.
 
     Returns:
         The object; of a risk measure a function of the mixture alone.
@@ -207,8 +228,8 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     owner = f"{kind} {part.part!r}"
     target = find(kind, part.part).target
     complete(kind, part)
-    arguments = _typed_options(kind, part, options_of(kind, target))
-    config = config_class(target, _GIVEN)
+    arguments = _typed_options(kind, part, target)
+    config = config_class(target, _GIVEN.get(kind, ()))
     if config:
         arguments = {"config": call(f"options of {owner}", config, arguments)}
     arguments |= {name: value for name, value in given.items() if name in parameters(target)}
@@ -229,7 +250,8 @@ def find(kind: str, source: str) -> Found:
     """
     if (_checked(kind), source) in _REGISTERED:
         target = _REGISTERED[kind, source]
-        return Found(target=target, origin="this process", digest=digest_of_target(target), everywhere=False)
+        digest = partial(digest_of_target, target)
+        return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
     points = [point for point in _points(kind) if point.name == source]
     if len(points) > 1:
         raise ConfigError(
@@ -247,9 +269,10 @@ def find(kind: str, source: str) -> Found:
 def options_of(kind: str, target: Any) -> dict[str, Option]:
     """Lists the options of a class or function, in order, by name.
 
-    Parameters that are given by the caller (`robot`, and a risk measure's mixture) are none.
+    Parameters that are given by the caller (an objective's `robot` and `goal_radius_m`, a risk measure's mixture)
+    are none.
     """
-    skipped: tuple[str, ...] = _GIVEN
+    skipped = _GIVEN.get(kind, ())
     if kind == "risk" and not inspect.isclass(target):
         skipped += tuple(parameters(target))[:1]
     return list_options(target, skipped)
@@ -287,9 +310,9 @@ def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
     return next(iter(known.items()))
 
 
-def _typed_options(kind: str, part: Part, known: Mapping[str, Option]) -> dict[str, Any]:
-    owner = f"{kind} {part.part!r}"
-    refuse_unknown(owner, part.options, known)
+def _typed_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
+    owner, known = f"{kind} {part.part!r}", options_of(kind, target)
+    refuse_unknown(owner, part.options, known, gone=gone_options(target, _GIVEN.get(kind, ())))
     return {name: typed(owner, name, known[name], value) for name, value in part.options.items()}
 
 
@@ -323,14 +346,14 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
             ) from error
         raise ConfigError(f"module {place} could not be imported: {one_line(error)}") from error
     target = attribute(module, place, name)
-    packages = {str(whose).partition(".")[0] for whose in (place, getattr(target, "__module__", place))}
     if place.partition(".")[0] == "benchnav":
-        return Found(target=target, origin=f"benchnav {benchnav.__version__}", digest="", shipped=True)
-    foreign = sorted(packages - {"benchnav", "builtins"})
+        return Found(target=target, origin=f"benchnav {benchnav.__version__}", shipped=True)
+    modules = {place, str(getattr(target, "__module__", place))}
+    foreign = [name for name in modules if name.partition(".")[0] not in ("benchnav", "builtins")]
     return Found(
         target=target,
         origin=distribution_of(place.partition(".")[0]) or f"module {place}",
-        digest=digest_of(digest_of_package(package).encode() for package in foreign),
+        source_digest=partial(digest_of_modules, foreign),
     )
 
 
@@ -344,4 +367,57 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
             f"Expected a {kind} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
         ) from error
     target = attribute(load_file(path.resolve(), content), str(path), name)
-    return Found(target=target, origin=f"file {path}", digest=digest_of([content]))
+    source = partial(digest_of_file_part, path.resolve(), content)
+    return Found(target=target, origin=f"file {path}", source_digest=source)
+
+
+def _listed_files(target: Any) -> Iterator[tuple[str, str]]:
+    """What a part lists as `files`, each with its digest."""
+    listed = getattr(target, "files", ())
+    if not listed or not isinstance(listed, list | tuple) or "files" in parameters(target):
+        return
+    module = sys.modules.get(str(getattr(target, "__module__", "")))
+    folder = Path(getattr(module, "__file__", None) or "").parent
+    for name in map(str, listed):
+        digest = digest_of_path(folder / name)
+        if not digest:
+            raise ConfigError(
+                f"Expected `files` of {target.__qualname__} in {folder}, got {name!r}, which is not there."
+            )
+        yield name, digest
+
+
+def option_files(kind: str, part: Part) -> dict[str, str]:
+    """Digests of what a part's options name: files and folders, by the path as it is written.
+
+    What reads as a path and is not there is among them, with an empty digest, so that it is seen when it comes or goes.
+    Options that the part lists as `writes` are not.
+
+    Raises:
+        ConfigError: an option names a folder that holds the working folder.
+    """
+    if not part.options:
+        return {}
+    written = getattr(find(kind, part.part).target, "writes", ())
+    found = {}
+    for text in _texts([value for name, value in part.options.items() if name not in written]):
+        path = Path(text).expanduser()
+        there = os.path.exists(path)  # of what cannot be a path false, where Path raises
+        if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
+            raise ConfigError(
+                f"Expected options of {kind} {part.part!r} that name files or folders of their own, got {text!r}, "
+                "which holds the working folder. Name the folder that is read, or list the option in its `writes`."
+            )
+        if there or os.sep in text or re.search(r"\.[A-Za-z]\w*$", text):
+            found[text] = digest_of_path(path) if there else ""
+    return found
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts in a value of plain data."""
+    if isinstance(value, str):
+        if value:
+            yield value
+    elif isinstance(value, Mapping | list | tuple):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(inner)

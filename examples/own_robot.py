@@ -28,7 +28,10 @@ class Tracked(Unicycle):
 
 @dataclass(frozen=True, kw_only=True)
 class Energy:
-    """Distance to the goal, and what the tracks waste where they slip."""
+    """Distance to the goal, and what the tracks waste where they slip.
+
+    Planners that search paths, such as A*, minimise `path_cost`; without it they would take the shortest path.
+    """
 
     waste: float = 2.0
 
@@ -37,3 +40,7 @@ class Energy:
 
     def terminal(self, state, traversability, target):
         return distance(state, target)
+
+    def path_cost(self, traversability, grade):
+        # Over a metre of ground the tracks run for 1 / λ metres.
+        return 1 + self.waste * (1 / traversability - 1)

@@ -172,6 +172,60 @@ def test_risk_measures_are_ordered_finite_and_in_range(weights, means, stds, lev
     assert (mixture.cvar(high) <= mixture.mean() + 1e-6).all()
 
 
+@given(
+    weights=st.lists(st.floats(0, 1), min_size=1, max_size=5).filter(lambda w: sum(w) > 1e-3),
+    means=st.lists(st.sampled_from([-3.0, -0.1, 0.0, 0.3, 0.5, 1.0, 1.2, 4.0]), min_size=5, max_size=5),
+    std=st.sampled_from([0.0, 1e-3, 0.2]),
+    off=st.floats(-1e-4, 1e-4),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+@settings(max_examples=200, deadline=None)
+def test_weights_that_sum_to_nearly_1_tell_of_what_those_do_that_sum_to_it(
+    weights, means, std, off, dtype
+) -> None:
+    shares = torch.tensor(weights, dtype=torch.float64)
+    shares = (shares / shares.sum())[:, None, None]
+    places = torch.tensor(means[: len(weights)], dtype=torch.float64)[:, None, None]
+    exact = TraversabilityMixture(shares, places, torch.full_like(shares, std))
+    mixture = TraversabilityMixture(
+        ((1 + off) * shares).to(dtype), places.to(dtype), exact.stds.to(dtype)
+    )  # fmt: skip
+    seen = torch.tensor([[0.0]], dtype=torch.float64)
+    for found, wanted in (
+        (mixture.mean(), exact.mean()),
+        (mixture.cvar(0.9), exact.cvar(0.9)),
+        (mixture.harmonic_mean(0.1), exact.harmonic_mean(0.1)),
+        (mixture.chance(0.45), exact.chance(0.45)),
+        (mixture.cdf(0.45), exact.cdf(0.45)),
+        (mixture.log_prob(seen).exp(), exact.log_prob(seen).exp()),
+    ):
+        assert 0 <= found.item() <= 1
+        assert found.item() == pytest.approx(wanted.item(), abs=1e-5)
+    for level in (0.0, 1e-6, 0.5, 1 - 1e-6):
+        assert 0 <= mixture.cvar(level).item() <= mixture.var(level).item() <= 1
+
+
+@pytest.mark.parametrize(("mean", "value"), [(-3.0, 0.0), (4.0, 1.0)])
+@pytest.mark.parametrize("off", [-1e-4, -2e-7, 0.0, 2e-7, 1e-4])
+def test_ground_surely_at_an_end_is_there_whatever_the_weights_sum_to(
+    mean: float, value: float, off: float
+) -> None:
+    weights = (1 + off) * torch.tensor([0.3, 0.6, 0.1])[:, None, None]
+    mixture = TraversabilityMixture(weights, torch.full_like(weights, mean), torch.full_like(weights, 0.01))
+    for found in (
+        mixture.mean(),
+        mixture.var(1e-5),
+        mixture.var(1 - 1e-5),
+        mixture.cvar(0.9),
+        mixture.from_normal(torch.full((1, 1), 4.5)),
+        mixture.from_normal(torch.full((1, 1), -4.5)),
+        mixture.chance(0.5),
+        1 - mixture.cdf(0.5),
+    ):
+        assert found.item() == pytest.approx(value, abs=1e-7)
+        assert 0 <= found.item() <= 1
+
+
 def test_var_at_level_0_is_the_supremum_whatever_the_weights_sum_to() -> None:
     weights = torch.softmax(torch.randn(50, 6, 1, 1, generator=torch.Generator().manual_seed(0)), dim=1)
     mixture = TraversabilityMixture(weights, torch.full_like(weights, 0.2), torch.full_like(weights, 0.01))

@@ -8,13 +8,17 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from benchnav.datagen.cli import main as datagen
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.eval.cli import main as evaluate
+from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.cli import main as train
+from benchnav.models.quality import figures
 from tests.datagen.dem.rasters import rough, write
 
 rasterio = pytest.importorskip("rasterio")
@@ -81,3 +85,90 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match="a class in every cell"):
         gymnasium.make("benchnav/OffRoad-v0", data="real.h5", split="train")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two classes of measured λ near 0.2 and 0.9, which is not what the recipe's class table says of them.
+
+    The first map of the split `test/site` has no class, but colours and a measured λ.
+    """
+    folder, generator = tmp_path_factory.mktemp("site"), np.random.default_rng(1)
+    classes = np.repeat(generator.integers(0, 2, (ROWS // 8, COLUMNS // 8)), 8, 0).repeat(8, 1)
+    value = np.clip(np.where(classes == 0, 0.2, 0.9) + 0.03 * generator.standard_normal(classes.shape), 0, 1)
+    photo = np.stack([60 + 150 * classes, 90 + 30 * classes, 200 - 60 * classes]).astype(np.uint8)
+    labels = classes.astype(np.uint8)
+    labels[:, 8 * 32 : 9 * 32] = 200
+    write(folder / "dem.tif", rough(ROWS, COLUMNS))
+    write(folder / "classes.tif", labels, nodata=200)
+    write(folder / "photo.tif", photo)
+    write(folder / "value.tif", value.astype(np.float32))
+    rasters = ("dem.tif", "--classes", "classes.tif", "--photo", "photo.tif", "--traversability", "value.tif")
+    splits = ("--splits", "train:0.4,valid:0.2,test/site:0.4", "--recipe", "tiny-v1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert call(patch, datagen, "import-dem", *rasters, *splits, "--out", "real.h5") == 0
+        gp = ("--gp.epochs", "2", "--gp.epoch_steps", "10", "--classifier.encoder_depth", "3")
+        assert call(patch, train, "all", "--data", "real.h5", "--out", "mine", *QUICK, *gp) == 0
+    return folder
+
+
+def test_nothing_is_scored_against_a_truth_that_is_unknown(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(site)
+    dataset = TerrainDataset("real.h5")
+    assert dataset.truth == "unknown"
+    metrics = load_checkpoint("mine").part("gp").metrics
+    assert set(metrics) == {"valid_nll"}
+    assert metrics["valid_nll"] < -1
+    drawn: dict[str, list[object]] = {}
+
+    def save(figure: Figure, path: Path) -> None:
+        texts = [text.get_text() for text in figure.findobj(Text)]
+        drawn[path.stem] = [texts, [panel.get_label() for panel in figure.axes]]
+
+    monkeypatch.setattr(figures, "save_figure", save)
+    for model in ("mine", "oracle"):
+        out = ("--out", tmp_path / model, "--maps", 1)
+        assert call(monkeypatch, train, "evaluate", model, "--data", "real.h5", *out) == 0
+        said, _ = capfd.readouterr()
+        page = (tmp_path / model / "quality.md").read_text()
+        for text in (said, page):
+            assert "RMSE E[λ] is –, since the true distribution of λ is unknown" in text
+            assert "are against measured λ" in text
+            assert ("is the class table of the recipe, not the truth" in text) == (model == "oracle")
+        found = json.loads((tmp_path / model / "quality.json").read_text())
+        assert found["truth"] == "unknown"
+        assert found["splits"]["test/site"]["rmse_expected"] is None
+        headings, _, row = page.splitlines()[2:5]
+        columns = [cell.strip() for cell in headings.split("|")]
+        assert row.split("|")[columns.index("RMSE E[λ]")].strip() == "–"
+    texts, _ = drawn["latent"]
+    assert "GP mean" in texts
+    assert not [text for text in texts if "true" in text or "(0" in text]
+    _, panels = drawn["maps-test-site"]
+    assert {"observed 0", "expected 0", "error_observed 0"} <= set(panels)
+    assert not {"expected_true 0", "error 0"} & set(panels)
+
+
+def test_a_map_without_labels_but_with_a_measured_traversability_is_learned_from(site: Path) -> None:
+    dataset = TerrainDataset(site / "real.h5")
+    labels = dataset.read("test/site", fields=["class_id", "traversability"])
+    (bare,) = np.flatnonzero((labels["class_id"] == UNLABELLED).all(axis=(1, 2)))
+    assert np.isfinite(labels["traversability"][bare]).all()
+    reasons = dataset.splits["test/site"]["parts"][0]["source"]["left_out"]
+    assert reasons["missing_classes"] == 0
+
+
+def test_lambda_that_the_class_table_drew_is_not_called_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "dem.tif", rough(ROWS, 32 * 3))
+    assert call(monkeypatch, datagen, "import-dem", "dem.tif", "--recipe", "tiny-v1", "--out", "real.h5") == 0
+    capfd.readouterr()
+    assert call(monkeypatch, train, "evaluate", "oracle", "--data", "real.h5") == 0
+    said = capfd.readouterr().out
+    if TerrainDataset("real.h5").truth == "unknown":
+        assert "drawn by the class table, not measured" in said

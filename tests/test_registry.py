@@ -452,7 +452,6 @@ def test_two_files_of_one_stem_are_two_modules(file: str) -> None:
 
 def test_the_digest_of_a_package_covers_all_its_sources(package: Path) -> None:
     def digest() -> str:
-        registry.digest_of_package.cache_clear()
         return find("planner", "plugged").digest
 
     before = digest()
@@ -479,7 +478,6 @@ def test_the_digest_of_a_module_is_that_of_its_file_and_of_where_the_part_is_def
         for name in ("base_of_it", "front_of_it"):
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
-        registry.digest_of_package.cache_clear()
         seen.add(find("planner", "front_of_it:Planner").digest)
     assert len(seen) == 2
     found = find("risk", "front_of_it:mean")

@@ -3,14 +3,12 @@
 None of the simulation of `benchnav` is used. Letters in shapes: B trials.
 """
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from benchmarks.cai.task import GOAL_M, GOAL_RADIUS_M, STEPS, Setup
+from benchmarks.cai.task import GOAL_M, GOAL_RADIUS_M, STEPS
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, advance_chunk, weigh
+from benchnav.planning.planners.mppi import MPPI, OF_EPISODES, MPPIConfig, advance_chunk, weigh
 from benchnav.planning.planners.planner import Step
 from benchnav.planning.problem import Problem
 
@@ -21,30 +19,14 @@ class ManyTrialsMPPI(MPPI):
     """MPPI that is compiled even at few samples: hundreds of trials of one shape share the compiling.
 
     Args:
-        setup: settings, and how samples are averaged.
+        config: settings.
     """
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, config: MPPIConfig) -> None:
         """Keeps the settings."""
-        super().__init__(setup.mppi)
-        self._advance = Fused(advance_chunk, setup.mppi.samples, _ALWAYS, batched=OF_EPISODES)
-        self._weigh = Fused(WEIGHS[setup.average], setup.mppi.samples, _ALWAYS, batched=OF_EPISODES)
-
-
-def average_as_drawn(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Averages the noise as drawn and clips the sum; arguments as for `mppi.average`."""
-    return torch.clamp(mean + torch.einsum("bk,tak->bta", weights, noise), low, high)
-
-
-def weigh_as_drawn(
-    states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor, *rest: Any
-) -> tuple[Tensor, Tensor]:
-    """As `mppi.weigh`, but that the noise is averaged as drawn."""
-    weights, _ = weigh(states, cost, mean, noise, low, high, *rest)
-    return weights, average_as_drawn(mean, noise, weights, low, high)
-
-
-WEIGHS = {"clipped": weigh, "drawn": weigh_as_drawn}
+        super().__init__(config)
+        self._advance = Fused(advance_chunk, config.samples, _ALWAYS, batched=OF_EPISODES)
+        self._weigh = Fused(weigh, config.samples, _ALWAYS, batched=OF_EPISODES)
 
 
 def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:

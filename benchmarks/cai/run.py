@@ -42,7 +42,7 @@ def run_trials(
         raise ConfigError(f"Expected densities in [0, 1], got {list(densities)}.")
     if maps < 1 or realisations < 1:
         raise ConfigError(f"Expected `maps` and `realisations` ≥ 1, got {maps} and {realisations}.")
-    planner = ManyTrialsMPPI(setup)
+    planner = ManyTrialsMPPI(setup.mppi)
     labels = pd.MultiIndex.from_product((densities, settings), names=("density", "setting")).to_frame(
         index=False
     )

@@ -28,7 +28,7 @@ START_M = (0.5, 0.5)
 GOAL_M = (8.5, 8.5)
 GOAL_RADIUS_M = 0.5
 STEPS = 150
-THEIR_MPPI = MPPIConfig(horizon=100, samples=1024, noise=(2.0, 2.0), temperature=1.0, control_cost=1.0)
+THEIR_MPPI = MPPIConfig(horizon_s=10.0, samples=1024, noise=(2.0, 2.0), temperature=1.0, control_cost=1.0)
 _LAST_SPEED_MPS = 0.01 + 1e-6
 
 
@@ -78,8 +78,6 @@ class Setup:
 
     Args:
         mppi: settings of the planner.
-        average: `clipped`, of samples within the bounds of actions, as ours is, or `drawn`, of samples as
-            drawn, which is clipped then, as theirs is.
         risk_map: `exact`, by our risk settings, or `histogram`, by their binning and rounding.
         objective: `theirs`, or one of ours by name.
         distance_power: of the distance in a step's cost.
@@ -87,7 +85,6 @@ class Setup:
     """
 
     mppi: MPPIConfig = THEIR_MPPI
-    average: Literal["clipped", "drawn"] = "clipped"
     risk_map: Literal["exact", "histogram"] = "exact"
     objective: str = "theirs"
     distance_power: int = 1
@@ -160,4 +157,4 @@ def choose_objective(setup: Setup) -> Objective:
     """J of a setup."""
     if setup.objective == "theirs":
         return TimeAndDistance(setup.distance_power)
-    return registry.make("objective", setup.objective, robot=ROVER)
+    return registry.make("objective", setup.objective, robot=ROVER, goal_radius_m=GOAL_RADIUS_M)

@@ -56,6 +56,7 @@ def create(
     from benchnav.datagen.files.reader import TerrainDataset, is_dataset
     from benchnav.datagen.recipe.recipe import load_recipe
     from benchnav.errors import ConfigError
+    from benchnav.files import output_path
     from benchnav.share import read_share
 
     if jobs < 1:
@@ -80,7 +81,7 @@ def create(
         chosen = replace(chosen, splits=kept)
     cells = sum(spec.maps for spec in chosen.splits.values()) * chosen.height * chosen.width
     is_folder = share is not None or cells > _MOST_CELLS_OF_A_FILE
-    path = Path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}").expanduser()
+    path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = create_dataset(chosen, path, jobs, scheduler, share, overwrite)
     show_progress(_tell_kept(steps), "maps")
     if not is_dataset(path):
@@ -203,8 +204,9 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
     from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.merge import merge as merge_datasets
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+    from benchnav.files import output_path
 
-    path = Path(out).expanduser()
+    path = output_path(out)
     sources = [Path(file) if Path(file).is_dir() else find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
     say_written(TerrainDataset(path))
@@ -229,13 +231,11 @@ def preview(
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.datagen.preview import save_contact_sheet, save_preview
     from benchnav.errors import ConfigError
-    from benchnav.files import replacing
+    from benchnav.files import output_path, replacing
 
     dataset = TerrainDataset(find_dataset(file))
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
-    path = Path(
-        out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png"
-    ).expanduser()
+    path = output_path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
     if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
         raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
     if maps is not None and contact_sheet:

@@ -1,8 +1,8 @@
 """Pictures of maps: a sheet for a paper, a row a map, and a contact sheet of a whole split.
 
 Lengths are in inches from the upper left corner and text is in points, as printed over the two columns
-of a page. A class has one colour in every map and figure. The earth tones of the class table look too
-alike, so their order from dark to light is kept and stretched, and every other class is drawn blue.
+of a page. A class has one colour in every map and figure, its own of the class table; of classes that look alike
+all but the first are drawn lighter or darker.
 Where the classes have soft spots, the ground that may hide them is hatched and outlined.
 """
 
@@ -16,7 +16,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap
+from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -24,7 +24,7 @@ from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.recipe.classes import TerrainClass, twins
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
@@ -48,9 +48,6 @@ _HATCH = "//////"
 _READ_MAPS = 20
 _MARK: dict[str, Any] = {"ls": "", "mfc": "white", "mec": "black", "mew": 0.75, "clip_on": False}
 _MARKS = {"start": _MARK | {"marker": "o", "ms": 3.6}, "goal": _MARK | {"marker": "*", "ms": 6.5}}
-# Ladders of equal lightness in Oklab; brown against blue is told apart by every kind of colour vision.
-_EARTH = LinearSegmentedColormap.from_list("earth", ["#472400", "#8d591d", "#cc9967", "#ffe0bf"])
-_BLUE = LinearSegmentedColormap.from_list("blue", ["#092f52", "#35699d", "#79a9db", "#caecff"])
 
 
 def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path, kind: str) -> None:
@@ -190,11 +187,13 @@ def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.nda
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
-    """Colours to draw classes in: RGB in [0, 1], dark to light as the table's own, shape [C, 3]."""
-    luminance = np.array([item.colour for item in classes]) @ (0.2126, 0.7152, 0.0722)
-    rank = np.argsort(np.argsort(luminance, kind="stable"), kind="stable")
-    place = rank / max(len(classes) - 1, 1)
-    return np.where((rank % 2 == 0)[:, None], _EARTH(place), _BLUE(place))[:, :3]
+    """Colours to draw classes in, those of the table but for look-alikes: RGB in [0, 1], shape [C, 3]."""
+    colours = np.array([item.colour for item in classes]) / 255
+    for alike in set(twins(tuple(classes))):
+        away = 0.0 if colours[alike[0]].mean() > 0.5 else 1.0
+        for place, member in enumerate(alike):
+            colours[member] += (away - colours[member]) * 0.7 * place / len(alike)
+    return colours
 
 
 def class_shades(colours: np.ndarray) -> Colormap:

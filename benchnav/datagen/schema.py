@@ -1,21 +1,21 @@
-"""Dataset formats 1.0 to 1.2: fields, manifest and content digests; `docs/format.md` describes it for readers.
+"""Dataset formats 1.0 to 1.3: fields, manifest and content digests; `docs/format.md` describes it for readers.
 
-One HDF5 file is one dataset. Groups are splits; each holds the fields of `FIELDS` and the SHA-256 of
-every entry. The manifest is a JSON text in the dataset `manifest`. A folder of such files, with a manifest
-of its own that says which maps lie in which, is one dataset too, of format 1.2. Digests cover logical arrays, not
-the file's bytes, so they are the same whatever compression, machine or number of workers wrote it.
+One HDF5 file is one dataset. Groups are splits; each holds the fields that the manifest lists, those of `FIELDS` and
+perhaps others, and the SHA-256 of every entry. The manifest is a JSON text in the dataset `manifest`. A folder of such
+files, with a manifest of its own that says which maps lie in which, is one dataset too. Digests cover logical arrays,
+not the file's bytes, so they are the same whatever compression, machine or number of workers wrote it.
 """
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 FORMAT = "benchnav-dataset"
-FORMAT_VERSION = (1, 2)  # the newest that is read
+FORMAT_VERSION = (1, 3)  # the newest that is read
 MANIFEST = "manifest"
 ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
@@ -50,6 +50,7 @@ class Field:
         return tuple(sizes[n] if isinstance(n, str) else n for n in self.shape)
 
 
+# What every dataset has.
 FIELDS: dict[str, Field] = {
     "rgb": Field("|u1", (3, "H", "W"), "1", 0, 255, "top-down colour image, shaded"),
     "class_id": Field("|u1", ("H", "W"), "1", 0, 255, "index into the class table"),
@@ -65,6 +66,13 @@ FIELDS: dict[str, Field] = {
 }
 
 
+# What a dataset may have beside.
+OPTIONAL: dict[str, Field] = {
+    "group": Field(
+        "<i8", (), "1", 0, 2**53, "maps of one number overlap, directly or by others between them"
+    ),
+}
+
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 
@@ -76,31 +84,37 @@ def quantise(values: np.ndarray, bits: int) -> np.ndarray:
     return steps
 
 
-def entry_digests(maps: Mapping[str, np.ndarray], names: Sequence[str] = tuple(FIELDS)) -> np.ndarray:
+def fields_in(maps: Mapping[str, np.ndarray]) -> dict[str, Field]:
+    """The fields that maps have, in the order of being stored."""
+    return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
+
+
+def entry_digests(maps: Mapping[str, np.ndarray], fields: Mapping[str, Field] | None = None) -> np.ndarray:
     """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
 
     Args:
         maps: arrays by field, each of shape [B, *entry shape].
-        names: the F fields to digest; all, in the order of `FIELDS`.
+        fields: the F fields to digest; None for `fields_in(maps)`.
 
     Returns:
         uint8, shape [B, F, 32].
     """
     columns = []
-    for name in names:
-        entries = np.ascontiguousarray(maps[name], dtype=FIELDS[name].dtype)
+    fields = fields_in(maps) if fields is None else fields
+    for name, field in fields.items():
+        entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
         columns.append([hashlib.sha256(entry.tobytes()).digest() for entry in entries])
     digests = np.frombuffer(b"".join(b"".join(row) for row in zip(*columns, strict=True)), np.uint8)
-    return digests.reshape(-1, len(names), DIGEST_BYTES)
+    return digests.reshape(-1, len(fields), DIGEST_BYTES)
 
 
 class SplitDigest:
     """The digest of a split: SHA-256 over its field table and its entries' digests, map by map."""
 
-    def __init__(self, maps: int, height: int, width: int) -> None:
-        """Starts the digest of a split of `maps` maps of height × width cells."""
-        shapes = {name: [maps, *field.entry_shape(height, width)] for name, field in FIELDS.items()}
-        table = [[name, field.dtype, shapes[name]] for name, field in FIELDS.items()]
+    def __init__(self, maps: int, height: int, width: int, fields: Mapping[str, Field]) -> None:
+        """Starts the digest of a split of `maps` maps of height × width cells with some fields."""
+        shapes = {name: [maps, *field.entry_shape(height, width)] for name, field in fields.items()}
+        table = [[name, field.dtype, shapes[name]] for name, field in fields.items()]
         self._hash = hashlib.sha256(json.dumps(table, separators=(",", ":")).encode())
 
     def update(self, digests: np.ndarray) -> None:
@@ -112,8 +126,12 @@ class SplitDigest:
         return self._hash.hexdigest()
 
 
-def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]]) -> str:
-    """The format version of a file: the least that the synthesis of its recipes and the entries of its splits need."""
+def version_of(
+    synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fields: Mapping[str, Field]
+) -> str:
+    """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
+    if set(fields) - set(FIELDS):
+        return "1.3"
     if any(has_unlabelled(entry) for entry in splits):
         return "1.2"
     return "1.1" if max(synthesis) > 1 else "1.0"
@@ -148,8 +166,8 @@ def _text_digest(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def field_table(height: int, width: int) -> dict[str, Any]:
-    """Describes the fields for the manifest."""
+def field_table(height: int, width: int, fields: Mapping[str, Field]) -> dict[str, Any]:
+    """Describes fields for the manifest."""
     return {
         name: {
             "dtype": field.dtype,
@@ -157,5 +175,73 @@ def field_table(height: int, width: int) -> dict[str, Any]:
             "unit": field.unit,
             "meaning": field.meaning,
         }
-        for name, field in FIELDS.items()
+        for name, field in fields.items()
     }
+
+
+def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
+    """Gives the fields that a manifest describes, in its order; of those that are not ours any value is allowed.
+
+    Raises:
+        KeyError, TypeError, ValueError: one of `FIELDS` is not among them, or one is not as it should be.
+    """
+    height, width = table["class_id"]["shape"]
+    known = FIELDS | OPTIONAL
+    lacking = [name for name in FIELDS if name not in table]
+    if lacking:
+        raise ValueError(f"field {lacking[0]!r} is not listed")
+    fields = {}
+    for name, about in table.items():
+        shape = tuple(about["shape"])
+        if name in known:
+            field = known[name]
+        else:
+            cells = shape[-2:] == (height, width)
+            symbols = (*shape[:-2], "H", "W") if cells else shape
+            dtype = np.dtype(about["dtype"]).str
+            field = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
+        if (about["dtype"], shape) != (field.dtype, field.entry_shape(height, width)):
+            raise ValueError(f"field {name!r} is {about['dtype']} {list(shape)}, not {field.dtype}")
+        fields[name] = field
+    return fields
+
+
+_KINDS = {"id": str, "generator": dict, "fields": dict, "splits": dict, "recipes": list}
+_ENTRY_KINDS = {"scenario": str, "maps": int, "digest": str, "parts": list}
+
+
+def check(manifest: Mapping[str, Any]) -> None:
+    """Refuses a manifest that does not say what a reader needs.
+
+    Raises:
+        KeyError, TypeError, ValueError: it does not.
+    """
+    _check_kinds("the manifest", manifest, _KINDS)
+    _check_kinds("`generator`", manifest["generator"], {"package": str, "version": str})
+    read_field_table(manifest["fields"])
+    if not manifest["splits"] or not manifest["recipes"]:
+        raise ValueError("it has no split or no recipe")
+    for name, entry in manifest["splits"].items():
+        _check_kinds(f"split {name!r}", entry, _ENTRY_KINDS)
+        for part in entry["parts"]:
+            _check_kinds(f"a part of split {name!r}", part, {"maps": int})
+            if "source" in part:
+                _check_kinds(f"the source of split {name!r}", part["source"], {"file": str, "left_out": dict})
+                continue
+            _check_kinds(f"a part of split {name!r}", part, {"recipe": int, "split": str, "first": int})
+            recipe = manifest["recipes"][part["recipe"]]
+            _check_kinds("a recipe", recipe, {"id": str, "seed": int, "scenarios": dict})
+            recipe["scenarios"][recipe["splits"][part["split"]]["scenario"]]
+        shards = manifest["shards"][name] if "shards" in manifest else entry["parts"]
+        if entry["maps"] < 1 or any(
+            sum(own["maps"] for own in some) != entry["maps"] for some in (entry["parts"], shards)
+        ):
+            raise ValueError(f"the maps of split {name!r} are not as many as those of its parts")
+        if "shards" in manifest and any("/" in shard["file"] for shard in shards):
+            raise ValueError(f"a file of split {name!r} is not in the folder")
+
+
+def _check_kinds(what: str, given: Any, kinds: Mapping[str, type]) -> None:
+    for name, kind in kinds.items():
+        if type(given) is not dict or type(given.get(name)) is not kind:
+            raise ValueError(f"{what} has no {name!r} of type {kind.__name__}")

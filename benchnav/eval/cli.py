@@ -1,13 +1,14 @@
 """The command `benchnav-eval`: run suites, merge and repeat runs, list parts, report, replay episodes."""
 
 import json
+import os
 import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from benchnav.command import INTERRUPTED, Command, Device, run, tell
-from benchnav.eval.replay import program, replay
+from benchnav.eval.replay import other_folder, program, replay
 from benchnav.eval.suite import RENAMED, Suite
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def run_command(
     share = read_share(shard)
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
-    folder = Path(out)
+    folder = _own_folder(out)
     for planner, options in suite.planner_options.items():
         _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     steps = run_suite(
@@ -75,7 +76,7 @@ def merge(out: str, parts: list[str]) -> int:
     from benchnav.command import show_progress
     from benchnav.eval.run.merge import merge_shards
 
-    folder = Path(out)
+    folder = _own_folder(out)
     show_progress(merge_shards([Path(part) for part in parts], folder), "units")
     return _finish(folder)
 
@@ -103,8 +104,8 @@ def rerun(
     from benchnav.eval.run.rerun import rerun as rerun_all
 
     workers = _workers(jobs, backend, scheduler)
-    original = Path(folder)
-    repeated = Path(out) if out else original.resolve().with_name(f"{original.resolve().name}-rerun")
+    original = _own_folder(folder)
+    repeated = _own_folder(out or f"{original.resolve()}-rerun")
     show_progress(rerun_all(original, repeated, workers, overwrite, _say), "units")
     comparison = compare(original, repeated)
     print("\n".join(comparison.lines))
@@ -122,16 +123,18 @@ def list_command(kinds: list[str]) -> None:
     print_catalogue(*kinds)
 
 
-def report(folder: str) -> None:
+def report(folder: str, out: str = "") -> None:
     """Write tables, figures and the page of a finished run again, and print what it says.
 
     Args:
         folder: Run folder.
+        out: Folder that they are written to, such as for a run that cannot be written; the run's own when not given.
     """
     from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
 
-    _print(write_report(Path(folder), ground_of_run(Path(folder))), Path(folder))
+    run, place = Path(folder), other_folder(folder, out)
+    _print(write_report(run, ground_of_run(run), place), place)
 
 
 def compare(
@@ -147,15 +150,16 @@ def compare(
     world: str = "",
     data: str = "",
     points: float = 5.0,
+    allow_different: Literal["nothing", "code"] = "nothing",
     out: str = "",
 ) -> None:
-    """Compare trials that met the same maps under the same luck, with intervals and corrected tests.
+    """Compare conditions that met the same maps with the same draws of λ, with intervals and corrected tests.
 
     Args:
         folders: Folders of finished runs, one or more.
         against: What all others are compared with, such as mean or straight; all pairs when not given.
-        by: Label in which trials differ: risk, planner, model, objective, robot, world or run. When not given, that in
-            which `against` is found; run where runs share trials; else risk.
+        by: In what conditions differ, and in nothing else: risk, planner, model, objective, robot, world or run. When
+            not given, that in which `against` is found; run where runs share conditions; else risk.
         planner: Planners that are looked at, as the table calls them, with a comma between; all when not given.
         risk: Risk settings.
         scenario: Scenarios.
@@ -165,19 +169,33 @@ def compare(
         world: Worlds.
         data: Datasets.
         points: Difference of success in percentage points, for which the maps that it needs are told.
+        allow_different: code compares conditions that other code made too, and names in every table what differs.
         out: Path without a suffix; .csv, .md and .tex are written there.
     """
+    from benchnav.errors import ConfigError
     from benchnav.eval.compare import compare_runs, print_comparison, write_comparison
 
+    if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
+        raise ConfigError(f"Expected `out` as the path of files without a suffix, got the folder {out}.")
     labels = {
         **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
         **{"robot": robot, "objective": objective, "world": world, "data": data},
     }
     asked = {name: label for name, label in labels.items() if label}
-    table, shown = compare_runs([Path(folder) for folder in folders], by, against, asked, points / 100)
+    runs = [Path(folder) for folder in folders]
+    table, shown = compare_runs(runs, by, against, asked, points / 100, allow_different == "code")
     print_comparison(shown)
     if out:
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
+
+
+def _own_folder(path: str) -> Path:
+    """A run folder by its path; one that has no name of its own, as `/`, is none."""
+    from benchnav.errors import ConfigError
+
+    if not Path(path).resolve().name:
+        raise ConfigError(f"Expected the path of a run folder, got {path}.")
+    return Path(path)
 
 
 def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
@@ -283,3 +301,7 @@ def main() -> None:
     if status == INTERRUPTED and sys.argv[1] in ("run", "rerun"):
         _say("to go on, give the same command again")
     sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

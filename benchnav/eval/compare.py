@@ -1,55 +1,97 @@
-"""Compares trials of one run or several: reads them, pairs them, and writes the table."""
+"""Compares conditions of one run or several: reads them, refuses what else differs, and writes the table."""
 
+import json
 import shutil
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import pandas as pd
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import EPISODES, Run, open_run, read_table
+from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
+from benchnav.eval.folder.provenance import code_differences, code_of
+from benchnav.eval.folder.sameness import differences
 from benchnav.eval.report.comparison import comparison_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import compare
-from benchnav.eval.stats.pairing import Compared, Pair, find_pairs
+from benchnav.eval.stats.pairing import (
+    DRAW,
+    Compared,
+    Pair,
+    by_what,
+    check_maps,
+    check_one_value_each,
+    find_pairs,
+)
 from benchnav.eval.stats.summary import LABELS, time_budgets
 from benchnav.eval.trial import NOT_USED
 from benchnav.files import write_text
 
-_CAPTION = "Differences of success and of time between trials that met the same maps under the same luck."
+_CAPTION = (
+    "Differences of success and of time between conditions that met the same maps with the same draws of λ."
+)
+_LISTED, _NAMED = 8, 3
 
 
 def compare_runs(
-    folders: Sequence[Path], by: str, against: str, asked: Mapping[str, str], difference: float
+    folders: Sequence[Path],
+    by: str,
+    against: str,
+    asked: Mapping[str, str],
+    difference: float,
+    allow_different_code: bool = False,
 ) -> tuple[pd.DataFrame, ResultTable]:
-    """Compares the trials of runs pair by pair.
+    """Compares the conditions of runs pair by pair.
 
     Args:
         folders: finished runs, of format version 2 or later.
-        by: label in which trials differ; see `pairing.find_pairs`.
+        by: in what conditions differ; see `pairing.by_what`.
         against: what all others are compared with; all pairs when empty.
-        asked: labels of the trials that are looked at, several with a comma between; all when not named.
+        asked: labels of the conditions that are looked at, several with a comma between; all when not named.
         difference: of success, for which the maps needed are counted.
+        allow_different_code: compare what other code made too, and say so in the table. Runs that are compared with
+            each other always are.
 
     Returns:
         The numbers, and the table that is shown.
 
     Raises:
-        ConfigError: there is nothing to compare, or it cannot be paired.
+        ConfigError: there is nothing to compare, it cannot be paired, or code differs.
     """
     if not folders:
         raise ConfigError("Expected one or more run folders, got none.")
     if not 0 < difference <= 1:
         raise ConfigError(f"Expected `points` in (0, 100], got {100 * difference:g}.")
     runs = [open_run(folder) for folder in folders]
-    pairs = find_pairs(_chosen(read_trials(runs), asked), by, against)
-    table = compare(pairs, difference)
+    trials = _chosen(read_trials(runs), asked)
+    check_one_value_each(trials)
+    by = by_what(trials, by, against)
+    if by != "run":
+        trials = _once_each(trials)
+    pairs = find_pairs(trials, by, against)
+    unlike = [_unlike_code(pair.members) for pair in pairs]
+    # Versions and machines may differ between rows; what a label names may not.
+    lines = _in_words(
+        *unlike, _unlike_code({member for pair in pairs for member in pair.members}, parts_alone=True)
+    )
+    if lines and by != "run" and not allow_different_code:
+        raise ConfigError(
+            f"Expected conditions that differ in their {by} alone, but the code that made them differs too: "
+            f"{'; '.join(lines)}. Run them with one code, or pass --allow-different code to have it said in the table."
+        )
+    table = compare(pairs, difference).assign(
+        different_code=["; ".join(_in_words(found)) for found in unlike]
+    )
     shown = comparison_table(table, difference)
-    notes = (*_about(pairs, table), *shown.notes, *_sources(runs))
+    notes = (*_about(pairs, table), *_left_out(pairs), *_no_partner(trials, pairs), *shown.notes)
+    notes += tuple(f"Different code: {line}." for line in lines)
+    notes += tuple(dict.fromkeys(line for run in runs for line in caveats(run.about)))
     return table, ResultTable(headings=shown.headings, labels=shown.labels, rows=shown.rows, notes=notes)
 
 
@@ -104,9 +146,10 @@ def read_trials(runs: Sequence[Run]) -> list[Compared]:
             found.append(
                 Compared(
                     labels={**labels, "run": name if shared[trial] > 1 else NOT_USED},
-                    world=value["world"],
+                    value=value,
                     maps=run.about["datasets"][labels["data"]]["maps"][value["split"]],
                     episodes=rows.assign(time_budget_s=time_budgets(rows, value["world"])),
+                    code={name: code_of(run.about, run.trials[trial][0])},
                 )
             )
     return found
@@ -134,6 +177,69 @@ def _chosen(trials: Iterable[Compared], asked: Mapping[str, str]) -> list[Compar
     return chosen
 
 
+def _unlike_code(trials: Iterable[Compared], parts_alone: bool = False) -> dict[tuple[str, str], list[str]]:
+    """What of the code that made conditions differs, by the two runs; of parts and our own sources alone, or of all."""
+    held = [
+        (run, {name: value for name, value in code.items() if isinstance(value, Mapping) or not parts_alone})
+        for trial in trials
+        for run, code in trial.code.items()
+    ]
+    found: dict[tuple[str, str], list[str]] = {}
+    for (first, earlier), (second, now) in combinations(sorted(held, key=lambda one: one[0]), 2):
+        if first != second:
+            found.setdefault((first, second), []).extend(code_differences(earlier, now))
+    return found
+
+
+def _in_words(*found: Mapping[tuple[str, str], Sequence[str]]) -> list[str]:
+    """Says what code differs, a line for two runs."""
+    lines: dict[tuple[str, str], dict[str, None]] = {}
+    for (first, second), names in (item for one in found for item in one.items()):
+        lines.setdefault((first, second), {}).update(dict.fromkeys(names))
+    return [
+        f"{second} differs from {first} in {', '.join(names)}"
+        for (first, second), names in lines.items()
+        if names
+    ]
+
+
+def _once_each(trials: Iterable[Compared]) -> list[Compared]:
+    """Makes one of each condition that several runs hold, with the episodes of all.
+
+    Raises:
+        ConfigError: an episode came out differently in two runs.
+    """
+    found: dict[str, Compared] = {}
+    for trial in trials:
+        name = json.dumps(trial.value, sort_keys=True)
+        earlier = found.setdefault(name, trial)
+        if earlier is not trial:
+            found[name] = _joined(earlier, trial)
+    return list(found.values())
+
+
+def _joined(one: Compared, other: Compared) -> Compared:
+    runs = " and ".join([*one.code, *other.code])
+    check_maps(one, other, f"{_words(one)} in {runs}")
+    first, second = (trial.episodes.drop(columns=list(LABELS)) for trial in (one, other))
+    unlike = [difference for difference in differences(first, second) if difference.columns]
+    if unlike:
+        both = len(first.merge(second, on=DRAW))
+        why = "; ".join(_in_words(_unlike_code((one, other))))
+        raise ConfigError(
+            f"Expected one set of rows of a condition that several runs hold, but {len(unlike)} of {both} episodes of "
+            f"{_words(one)} came out differently in {runs}{f' ({why})' if why else ''}. Leave one of them out, or "
+            "compare the runs with each other by --by run."
+        )
+    rows = pd.concat([one.episodes, other.episodes]).drop_duplicates(DRAW, ignore_index=True)
+    longer = max((one.maps, other.maps), key=len)
+    return replace(one, episodes=rows, maps=longer, code={**one.code, **other.code})
+
+
+def _words(trial: Compared, names: Iterable[str] = LABELS[1:]) -> str:
+    return " ".join(trial.labels[name] for name in names if trial.labels[name] != NOT_USED)
+
+
 def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
     same = [
         f"{name} {table[name].iloc[0]}"
@@ -141,20 +247,62 @@ def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
         if name in table and table[name].nunique() == 1 and table[name].iloc[0] != NOT_USED
     ]
     lines = [f"Of {', '.join(same)}."]
-    if table["n_maps"].nunique() == table["n_draws"].nunique() == 1:
-        draws = table["n_draws"].iloc[0]
-        episodes = "1 episode" if draws == 1 else f"{draws} episodes"
+    if all(table[name].nunique() == 1 for name in ("n_maps", "n_groups", "n_episodes")):
+        maps, groups, episodes = table[["n_maps", "n_groups", "n_episodes"]].iloc[0]
         lines.append(
-            f"Each pair: {table['n_maps'].iloc[0]} maps, {episodes} on each, both trials under the same luck."
+            f"Each pair: {maps} maps, {episodes} episodes of each condition, both with the same draws of λ."
         )
-    left = sum(pair.left_out for pair in pairs)
-    if left:
-        lines.append(f"{left} episodes were left out, on maps or under luck that only one of two trials met.")
+        if groups != maps:
+            lines.append(
+                f"The maps are in {groups} groups that overlap or share a site; the group is the unit."
+            )
     return lines
 
 
-def _sources(runs: Sequence[Run]) -> list[str]:
-    versions = dict.fromkeys(run.about["code"]["sources"] for run in runs)
-    if len(versions) == 1:
-        return []
-    return ["The runs were made by different sources of benchnav, which may be what differs."]
+def _left_out(pairs: Sequence[Pair]) -> list[str]:
+    """Says which episodes of a condition its partner was not run on."""
+    lines: dict[str, None] = {}
+    for pair in pairs:
+        paired = pd.MultiIndex.from_frame(pair.episodes[DRAW])
+        for trial, own, partner in zip(
+            pair.members, (pair.one, pair.other), (pair.other, pair.one), strict=True
+        ):
+            drawn = pd.MultiIndex.from_frame(trial.episodes[DRAW])
+            rows = trial.episodes.loc[~drawn.isin(paired), DRAW]
+            if len(rows):
+                seeds = {
+                    f"seed {seed}" + (f", realisation {realisation}" if realisation else ""): sorted(
+                        group["instance"]
+                    )
+                    for (seed, realisation), group in rows.groupby(["seed", "realisation"])
+                }
+                where = "; ".join(f"{name} on {_maps(maps)}" for name, maps in list(seeds.items())[:_NAMED])
+                more = f" and {len(seeds) - _NAMED} more draws" if len(seeds) > _NAMED else ""
+                line = (
+                    f"Left out: {len(rows)} of {len(trial.episodes)} episodes of {own}, on which {partner} was not run "
+                    f"({where}{more})."
+                )
+                lines[line] = None
+    return _first_of(list(lines), "pairs with episodes left out")
+
+
+def _maps(instances: Sequence[int]) -> str:
+    """Numbers of maps in words; runs of them by their ends."""
+    whole = len(instances) > 1 and instances[-1] - instances[0] == len(instances) - 1
+    if whole:
+        return f"maps {instances[0]} to {instances[-1]}"
+    listed = ", ".join(map(str, instances[:_NAMED])) + (", …" if len(instances) > _NAMED else "")
+    return f"map {listed}" if len(instances) == 1 else f"{len(instances)} maps ({listed})"
+
+
+def _no_partner(trials: Sequence[Compared], pairs: Sequence[Pair]) -> list[str]:
+    """Names the conditions that are in no pair."""
+    paired = {member for pair in pairs for member in pair.members}
+    alone = [trial for trial in trials if trial not in paired]
+    varying = [name for name in (*LABELS, "run") if len({trial.labels[name] for trial in trials}) > 1]
+    names = [_words(trial, varying) for trial in alone]
+    return [f"Without a partner, so in no row: {'; '.join(_first_of(names, 'conditions'))}."] if names else []
+
+
+def _first_of(lines: list[str], what: str) -> list[str]:
+    return lines if len(lines) <= _LISTED else [*lines[:_LISTED], f"and {len(lines) - _LISTED} more {what}"]

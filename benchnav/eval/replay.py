@@ -29,12 +29,13 @@ def replay(
     objective: tuple[str, ...] = (),
     world: tuple[str, ...] = (),
     data: tuple[str, ...] = (),
-    seed: int = -1,
+    seed: int | None = None,
     realisation: int = 0,
     instance: int = 0,
     view: bool = True,
     web: bool = False,
     video: str = "",
+    out: str = "",
 ) -> int:
     """Play an episode back, or several on one map, recording first what was not recorded.
 
@@ -56,6 +57,8 @@ def replay(
         view: Open the viewer; false only makes the recording.
         web: Serve the viewer to a browser on this machine until Ctrl-C.
         video: Write a video to this file, .mp4, in place of opening the viewer; trials stand side by side.
+        out: Folder that recordings are written to, such as for a run that cannot be written; the run's own when not
+            given.
     """
     from benchnav.eval.find_episodes import find_episodes
 
@@ -68,12 +71,13 @@ def replay(
         **{"robot": robot, "objective": objective, "world": world, "data": data},
     }
     asked = {name: labels for name, labels in columns.items() if labels}
-    found = find_episodes(Path(folder), asked, seed if seed >= 0 else None, realisation, instance)
+    run, place = Path(folder), other_folder(folder, out)
+    found = find_episodes(run, asked, seed, realisation, instance)
     if video:
         from benchnav.command import show_progress
         from benchnav.eval.report.playback.video import write_video
 
-        show_progress(write_video(_recordings(Path(folder), found), Path(video)), "frames")
+        show_progress(write_video(_recordings(run, found, place), Path(video)), "frames")
         print(f"video:   {video}")
         return 0
     worlds = dict.fromkeys(unit.trial.labels["world"] for unit, _ in found)
@@ -82,7 +86,7 @@ def replay(
             f"Expected trials in one world to show on one map, got {', '.join(worlds)}. A video shows them side by "
             "side: --video FILE.mp4."
         )
-    path = _viewer_file(Path(folder), found)
+    path = _viewer_file(run, found, place)
     print(f"recording: {path}")
     if web:
         from benchnav.eval.report.playback.web import serve
@@ -109,14 +113,30 @@ def program(name: str) -> str:
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
-def _recordings(folder: Path, found: "list[tuple[Unit, int]]") -> "list[Recording]":
+def other_folder(run: str, out: str) -> Path:
+    """Where something made of a run is written: into it, or into a folder that is no other run.
+
+    Args:
+        run: the run folder.
+        out: another folder; empty for none.
+
+    Raises:
+        ConfigError: the other folder is another run.
+    """
+    place = Path(out or run)
+    if (place / "run.json").exists() and place.resolve() != Path(run).resolve():
+        raise ConfigError(f"Expected `out` as a folder that holds no other run, got {out}.")
+    return place
+
+
+def _recordings(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> "list[Recording]":
     from benchnav.eval.run.recorder import find_recording
 
-    return [find_recording(folder, unit, member) for unit, member in found]
+    return [find_recording(folder, unit, member, out) for unit, member in found]
 
 
-def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]") -> Path:
-    """The viewer's file of the episodes, which is made where it is not there."""
+def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Path:
+    """The viewer's file of the episodes, which is made in a folder where it is not there."""
     from benchnav.eval.report.playback.files import playback_path
     from benchnav.eval.report.playback.rerun_file import write_rerun
 
@@ -133,7 +153,7 @@ def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]") -> Path:
             f"{unit.instances[member]:05d}",
         )
         stem = "+".join(map(str, words))
-    path = playback_path(folder, stem)
+    path = playback_path(out, stem)
     if len(found) > 1 or not path.exists():
-        write_rerun(_recordings(folder, found), path)
+        write_rerun(_recordings(folder, found, out), path)
     return path

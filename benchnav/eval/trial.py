@@ -102,7 +102,9 @@ class Trial:
     def make_task(self) -> Task:
         """Makes the robot, the objective and with them the task."""
         robot = registry.make("robot", self.robot)
-        objective = registry.make("objective", self.objective, robot=robot)
+        objective = registry.make(
+            "objective", self.objective, robot=robot, goal_radius_m=self.rules.goal_radius_m
+        )
         return Task(robot=robot, objective=objective, rules=self.rules)
 
     def make_planner(self) -> Any:

@@ -1,7 +1,7 @@
 """Checkpoints: a trained model as a folder of data that runs no code when it is read.
 
-`config.json` says what the model is and how each of its parts came to be; a part, such as `classifier`
-or `gp`, has its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`. A checkpoint is
+`config.json` says what the model is and how each of its parts came to be, and holds its own SHA-256; a part, such as
+`classifier` or `gp`, has its tensors in `PART.safetensors`, whose SHA-256 stands in `config.json`. A checkpoint is
 written to a folder beside its own and renamed, so that its name never holds half of one.
 """
 
@@ -23,11 +23,13 @@ import torch
 from torch import Tensor
 
 import benchnav
+from benchnav.datagen.schema import seal, unseal
 from benchnav.errors import CheckpointError
 
 FORMAT = "benchnav-checkpoint"
-FORMAT_VERSION = (2, 1)
-OLDEST_VERSION = (2, 0)  # written as long as nothing newer is in it
+FORMAT_VERSION = (2, 2)
+OLDEST_VERSION = (2, 0)
+_SEALED = (2, 2)  # from which on config.json holds its own digest
 CONFIG = "config.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
@@ -53,6 +55,8 @@ class Part:
         data_digest: content digest of what it was trained on.
         half_precision: store kernels as float16; they are read as float32.
         versions: of the packages that trained it.
+        trainer: settings of the trainer on which the outcome depends; None of a part that none trained, or of an
+            earlier version.
     """
 
     config: dict[str, Any]
@@ -63,6 +67,7 @@ class Part:
     data_digest: str
     half_precision: bool = False
     versions: Mapping[str, str] = field(default_factory=_versions)
+    trainer: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,25 +185,29 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
                 tensors=_read_tensors(folder / f"{name}.safetensors", entry["sha256"]),
                 seed=int(entry["seed"]),
                 metrics=dict(entry["metrics"]),
-                data_id=entry["data"]["id"],
-                data_digest=entry["data"]["digest"],
+                data_id=str(entry["data"]["id"]),
+                data_digest=str(entry["data"]["digest"]),
                 half_precision=bool(entry["half_precision"]),
                 versions=dict(entry["versions"]),
+                trainer=None if entry.get("trainer") is None else dict(entry["trainer"]),
             )
             for name, entry in config["parts"].items()
         }
-        if config["class_count"] != len(config["class_names"]):
-            raise ValueError("class_count is not the number of class_names")
+        names = config["class_names"]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError("class_names is no list of names")
+        if config["class_count"] != len(set(names)) or len(set(names)) != len(names):
+            raise ValueError("class_count is not the number of different class_names")
         pooled = float(config.get("pool_temperature", 1.0))
         if not 0 < pooled < float("inf"):
             raise ValueError(f"pool_temperature is {pooled}")
         return Checkpoint(
-            class_names=tuple(config["class_names"]),
+            class_names=tuple(names),
             parts=parts,
             model=config["model"],
             pool_temperature=pooled,
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
 
 
@@ -241,9 +250,12 @@ def read_config(folder: Path) -> dict[str, Any]:
             f"Make one with `benchnav-train all --out {folder}`."
         )
     try:
-        config = json.loads(path.read_text())
+        text = path.read_text()
+        config = json.loads(text)
         kind, version = config["format"], tuple(int(part) for part in config["format_version"].split("."))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        if kind == FORMAT and _SEALED <= version <= FORMAT_VERSION:
+            config = unseal(text)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise _damaged(path, f"{type(error).__name__} {error}") from error
     if kind != FORMAT:
         raise CheckpointError(
@@ -273,20 +285,20 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
             "metrics": part.metrics,
             "versions": dict(part.versions),
             "half_precision": part.half_precision,
+            **({} if part.trainer is None else {"trainer": dict(part.trainer)}),
             "sha256": hashlib.sha256(content).hexdigest(),
         }
     pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
-    soft = GP in checkpoint.parts and any(name.startswith("soft_") for name in checkpoint.parts[GP].tensors)
     config = {
         "format": FORMAT,
-        "format_version": ".".join(map(str, FORMAT_VERSION if pooled or soft else OLDEST_VERSION)),
+        "format_version": ".".join(map(str, FORMAT_VERSION)),
         "model": checkpoint.model,
         "class_count": len(checkpoint.class_names),
         "class_names": list(checkpoint.class_names),
         **pooled,
         "parts": parts,
     }
-    _write_bytes(folder / CONFIG, (json.dumps(config, indent=1) + "\n").encode())
+    _write_bytes(folder / CONFIG, (seal(config) + "\n").encode())
 
 
 def _write_bytes(path: Path, content: bytes) -> None:
@@ -307,7 +319,10 @@ def _read_tensors(path: Path, digest: str) -> dict[str, Tensor]:
         raise CheckpointError(
             f"Expected {path.name} in checkpoint {path.parent}, got none. Copy it again whole."
         )
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise _damaged(path, error.strerror or str(error)) from error
     if hashlib.sha256(content).hexdigest() != digest:
         raise _damaged(path, "its SHA-256 is not the one in config.json")
     try:

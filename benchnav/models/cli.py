@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from benchnav.command import INTERRUPTED, Command, Device, run
-from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig
+from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig, check_seed
 from benchnav.models.quality.command import evaluate
 
 if TYPE_CHECKING:
@@ -49,11 +49,12 @@ def train_classifier(
         resume: Go on with a training that was interrupted; whole epochs are kept.
         overwrite: Replace classifiers, or a checkpoint of other classes, that are there.
     """
-    from benchnav.models.training.classifiers import train_members
+    from benchnav.models.training.classifiers import check_classifier, train_members
 
-    dataset = _open_dataset(data)
+    names, dataset = _members(members, seed), _open_dataset(data)
     classifier, options = _options(out, classifier, device, trainer, resume, workers, in_memory)
-    target = _open_target(out, dataset, _members(members), options, overwrite)
+    check_classifier(classifier, dataset, options)
+    target = _open_target(out, dataset, names, options, overwrite)
     train_members(target, classifier, dataset, members, seed, options, half_precision)
 
 
@@ -68,8 +69,8 @@ def train_gp(
     """Train the class-wise Gaussian processes.
 
     Args:
-        data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv or .parquet with
-            the columns class, slope_deg and traversability.
+        data: Path or id of a dataset with splits train and valid; or slip logs, a file .csv, .tsv, one of these
+            with .gz, or .parquet, with the columns class, slope_deg and traversability.
         out: Checkpoint folder; classifiers in it for the same classes are kept, and slip logs are read with
             their class table.
         gp: Settings of the GPs.
@@ -77,11 +78,13 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
+    from benchnav.models.slope_gp.slip_logs import ENDINGS
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
 
+    check_seed(seed)
     options = FitOptions(device=device)
-    if data.endswith((".csv", ".parquet")):
+    if data.endswith(ENDINGS):
         train_gps_on_logs(data, out, gp, seed, options, overwrite)
         return
     dataset = _open_dataset(data)
@@ -121,12 +124,13 @@ def train_all(
         resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
         overwrite: Replace a checkpoint that is there.
     """
-    from benchnav.models.training.classifiers import train_members
+    from benchnav.models.training.classifiers import check_classifier, train_members
     from benchnav.models.training.gps import train_gps_on_maps
 
-    dataset = _open_dataset(data)
+    names, dataset = _members(members, seed), _open_dataset(data)
     classifier, options = _options(out, classifier, device, trainer, resume, workers, in_memory)
-    target = _open_target(out, dataset, ["gp", *_members(members)], options, overwrite)
+    check_classifier(classifier, dataset, options)
+    target = _open_target(out, dataset, ["gp", *names], options, overwrite)
     if not target.holds("gp", asdict(gp), seed, asdict(LatentGPConfig())):
         target.add("gp", train_gps_on_maps(gp, dataset, seed, options))
     train_members(target, classifier, dataset, members, seed, options, half_precision)
@@ -161,12 +165,14 @@ def train_mdn(
         overwrite: Replace a checkpoint that is there.
     """
     from benchnav.models.nets.mdn import MDN
-    from benchnav.models.training.mdn import train_mdn_part
+    from benchnav.models.training.mdn import check_mdn, train_mdn_part
 
+    check_seed(seed)
     dataset = _open_dataset(data)
     mdn, options = _options(out, mdn, device, trainer, resume, workers, in_memory)
+    check_mdn(mdn, dataset, options)
     target = _open_target(out, dataset, [MDN], options, overwrite, model=MDN)
-    if not target.holds(MDN, asdict(mdn), seed, asdict(MDNConfig())):
+    if not target.holds(MDN, asdict(mdn), seed, asdict(MDNConfig()), half_precision):
         target.add(MDN, train_mdn_part(mdn, dataset, seed, options, half_precision))
 
 
@@ -205,12 +211,13 @@ def _options(
     )
 
 
-def _members(count: int) -> list[str]:
+def _members(count: int, seed: int) -> list[str]:
     from benchnav.errors import ConfigError
     from benchnav.models.checkpoint import member_name
 
     if count < 1:
         raise ConfigError(f"Expected `members` ≥ 1, got {count}.")
+    check_seed(seed, count)
     return [member_name(index) for index in range(count)]
 
 

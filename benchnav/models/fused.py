@@ -104,7 +104,7 @@ class FusedModel:
             return cls(classifiers, table, names, checkpoint.pool_temperature)
         except (BenchnavError, KeyError, RuntimeError) as error:
             raise CheckpointError(
-                f"Expected tensors that fit the checkpoint's settings, got: {error}. Train the model again."
+                f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
             ) from error
 
     def _probabilities(self, classifier: nn.Module, observation: Observation) -> Tensor:

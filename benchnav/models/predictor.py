@@ -25,6 +25,7 @@ from benchnav.models.checkpoint import (
     FUSED,
     Checkpoint,
     load_checkpoint,
+    read_config,
     refuse_unfinished,
 )
 from benchnav.shipped import shipped_folder
@@ -127,6 +128,7 @@ PRIVILEGED = (Oracle, Ideal, Clairvoyant)
 Source = str | Path | Mapping[str, Any] | registry.Part
 
 
+@torch.inference_mode(False)  # so that it is the same model wherever it is loaded
 def load_model(source: Source) -> AnyModel:
     """Finds a model by checkpoint or as a part of the registry; it predicts on the observation's device.
 
@@ -231,6 +233,27 @@ def model_identity(source: Source) -> dict[str, Any]:
         "name": str(name),
         "files": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files},
     }
+
+
+def trained_on(source: Source) -> dict[str, str]:
+    """Says which maps a checkpoint was trained on.
+
+    Args:
+        source: as `load_model` takes it, which is to have read it.
+
+    Returns:
+        By digest of a split its name and that of its dataset, such as "train of paper-v1"; empty of what is no
+        checkpoint.
+    """
+    place = _as_part(source)
+    if not isinstance(place, Path):
+        return {}
+    found = {}
+    for part in read_config(place)["parts"].values():
+        for entry in part["data"]["digest"].split(","):
+            split, _, digest = entry.partition(":")
+            found[digest] = f"{split} of {part['data']['id']}"
+    return found
 
 
 def class_mismatch(

@@ -64,14 +64,23 @@ class EnvBatch:
         """Loads the maps of the split."""
         self._world = world if isinstance(world, World) else read_world(world)[0]
         made: Any = _part("robot", robot)
-        self._objective: Any = _part("objective", objective, robot=made) if objective else None
         rules = Rules(goal_radius_m=goal_radius_m)
+        made_for = {"robot": made, "goal_radius_m": goal_radius_m}
+        self._objective: Any = _part("objective", objective, **made_for) if objective else None
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
         dataset = TerrainDataset(find_dataset(data))
         split = split or _default_split(dataset)
         self._maps = dataset.terrain(split)
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
+        lacking = int(np.isnan(places["reference_time_s"]).sum())
+        if self._world.time_budget_ratio is not None and lacking:
+            raise ConfigError(
+                f"Expected a reference time on each map of split {split!r} of {dataset.path}, of which this world's "
+                f"time budget is a multiple, got none on {lacking} of {len(self._maps)}. Make such maps: "
+                f"benchnav-datagen create RECIPE id=NAME splits.{split}.solvable=true; or give a budget: "
+                "world={'preset': 'stakes', 'time_budget_s': 60}."
+            )
         # To be refused at once.
         self._world.budget_s(self._places.reference_time_s, made.top_speed_mps)
         check_known(self._maps, self._world)

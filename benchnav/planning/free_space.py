@@ -1,9 +1,10 @@
 """Ground that is not free: one rule for every planner.
 
 S_free is where a map exceeds a threshold, and around the goal. A planner may cross other ground at a high
-finite price, so that all planners face the same question and none gives up where no free way is
-predicted. The λ̂ that motion and path costs are given is at least `slowest`, so that a robot on ground
-predicted to hold it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
+finite price, so that all planners face the same question and there is a way where no free way is
+predicted. A planner that looks no farther than a horizon, as MPPI does, may still wait before such ground.
+The λ̂ that motion and path costs are given is at least `slowest`, so that a robot on ground predicted to hold
+it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
 """
 
 from dataclasses import dataclass

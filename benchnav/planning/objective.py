@@ -1,14 +1,16 @@
 """Objectives J: what a planner minimises.
 
-An objective is any object with `stage` and `terminal`. `target` is the goal, or a local planner's
-way-point; traversability is read at the state before the move, as the risk setting gives it: the least λ̂
-that motion is given does not bound it. In the Gymnasium environment J is given the λ that the robot met.
+An objective is any object with `stage` and `terminal`; with `path_cost` it also tells what a metre of a
+path costs, which planners that search paths minimise. `target` is the goal, or a local planner's way-point;
+traversability is read at the state before the move, as the risk setting gives it: the least λ̂ that motion
+is given does not bound it. In the Gymnasium environment J is given the λ that the robot met.
 Ground that is not free is no concern of J: the `Problem` adds its penalty. An objective whose constructor
-has a parameter `robot` is given the task's. Source: paper III-C and IV-A. Letters in shapes: *B any leading
-dimensions, S state and A action dimensions.
+has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper III-C and IV-A. Letters in
+shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -17,9 +19,20 @@ from torch import Tensor
 from benchnav.errors import ConfigError
 from benchnav.planning.robots import Robot
 
+# Cost of a metre of path from λ̂ and grade, see `Objective`.
+PathCost = Callable[[Tensor, Tensor], Tensor]
+
+_WAYPOINT_M = 0.2  # a robot this near to a way-point has reached it
+
 
 class Objective(Protocol):
-    """The contract of a cost J, summed over a trajectory. Shapes broadcast over *B."""
+    """The contract of a cost J, summed over a trajectory. Shapes broadcast over *B.
+
+    It may also have `path_cost(traversability, grade)`: what a horizontal metre of a path costs, from the λ̂
+    that motion is planned with, and from the grade, the rise of that metre, negative downhill; each of
+    shape [*B], as the cost, which is finite and above 0. A path's cost is the sum over its pieces. An
+    objective without it has that of `path_length`.
+    """
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step.
@@ -51,6 +64,10 @@ class GoalDistance:
         """Cost of the last state; see `Objective`."""
         return distance(state, target)
 
+    def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
+        """Metres in 3D, which the paper's A* minimises; see `Objective`. Source: paper IV-A1."""
+        return path_length(traversability, grade)
+
 
 @dataclass(frozen=True)
 class TravelTime:
@@ -58,25 +75,49 @@ class TravelTime:
 
     Args:
         robot: gives time step and top speed.
-        arrival_m: a state this near to the target has arrived.
+        goal_radius_m: a state this near to the target has arrived.
     """
 
     robot: Robot
-    arrival_m: float = 0.5
+    goal_radius_m: float
 
     def __post_init__(self) -> None:
         """Refuses a distance at which nothing arrives."""
-        if not self.arrival_m > 0:
-            raise ConfigError(f"Expected `arrival_m` > 0, got {self.arrival_m}.")
+        if not self.goal_radius_m > 0:
+            raise ConfigError(f"Expected `goal_radius_m` > 0, got {self.goal_radius_m}.")
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step; see `Objective`."""
         away = distance(state, target)
-        return self.robot.dt_s * (away > self.arrival_m).to(away.dtype)
+        return self.robot.dt_s * (away > self.goal_radius_m).to(away.dtype)
 
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state; see `Objective`."""
-        return (distance(state, target) - self.arrival_m).clamp(min=0) / self.robot.top_speed_mps
+        return (distance(state, target) - self.goal_radius_m).clamp(min=0) / self.robot.top_speed_mps
+
+    def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
+        """Seconds at top speed under λ̂; see `Objective`. Grade costs nothing: robots drive in the plane."""
+        return 1 / (traversability * self.robot.top_speed_mps)
+
+
+def toward_waypoints(objective: Objective) -> Objective:
+    """J of a local planner: a way-point is reached at the point itself, not within the goal's radius of it.
+
+    Else a way-point that is nearer than that radius, as in narrow places, would draw no robot.
+    """
+    if not isinstance(objective, TravelTime):
+        return objective
+    return replace(objective, goal_radius_m=min(objective.goal_radius_m, _WAYPOINT_M))
+
+
+def path_cost_of(objective: Objective) -> PathCost:
+    """What a metre of path costs under an objective: its `path_cost`, else `path_length`."""
+    return getattr(objective, "path_cost", path_length)
+
+
+def path_length(traversability: Tensor, grade: Tensor) -> Tensor:
+    """Length in 3D of a horizontal metre, from grades [*B], shape [*B]; λ̂ changes nothing."""
+    return torch.sqrt(1 + grade * grade)
 
 
 def distance(state: Tensor, target: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
 from benchnav.errors import ConfigError
 from benchnav.share import Share
+from tests.factories import tiny_dataset
 
 Call = Callable[..., int]
 
@@ -538,3 +539,41 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
             [sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=tmp_path, check=True
         )
         assert ran.stdout.splitlines()[-1] == "False", words
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("create", "tiny-v1", "--seed", "-1"), "Expected `seed` in 0–2^63 − 1, got -1."),
+        (("create", "tiny-v1", "--seed", "99999999999999999999999"), "Expected `seed` in 0–2^63 − 1"),
+        (("create", "tiny-v1", "--out", "s3://bucket/maps.h5"), "place on this machine, got the address"),
+        (("merge", "a.h5", "b.h5", "--out", "gs://bucket/maps.h5"), "place on this machine"),
+        (("import-dem", "dem.tif", "--out", "s3://bucket/maps.h5"), "place on this machine"),
+        (("export", "paper-v1", "--out", "https://host/maps"), "place on this machine"),
+        (("preview", "paper-v1", "--out", "s3://bucket/maps.png"), "place on this machine"),
+        (
+            ("create", "tiny-v1", "--splits", "{a: 1}"),
+            "Expected --splits as a list, each text or null, got '[{a: 1}]'",
+        ),
+    ],
+)
+def test_what_was_taken_or_told_in_jargon_is_one_line(
+    datagen: Call, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], said: str
+) -> None:
+    assert datagen(*arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_show_tells_the_kind_of_truth_and_what_models_record(
+    datagen: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    assert datagen("show", str(path)) == 0
+    told, digest = capsys.readouterr().out, TerrainDataset(path).split_digest("test/hg")
+    assert "generated" in told
+    assert digest in told
+    assert datagen("show", str(path), "--json") == 0
+    split = json.loads(capsys.readouterr().out)["splits"]["test/hg"]
+    assert (split["truth"], split["recorded_digest"]) == ("generated", digest)

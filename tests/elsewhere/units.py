@@ -15,7 +15,7 @@ from benchnav import mixture
 from benchnav.cvar import Cells
 from benchnav.device import DeviceError, find_device, gpu_failed
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.folder import open_run, write_run
 from benchnav.eval.keep import Keep
 from benchnav.eval.run import episode, recorder, runner
 from benchnav.eval.run.rollout import run_episodes
@@ -34,7 +34,7 @@ from tests import factories
 from tests.elsewhere.device import elsewhere, waits
 from tests.test_mixture import random_mixture
 
-SMALL = {"samples": 20, "horizon": 4}
+SMALL = {"samples": 20, "horizon_s": 0.4}
 DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon": 4}}}
 CL_RRT = {"part": "cl_rrt", "options": {"expansions": 50, "edge_time_s": 3.0}}
 MPPI = {"part": "mppi", "options": SMALL}
@@ -187,7 +187,7 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     about = json.loads((tmp_path / "run" / "run.json").read_text())
-    (tmp_path / "run" / "run.json").write_text(json.dumps({**about, "device": "cuda"}))
+    write_run(tmp_path / "run", {**about, "device": "cuda"})
     (unit,) = units(open_run(tmp_path / "run").trials, Keep())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU, on which this run was computed"):

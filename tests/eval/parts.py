@@ -19,6 +19,7 @@ class Spy:
     """Stands still, and writes down what it is given."""
 
     steers = (("speed_mps", "turn_rate_radps"),)
+    writes = ("log",)
 
     def __init__(self, log: str, gain: float = 1.0) -> None:
         self.log, self.gain = Path(log), gain
@@ -97,6 +98,35 @@ class Faulty:
         return action, plan_state, Plan.empty(batch, device)
 
 
+class Steering(Faulty):
+    """Knows one kind of robot alone."""
+
+    steers = (("speed_mps", "turn_rate_radps"),)
+
+
+class Still(Faulty):
+    """Stands still."""
+
+    def plan(self, step: Step, plan_state: Problem):  # type: ignore[no-untyped-def]
+        action, plan_state, plan = super().plan(step, plan_state)
+        return 0 * action, plan_state, plan
+
+
+class Timed(Faulty):
+    """Takes 80 ms for its first step, then 4 ms and for every tenth 40 ms; notes how many robots it plans for."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__(after_s=1e9)
+        self.log, self.calls = Path(log), 0
+
+    def plan(self, step: Step, plan_state: Problem):  # type: ignore[no-untyped-def]
+        time.sleep(0.08 if not self.calls else 0.04 if self.calls % 10 == 0 else 0.004)
+        self.calls += 1
+        with self.log.open("a") as log:
+            log.write(f"{len(step.state)} {step.time_s:.3f}\n")
+        return super().plan(step, plan_state)
+
+
 class Picky(Faulty):
     """Can be made until a unit has begun, which a file tells."""
 
@@ -108,6 +138,8 @@ class Picky(Faulty):
 
 class Held(Faulty):
     """Writes down which process began it; one that a file beside names, `PID N`, ends nothing from its Nth on."""
+
+    writes = ("log",)
 
     def __init__(self, log: str) -> None:
         super().__init__()
@@ -156,6 +188,8 @@ def least(mixture: TraversabilityMixture, factor: float = 1.0) -> torch.Tensor:
 
 class Asleep:
     """Writes down which process began it, and does not wake."""
+
+    writes = ("folder",)
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)

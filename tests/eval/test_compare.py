@@ -1,5 +1,6 @@
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ import pytest
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
 from benchnav.eval.compare import compare_runs
+from benchnav.eval.report.rendering import latex
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, find_pairs
 from benchnav.eval.trial import NOT_USED
-from tests.eval.report.made import PAPER, row, rows, trial
+from tests.eval.report.made import row, rows, trial
+from tests.eval.stats.test_pairing import value_of
 
 VERSION_1 = Path(__file__).parent.parent / "data" / "run-1"
 MAPS = 12
@@ -33,25 +36,35 @@ def settings(shift: int = 0) -> pd.DataFrame:
     return rows(*made)
 
 
-def run_folder(folder: Path, episodes: pd.DataFrame, **changes: Any) -> Path:
-    """A finished run with what a comparison reads of it."""
-    known = {
-        name: {
-            "value": {"data": "paper-v1", "split": "test/std", **PAPER}
-            | {
-                kind: {"part": kind, "options": {}}
-                for kind in ("model", "risk", "planner", "robot", "objective")
-            },
-            "labels": {label: group[label].iloc[0] for label in trial()},
-            "seeds": [0],
-            "draws": [[0, 0, MAPS]],
+PAPER = {"noise": "resampled", "time_budget_s": 100.0}
+CODE = {"sources": "s", "versions": {"torch": "2.1"}, "processor": "AVX2", "compiles": True}
+
+
+def run_folder(
+    folder: Path,
+    episodes: pd.DataFrame,
+    values: Mapping[str, Mapping[str, Any]] | None = None,
+    **changes: Any,
+) -> Path:
+    """A finished run with what a comparison reads of it; `values` are what is told of conditions by their label."""
+    known = {}
+    for name, group in episodes.groupby("trial", sort=False):
+        labels = {label: group[label].iloc[0] for label in trial()}
+        own = {
+            key: value for label in labels.values() for key, value in (values or {}).get(label, {}).items()
         }
-        for name, group in episodes.groupby("trial", sort=False)
-    }
+        draws = group.groupby(["seed", "realisation"]).size()
+        known[name] = {
+            "value": value_of(labels, world=PAPER) | own,
+            "labels": labels,
+            "seeds": sorted({int(seed) for seed in group["seed"]}),
+            "draws": [[int(seed), int(realisation), int(n)] for (seed, realisation), n in draws.items()],
+        }
     about = {
         "format": "benchnav-run", "format_version": 2, "run_id": "r", "trials": known, "suite": {},
         "datasets": {"paper-v1": {"maps": {"test/std": [f"{i:x}" for i in range(MAPS)]}}},
-        "code": {"sources": "s"},
+        "code": CODE, "planner_limit_s": 0.0, "device": "cpu", "gpu": None,
+        "parts": {"planner mppi": {"origin": "file mppi.py", "digest": "1"}},
     }  # fmt: skip
     folder.mkdir(parents=True)
     (folder / "run.json").write_text(json.dumps(about | changes))
@@ -71,12 +84,16 @@ def test_the_numbers_are_those_of_the_pairs_of_the_run(tmp_path: Path) -> None:
     table, _ = compare_runs([run_folder(tmp_path / "run", episodes)], "", "mean", {"planner": "mppi"}, 0.05)
     trials = [
         Compared(
-            labels={**trial("mppi", risk), "run": NOT_USED}, world={}, maps=["m"] * MAPS,
+            labels={**trial("mppi", risk), "run": NOT_USED},
+            value=value_of(trial("mppi", risk)), maps=["m"] * MAPS,
             episodes=episodes[(episodes["planner"] == "mppi") & (episodes["risk"] == risk)].assign(time_budget_s=100.0),
         )
         for risk in ("mean", "cvar", "var")
     ]  # fmt: skip
-    pd.testing.assert_frame_equal(table, compare(find_pairs(trials, against="mean")))
+    pd.testing.assert_frame_equal(
+        table.drop(columns="different_code"), compare(find_pairs(trials, against="mean"))
+    )
+    assert (table["different_code"] == "").all()
     assert list(table["one"]) == ["cvar", "var"]
     assert (table["arrival_time_difference_s"] == [3, 7]).all()
 
@@ -99,18 +116,189 @@ def test_what_is_looked_at_can_be_narrowed(tmp_path: Path) -> None:
     assert set(blind["other"]) == {"straight"}
 
 
-def test_two_runs_are_compared_trial_by_trial(tmp_path: Path) -> None:
+def test_two_runs_are_compared_condition_by_condition(tmp_path: Path) -> None:
     before = run_folder(tmp_path / "a" / "run", settings())
-    after = run_folder(tmp_path / "b" / "run", settings(shift=2), code={"sources": "t"})
+    after = run_folder(tmp_path / "b" / "run", settings(shift=2), code={**CODE, "sources": "t"})
     table, shown = compare_runs([before, after], "", "", {}, 0.05)
     assert len(table) == 7
     assert set(table["one"]) == {"b/run"}
     assert set(table["other"]) == {"a/run"}
     assert (table["arrival_time_difference_s"].dropna() == 2).all()
-    assert any("different sources" in note for note in shown.notes)
-    # Settings of one run, where another stands beside it.
-    table, _ = compare_runs([before, after], "risk", "mean", {"planner": "mppi"}, 0.05)
-    assert list(table["run"]) == ["a/run", "a/run", "b/run", "b/run"]
+    # What differs between runs is what is asked here, so that it is said and not refused.
+    assert "Different code: b/run differs from a/run in benchnav's own sources." in shown.notes
+    assert set(table["different_code"]) == {"b/run differs from a/run in benchnav's own sources"}
+
+
+# What made the second run, and how it is told.
+OTHER_CODE = {
+    "part": ({"parts": {"planner mppi": {"origin": "file mppi.py", "digest": "2"}}}, "planner mppi"),
+    "sources": ({"code": {**CODE, "sources": "t"}}, "benchnav's own sources"),
+    "version": ({"code": {**CODE, "versions": {"torch": "2.2"}}}, "torch (2.1 to 2.2)"),
+    "processor": ({"code": {**CODE, "processor": "AVX512"}}, "processor (AVX2 to AVX512)"),
+    "compiles": ({"code": {**CODE, "compiles": False}}, "compiles (True to False)"),
+    "limit": ({"planner_limit_s": 5.0}, "planner_limit_s (0.0 to 5.0)"),
+    "GPU": ({"device": "cuda", "gpu": "H100"}, "device (cpu to H100)"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_CODE)
+def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every_table(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes, told = OTHER_CODE[name]
+    episodes, out = settings()[lambda rows: rows["planner"] == "mppi"], tmp_path / "table"
+    cautious = run_folder(tmp_path / "a", episodes[episodes["risk"] == "cvar"])
+    plain = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"], **changes)
+    asked = (str(cautious), str(plain), "--by", "risk", "--out", str(out))
+    assert command(monkeypatch, *asked) == 2
+    refused = capsys.readouterr().err
+    assert refused.count("\n") == 1
+    assert (
+        f"in their risk alone, but the code that made them differs too: b differs from a in {told}. "
+        in refused
+    )
+    assert not list(tmp_path.glob("table*"))
+    assert command(monkeypatch, *asked, "--allow-different", "code") == 0
+    line = f"b differs from a in {told}"
+    assert f"Different code: {line}." in capsys.readouterr().out
+    assert f"Different code: {line}." in out.with_suffix(".md").read_text()
+    assert f"Different code: {latex(line)}." in out.with_suffix(".tex").read_text()
+    assert list(pd.read_csv(out.with_suffix(".csv"))["different_code"]) == [line]
+    same = run_folder(tmp_path / "c", episodes[episodes["risk"] == "mean"])
+    _, shown = compare_runs([cautious, same], "risk", "", {}, 0.05)
+    assert not any("Different" in note for note in shown.notes)
+
+
+def test_a_planner_that_was_edited_is_not_compared_with_another_either(tmp_path: Path) -> None:
+    """By planner the two have parts of their own; what both runs name has to be one."""
+    episodes = settings()[lambda rows: rows["risk"] == "mean"]
+    first = run_folder(tmp_path / "a", episodes[episodes["planner"] != "cl_rrt"])
+    parts = {f"planner {name}": {"origin": "file", "digest": "2"} for name in ("mppi", "cl_rrt")}
+    second = run_folder(tmp_path / "b", episodes[episodes["planner"] == "cl_rrt"], parts=parts)
+    # The second run names another `mppi` too, of which it holds no row here.
+    assert len(compare_runs([first, second], "planner", "", {}, 0.05)[0]) == 1
+    # Of two scenarios each in a run of its own each pair has one code, and the label of a row two.
+    moved = episodes[episodes["planner"] == "mppi"].assign(
+        scenario="hg", trial=lambda rows: rows["trial"] + "hg"
+    )
+    cautious = settings()[lambda rows: (rows["risk"] == "cvar") & (rows["planner"] == "mppi")]
+    here = run_folder(tmp_path / "c", pd.concat([episodes[episodes["planner"] == "mppi"], cautious]))
+    two = pd.concat([moved, cautious.assign(scenario="hg", trial=lambda rows: rows["trial"] + "hg")])
+    maps = {"paper-v1": {"maps": {"test/hg": ["m"] * MAPS}}}
+    there = run_folder(tmp_path / "d", two, parts=parts, datasets=maps)
+    with pytest.raises(ConfigError, match="d differs from c in planner mppi"):
+        compare_runs([here, there], "risk", "", {}, 0.05)
+
+
+def test_a_condition_that_two_runs_hold_counts_once(tmp_path: Path) -> None:
+    episodes = settings()[lambda rows: rows["planner"] == "mppi"]
+    whole, _ = compare_runs([run_folder(tmp_path / "whole", episodes)], "risk", "", {}, 0.05)
+    mean = episodes["risk"] == "mean"
+    first = run_folder(tmp_path / "a", episodes[mean | (episodes["risk"] == "cvar")])
+    # The second run holds `mean` again, on fewer maps and timed anew.
+    again = episodes[(mean & (episodes["instance"] < 9)) | (episodes["risk"] == "var")].assign(
+        planning_ms=77.0
+    )
+    second = run_folder(tmp_path / "b", again)
+    table, shown = compare_runs([first, second], "risk", "", {}, 0.05)
+    pd.testing.assert_frame_equal(table.drop(columns="run"), whole.drop(columns="run"))
+    assert not any("Left out" in note for note in shown.notes)
+    # The other way round the longer one comes last.
+    turned, _ = compare_runs([second, first], "risk", "mean", {}, 0.05)
+    assert set(turned["n_episodes"]) == {MAPS}
+
+
+def test_rows_of_one_condition_that_disagree_are_refused(tmp_path: Path) -> None:
+    episodes = settings()[lambda rows: rows["planner"] == "mppi"]
+    mean, late = episodes["risk"] == "mean", episodes.copy()
+    late.loc[mean & (late["instance"] < 2), "total_time_s"] += 1
+    first = run_folder(tmp_path / "a", episodes[mean | (episodes["risk"] == "cvar")])
+    parts = {"planner mppi": {"origin": "file mppi.py", "digest": "2"}}
+    second = run_folder(tmp_path / "b", late[mean | (late["risk"] == "var")], parts=parts)
+    for allowed in (False, True):
+        with pytest.raises(
+            ConfigError, match=r"2 of 12 episodes of .* in a and b \(b differs from a in planner mppi\)"
+        ):
+            compare_runs([first, second], "risk", "", {}, 0.05, allowed)
+
+
+def test_two_settings_under_one_label_are_refused(tmp_path: Path) -> None:
+    episodes = settings()[lambda rows: rows["planner"] == "mppi"]
+    first = run_folder(tmp_path / "a", episodes[episodes["risk"] == "cvar"])
+    other = {"mppi": {"planner": {"part": "mppi", "options": {"samples": 9}}}}
+    second = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"], values=other)
+    with pytest.raises(
+        ConfigError, match=r"one planner under each label.*'mppi': planner\.options\.samples None and 9"
+    ):
+        compare_runs([first, second], "risk", "", {}, 0.05)
+
+
+def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run", settings())
+    _, shown = compare_runs([folder], "planner", "", {"risk": "mean,–"}, 0.05)
+    assert not any("Without a partner" in note for note in shown.notes)
+    lonely = {"part": "mppi", "options": {"theta": 5.0}}
+    episodes = settings()[lambda rows: (rows["planner"] != "cl_rrt") | (rows["risk"] != "var")]
+    other = run_folder(tmp_path / "other", episodes, values={"var": {"risk": lonely}})
+    _, shown = compare_runs([other], "planner", "", {"planner": "mppi,cl_rrt"}, 0.05)
+    assert "Without a partner, so in no row: mppi var." in shown.notes
+    _, shown = compare_runs([folder], "", "mean", {}, 0.05)
+    assert "Without a partner, so in no row: straight." in shown.notes
+
+
+def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tmp_path: Path) -> None:
+    def drawn(risk: str, *draws: tuple[int, int]) -> pd.DataFrame:
+        return rows([row(trial("mppi", risk), i, seed=seed) for seed, maps in draws for i in range(maps)])
+
+    uneven = run_folder(
+        tmp_path / "a", pd.concat([drawn("mean", (0, 12), (1, 5)), drawn("cvar", (0, 12), (1, 5))])
+    )
+    table, shown = compare_runs([uneven], "risk", "", {}, 0.05)
+    assert (table["n_maps"][0], table["n_episodes"][0]) == (12, 17)
+    assert "Each pair: 12 maps, 17 episodes of each condition, both with the same draws of λ." in shown.notes
+    assert not any("Left out" in note for note in shown.notes)
+    short = run_folder(
+        tmp_path / "b", pd.concat([drawn("mean", (0, 12), (1, 9)), drawn("cvar", (0, 10), (2, 1))])
+    )
+    table, shown = compare_runs([short], "risk", "", {}, 0.05)
+    assert (table["n_maps"][0], table["n_episodes"][0]) == (10, 10)
+    assert [note for note in shown.notes if "Left out" in note] == [
+        "Left out: 1 of 11 episodes of cvar, on which mean was not run (seed 2 on map 0).",
+        "Left out: 11 of 21 episodes of mean, on which cvar was not run "
+        "(seed 0 on maps 10 to 11; seed 1 on maps 0 to 8).",
+    ]
+
+
+def test_groups_of_maps_are_the_unit(tmp_path: Path) -> None:
+    episodes = settings()
+    folder = run_folder(tmp_path / "run", episodes.assign(group=episodes["instance"] // 3))
+    table, shown = compare_runs([folder], "risk", "", {}, 0.05)
+    assert set(zip(table["n_maps"], table["n_groups"], strict=True)) == {(12, 4)}
+    assert "The maps are in 4 groups that overlap or share a site; the group is the unit." in shown.notes
+
+
+def test_robots_under_unlike_budgets_are_compared_in_shares(tmp_path: Path) -> None:
+    """T is thrice the reference time at each robot's top speed, 1 and 2 m/s: a failure of the slow one costs 75 s."""
+    slow, fast = (trial(robot=name) for name in ("slow", "fast"))
+    times = {"slow": [30.0, 45.0, None], "fast": [15.0, 20.0, 20.0]}
+    made = [
+        row(
+            labels,
+            i,
+            time_s,
+            time_ratio=time_s * speed / 25 if time_s else np.nan,
+            total_time_s=time_s or 75.0,
+        )
+        for labels, speed in ((slow, 1), (fast, 2))
+        for i, time_s in enumerate(times[labels["robot"]])
+    ]
+    world = {"paper": {"world": {"noise": "resampled", "time_budget_ratio": 3.0}}}
+    table, shown = compare_runs(
+        [run_folder(tmp_path / "run", rows(made), values=world)], "robot", "slow", {}, 0.05
+    )
+    shares = np.array([15 / 37.5 - 30 / 75, 20 / 37.5 - 45 / 75, 20 / 37.5 - 1])
+    assert table["time_difference_share"][0] == pytest.approx(shares.mean())
+    assert "Δ T_total [% of T]" in shown.headings
 
 
 def test_runs_with_trials_of_their_own_are_compared_across(tmp_path: Path) -> None:
@@ -131,7 +319,7 @@ def test_command_prints_and_writes(tmp_path: Path, monkeypatch, capsys) -> None:
     assert command(monkeypatch, str(folder), "--against", "mean", "--points", "20", "--out", str(out)) == 0
     printed = capsys.readouterr().out
     assert "Family: 4 pairs" in printed
-    assert "12 maps, 1 episode on each" in printed
+    assert "12 maps, 12 episodes of each condition" in printed
     assert "A difference of 20 points needs" in printed
     numbers = pd.read_csv(out.with_suffix(".csv"))
     assert list(numbers["one"]) == ["cvar", "var"] * 2

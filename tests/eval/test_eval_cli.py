@@ -73,6 +73,21 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--world", "stakes"), "stakes"),
+        (("--world", "[paper,stakes]"), ["paper", "stakes"]),
+        (("--world", "stakes", "--world.noise", "stored"), {"preset": "stakes", "noise": "stored"}),
+    ],
+)
+def test_a_world_is_given_by_name_as_several_or_with_its_fields(
+    words: tuple[str, ...], expected: object, monkeypatch, capsys
+) -> None:  # type: ignore[no-untyped-def]
+    assert evaluate(monkeypatch, "run", *words, "--print_config") == 0
+    assert yaml.safe_load(capsys.readouterr().out)["world"] == expected
+
+
+@pytest.mark.parametrize(
     ("words", "changed"),
     [
         ((), {}),

@@ -9,7 +9,7 @@ import pytest
 
 from benchnav.errors import BenchnavError
 from benchnav.eval.failed_ground import ground_of_run
-from benchnav.eval.folder.folder import open_run, read_table
+from benchnav.eval.folder.folder import open_run, read_table, write_run
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run.episode import build
@@ -75,7 +75,7 @@ def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, fo
         data["maps"]["test/std"] = ["0" * 16 for _ in data["maps"]["test/std"]]
     else:
         about[part]["model oracle"]["name"] = "another"
-    (folder / "run.json").write_text(json.dumps(about))
+    write_run(folder, about)
     try:
         rows = failures_table(folder, read_table(folder, "episodes.parquet"))
         with pytest.raises(BenchnavError, match="Expected"):

@@ -6,7 +6,7 @@ import pytest
 
 from benchnav.errors import ConfigError
 from benchnav.eval.find_episodes import find_episodes
-from benchnav.eval.folder.folder import FORMAT, FORMAT_VERSION
+from benchnav.eval.folder.folder import FORMAT, FORMAT_VERSION, write_run
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent
@@ -23,9 +23,15 @@ def made(path: Path, **draws: tuple[tuple[int, int, int], ...]) -> Path:
     for trial in trials_of(suite, lambda data: ["std", "hs"]):
         extent = Extent(draws=draws.get(trial.labels["planner"], DRAWS))
         entries[trial.id] = {"value": trial.value, "labels": trial.labels, **extent.to_dict()}
-    about = {"format": FORMAT, "format_version": FORMAT_VERSION, "suite": {}, "trials": entries}
+    maps = {f"test/{scenario}": ["m"] * 60 for scenario in ("std", "hs")}
+    about = {
+        "format": FORMAT, "format_version": FORMAT_VERSION, "run_id": "r", "suite": {}, "trials": entries,
+        "datasets": {suite.data: {"id": "d", "maps": maps}}, "parts": {}, "commands": [], "machine": {},
+        "code": {"sources": "s", "versions": {}, "processor": "", "compiles": False}, "device": "cpu",
+        "planner_limit_s": 0.0,
+    }  # fmt: skip
     path.mkdir()
-    (path / "run.json").write_text(json.dumps(about))
+    write_run(path, json.loads(json.dumps(about)))
     return path
 
 

@@ -28,15 +28,15 @@ def test_several_lists_are_a_product_with_labels_of_their_own() -> None:
     given = {
         "part": "astar_dwa",
         "label": "dwa",
-        "options": {"by_time": [False, True], "dwa": {"horizon": [20, 50], "speeds": 5}},
+        "options": {"lookahead_m": [2.0, 4.0], "dwa": {"horizon_s": [2.0, 5.0], "speeds": 5}},
     }
     assert parts("planner", given) == [
         (
-            f"dwa by_time={by_time} dwa.horizon={horizon}",
-            {"by_time": by_time, "dwa": {"horizon": horizon, "speeds": 5}},
+            f"dwa lookahead_m={lookahead} dwa.horizon_s={horizon}",
+            {"lookahead_m": lookahead, "dwa": {"horizon_s": horizon, "speeds": 5}},
         )
-        for by_time in (False, True)
-        for horizon in (20, 50)
+        for lookahead in (2.0, 4.0)
+        for horizon in (2.0, 5.0)
     ]
 
 
@@ -61,14 +61,14 @@ def test_mappings_are_expanded_at_any_depth() -> None:
 
 def test_a_suite_sweeps_levels_planners_worlds_and_tasks() -> None:
     found = trials(
-        planners=[{"part": "mppi", "options": {"horizon": [10, 20]}}],
+        planners=[{"part": "mppi", "options": {"horizon_s": [1.0, 2.0]}}],
         risks=["mean", {"part": "cvar", "options": {"level": [0.5, 0.9]}}],
         world={"preset": "stakes", "correlation_m": [1.0, 2.0]},
         task={"slowest": [0.05, 0.1]},
     )
     assert len(found) == 2 * 3 * 2 * 2
     values = {
-        (t.planner.options["horizon"], t.risk.label, t.world.correlation_m, t.rules.slowest) for t in found
+        (t.planner.options["horizon_s"], t.risk.label, t.world.correlation_m, t.rules.slowest) for t in found
     }
     assert len(values) == len(found)
     assert {t.world_label for t in found} == {

@@ -24,6 +24,12 @@ def one(**changes: object) -> Trial:
     return trial
 
 
+def test_travel_time_ends_where_the_tasks_goal_begins() -> None:
+    for changes, radius_m in (({}, 1.0), ({"task": {"goal_radius_m": 0.3}}, 0.3)):
+        task = one(objectives=("travel_time",), **changes).make_task()
+        assert (task.objective.goal_radius_m, task.rules.goal_radius_m) == (radius_m, radius_m)
+
+
 def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
     trial = one()
     assert one().id == trial.id
@@ -90,6 +96,18 @@ def test_every_setting_reaches_its_place() -> None:
     )
     travel = one(objectives=("travel_time",), robots=({"part": "unicycle", "options": {"dt_s": 0.2}},))
     assert travel.make_task().objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
+
+
+def test_several_worlds_stand_at_the_top_of_a_suite() -> None:
+    suite = Suite(
+        model="oracle",
+        planners=("straight",),
+        world=("paper", {"preset": "stakes", "correlation_m": [1.0, 2.0]}),
+    )
+    worlds = [trial.world for trial in trials_of(suite, lambda data: ["std"])]
+    assert [(world.noise, world.correlation_m) for world in worlds] == [
+        ("resampled", 1.5), ("frozen", 1.0), ("frozen", 2.0),
+    ]  # fmt: skip
 
 
 def test_what_a_world_says_itself_goes_before_the_short_forms() -> None:

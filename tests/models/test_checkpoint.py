@@ -1,20 +1,31 @@
 import json
 import os
+import random
 import shutil
-from dataclasses import replace
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from benchnav.errors import CheckpointError
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.datagen.schema import seal, unseal
+from benchnav.errors import BenchnavError, CheckpointError
+from benchnav.mixture import TraversabilityMixture
 from benchnav.models import checkpoint as module
-from benchnav.models.checkpoint import Part, as_stored, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint, save_checkpoint
+from benchnav.models.cli import main
+from benchnav.models.config import ClassifierConfig
 from benchnav.models.contract import check_model
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.predictor import load_model, predict
+from benchnav.models.predictor import find_checkpoint, load_model, predict
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
+from benchnav.terrain import Terrain
+from tests.models.stub import true_table
 from tests.models.support import make_terrain
 
 
@@ -25,8 +36,8 @@ def folder(checkpoint_path: Path, tmp_path: Path) -> Path:
 
 
 def edit(folder: Path, **changes: object) -> None:
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, **changes}))
+    config = unseal((folder / "config.json").read_text())
+    (folder / "config.json").write_text(seal({**config, **changes}))
 
 
 def full(part: Part) -> Part:
@@ -96,18 +107,10 @@ def test_the_temperature_of_a_pool_is_kept_until_the_pool_is_another(folder: Pat
     assert load_model(tmp_path / "pool").pool_temperature == 0.25  # type: ignore[union-attr]
     assert again.with_part("gp", there.part("gp")).pool_temperature == 0.25
     assert again.with_part("classifier-3", there.part("classifier")).pool_temperature == 1
-    # A reader that knows nothing of it is told by the version; every other checkpoint is as before.
-    versions = [
-        json.loads((path / "config.json").read_text())["format_version"]
-        for path in (folder, tmp_path / "pool")
-    ]
-    assert versions == ["2.0", "2.1"]
     assert "pool_temperature" not in json.loads((folder / "config.json").read_text())
 
 
-def test_second_modes_are_kept_beside_the_tables_and_told_by_the_version(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_second_modes_are_kept_beside_the_tables(folder: Path, tmp_path: Path) -> None:
     there = load_checkpoint(folder)
     table = SlopeTable.from_tensors(there.part("gp").tensors)
     assert table.soft is None
@@ -119,11 +122,6 @@ def test_second_modes_are_kept_beside_the_tables_and_told_by_the_version(
     again = load_model(tmp_path / "soft").table.soft  # type: ignore[union-attr]
     for name in ("weight", "mean", "std"):
         assert torch.equal(getattr(again, name), getattr(soft, name))
-    versions = [
-        json.loads((path / "config.json").read_text())["format_version"]
-        for path in (folder, tmp_path / "soft")
-    ]
-    assert versions == ["2.0", "2.1"]
     terrain = make_terrain(classes=10)
     assert predict(load_model(tmp_path / "soft"), terrain).weights.shape[1] == 20
     check_model(load_model(tmp_path / "soft"))
@@ -168,11 +166,11 @@ def test_a_damaged_config_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("version", "remedy"), [("2.2", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
+    ("version", "remedy"), [("2.3", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
 )
 def test_another_format_is_refused(folder: Path, version: str, remedy: str) -> None:
     edit(folder, format_version=version)
-    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.1 .* got {version}.*{remedy}"):
+    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.2 .* got {version}.*{remedy}"):
         load_checkpoint(folder)
 
 
@@ -223,3 +221,162 @@ def test_a_save_never_replaces_what_is_no_checkpoint(folder: Path, tmp_path: Pat
     with pytest.raises(CheckpointError, match="something else"):
         save_checkpoint(tmp_path / "precious", load_checkpoint(folder))
     assert (tmp_path / "precious" / "notes.txt").read_text() == "keep"
+
+
+def test_settings_of_the_trainer_are_kept_and_absent_of_earlier_versions(
+    folder: Path, tmp_path: Path
+) -> None:
+    there = load_checkpoint(folder)
+    assert there.part("classifier").trainer == {"devices": 1, "precision": "32-true"}
+    assert there.part("gp").trainer is None
+    clipped = replace(there.part("classifier"), trainer={"gradient_clip_val": 0.5})
+    save_checkpoint(tmp_path / "again", there.with_part("classifier", clipped))
+    assert load_checkpoint(tmp_path / "again").part("classifier").trainer == {"gradient_clip_val": 0.5}
+    assert load_checkpoint(find_checkpoint("paper-v1")).part("classifier").trainer is None
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Terrain, TraversabilityMixture]:
+    """A small checkpoint of two classifiers that nobody trained, a map, and what it predicts of it."""
+    classes = load_recipe("tiny-v1").classes
+    config = ClassifierConfig(encoder="mobilenet_v2", encoder_depth=3, decoder_channels=(16, 8, 8))
+    members = {
+        name: Part(
+            config={**asdict(config), "temperature": 0.5 + seed},
+            tensors=dict(
+                TerrainClassifier(config, len(classes), torch.zeros(3), torch.ones(3), seed).state_dict()
+            ),
+            seed=seed,
+            metrics={"valid_loss": 0.5},
+            data_id="tiny-v1",
+            data_digest="train:00,valid:11",
+            half_precision=True,
+            trainer={"devices": 1},
+        )
+        for seed, name in enumerate(("classifier", "classifier-2"))
+    }
+    gp = replace(
+        members["classifier"], config={}, tensors=true_table(classes).to_tensors(), half_precision=False
+    )
+    folder = tmp_path_factory.mktemp("small") / "small"
+    names = tuple(item.name for item in classes)
+    save_checkpoint(folder, Checkpoint(class_names=names, parts={**members, "gp": gp}, pool_temperature=0.8))
+    terrain = make_terrain(batch=1, classes=10)
+    return folder, terrain, predict(load_model(folder), terrain)
+
+
+ODD = (None, -1, 0, 1, 7, 1e300, float("nan"), "", "x", "../x", True, [], [1], {}, {"a": 1}, 10**30)
+
+
+def spoil(folder: Path, generator: random.Random) -> str:
+    """Changes something of a checkpoint and says what."""
+    kind = generator.choice(
+        ["value", "value", "value", "key", "text", "text", "bytes", "cut", "gone", "swap"]
+    )
+    config, tensors = folder / "config.json", sorted(folder.glob("*.safetensors"))
+    if kind in ("value", "key"):
+        content = json.loads(config.read_text())
+        place: Any = content
+        while True:
+            key = generator.choice(list(place) if isinstance(place, dict) else range(len(place)))
+            if not isinstance(place[key], dict | list) or not place[key] or generator.random() < 0.15:
+                break
+            place = place[key]
+        before = place.pop(key)
+        if kind == "value":
+            near = [before * 1.5, before + 1] if type(before) in (int, float) else []
+            odd = generator.choice([*ODD, *near, *near])
+            place.insert(key, odd) if isinstance(place, list) else place.update({key: odd})
+        config.write_text(json.dumps(content))
+        return f"{kind} {key}"
+    path = config if kind == "text" else generator.choice([config, *tensors])
+    content = bytearray(path.read_bytes())
+    if kind in ("text", "bytes"):
+        content[generator.randrange(len(content))] = generator.randrange(256)
+    elif kind == "cut":
+        del content[generator.randrange(len(content)) :]
+    elif kind == "swap":
+        content = bytearray(generator.choice(tensors).read_bytes())
+    path.unlink()
+    if kind != "gone":
+        path.write_bytes(content)
+    return f"{kind} {path.name}"
+
+
+def predicted(folder: Path, terrain: Terrain) -> TraversabilityMixture | str:
+    """What a checkpoint predicts, or why it is refused."""
+    try:
+        return predict(load_model(folder), terrain)
+    except BenchnavError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize(
+    "edits", [range(50), pytest.param(range(50, 350), marks=pytest.mark.slow)], ids=["50", "300"]
+)
+def test_an_edited_checkpoint_is_refused_in_one_line_or_predicts_what_it_did(
+    edits: range, small: tuple[Path, Terrain, TraversabilityMixture], tmp_path: Path
+) -> None:
+    folder, terrain, wanted = small
+    refused = 0
+    for number in edits:
+        copy = Path(shutil.copytree(folder, tmp_path / str(number)))
+        done = spoil(copy, random.Random(number))
+        found = predicted(copy, terrain)
+        if isinstance(found, str):
+            refused += 1
+            assert "\n" not in found, done
+        else:
+            for name in ("weights", "means", "stds"):
+                assert torch.equal(getattr(found, name), getattr(wanted, name)), done
+        shutil.rmtree(copy)
+    assert refused > 0.8 * len(edits)
+
+
+@pytest.mark.parametrize(
+    "edits", [range(30), pytest.param(range(30, 130), marks=pytest.mark.slow)], ids=["30", "100"]
+)
+def test_an_edited_checkpoint_of_an_earlier_version_ends_in_no_traceback(
+    edits: range, small: tuple[Path, Terrain, TraversabilityMixture], tmp_path: Path
+) -> None:
+    """Nothing tells there whether a setting was edited, so that it may be another model; it is a model or refused."""
+    folder, terrain, _ = small
+    for number in edits:
+        copy = Path(shutil.copytree(folder, tmp_path / str(number)))
+        config = unseal((copy / "config.json").read_text())
+        (copy / "config.json").write_text(json.dumps({**config, "format_version": "2.1"}))
+        done = spoil(copy, random.Random(1000 + number))
+        found = predicted(copy, terrain)
+        if not isinstance(found, str):
+            assert bool(((found.mean() >= 0) & (found.mean() <= 1)).all()), done
+        shutil.rmtree(copy)
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_the_command_refuses_an_edited_checkpoint_in_one_line(
+    number: int,
+    small: tuple[Path, Terrain, TraversabilityMixture],
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    copy = Path(shutil.copytree(small[0], tmp_path / "copy"))
+    config = unseal((copy / "config.json").read_text())
+    names, parts = config["class_names"], config["parts"]
+    edited: list[dict[str, Any]] = [
+        {**config, "pool_temperature": 0.5},
+        {**config, "class_names": names[::-1]},
+        {**config, "parts": {**parts, "classifier": {**parts["classifier"], "seed": "x"}}},
+        {**config, "parts": {name: parts[name] for name in ("classifier", "gp")}},
+        {**config, "format_version": "2.1", "class_names": ["a", "a", *names[2:]]},
+        {**config, "format_version": "2.1", "parts": {**parts, "gp": 5}},
+    ]
+    (copy / "config.json").write_text(json.dumps(edited[number]))
+    monkeypatch.setattr(sys, "argv", ["benchnav-train", "evaluate", str(copy), "--data", str(dataset.path)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    out, err = capfd.readouterr()
+    assert (out, len(err.strip().splitlines())) == ("", 1)
+    assert "is damaged" in err

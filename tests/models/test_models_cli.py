@@ -5,9 +5,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import huggingface_hub
 import pytest
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.schema import seal
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
@@ -30,6 +32,9 @@ QUICK_CLASSIFIER = [
     "--trainer.precision",
     "32-true",
 ]
+
+
+NETWORKS = {"all": "classifier", "classifier": "classifier", "mdn": "mdn"}
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -93,7 +98,8 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
     copy = shutil.copytree(checkpoint_path, tmp_path / "copy")
     config = json.loads((copy / "config.json").read_text())
     config["class_names"][0] = "lava"
-    (copy / "config.json").write_text(json.dumps(config))
+    del config["manifest_digest"]
+    (copy / "config.json").write_text(seal(config))
     where = ["--data", dataset.path, "--out", copy]
     message = refuses(monkeypatch, capfd, "classifier", *where, *QUICK_CLASSIFIER)
     assert "classes lava" in message
@@ -111,6 +117,27 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
         (["gp", "--data", "DATA", "--out", "x", "--gp.max_points", "9"], "max_points"),
         (["gp", "--data", "TEST", "--out", "x"], "train and valid"),
         (["gp", "--data", "DATA", "--out", "."], "something else"),
+        *(
+            ([kind, "--data", "DATA", "--out", "x/y", *setting], expected)
+            for kind in ("all", "mdn", "classifier")
+            for setting, expected in (
+                (
+                    [f"--{NETWORKS[kind]}.encoder", "tu-resnet81"],
+                    "got 'tu-resnet81'. Did you mean 'tu-resnet18'?",
+                ),
+                ([f"--{NETWORKS[kind]}.architecture", "DeepLabV3+"], "Did you mean 'deeplabv3plus'?"),
+                (["--trainer.limit_val_batches", "0"], "`trainer.limit_val_batches` that leaves a batch"),
+                (["--trainer.gradient_clip_val", "many"], "`gradient_clip_val` should be"),
+                (["--seed", "99999999999999999999999"], "Expected `seed` in 0–"),
+                (["--seed", "-1"], "got -1."),
+            )
+        ),
+        (["gp", "--data", "DATA", "--out", "x/y", "--seed", "-1"], "Expected `seed` in 0–"),
+        (
+            ["classifier", "--data", "DATA", "--out", "x/y", "--classifier.decoder_channels", "many"],
+            "Expected --classifier.decoder_channels as a list, each a whole number, got 'many'.",
+        ),
+        (["all", "--data", "DATA", "--out", "x/y", "--members", "2", "--seed", str(2**63 - 1)], "`seed`"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(
@@ -127,6 +154,23 @@ def test_bad_input_is_refused_in_one_line(
         paths["TEST"] = make_dataset(tmp_path / "test.h5", test_std=1).path
     message = refuses(monkeypatch, capfd, *(paths.get(item, item) for item in arguments))
     assert expected in message
+    assert {path.name for path in tmp_path.iterdir()} <= {"test.h5"}
+
+
+def test_pretrained_weights_that_cannot_be_had_are_told_with_the_flag_before_anything_is_trained(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    for encoder in ("resnet18", "tu-resnet18"):
+        asked = ("--classifier.pretrained", "--classifier.encoder", encoder)
+        message = refuses(monkeypatch, capfd, "all", "--data", dataset.path, "--out", "x/y", *asked)
+        assert f"ImageNet weights of {encoder} for `pretrained`" in message
+        assert "leave --classifier.pretrained or --mdn.pretrained out" in message
     assert not (tmp_path / "x").exists()
 
 

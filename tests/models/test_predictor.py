@@ -2,7 +2,7 @@ import hashlib
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,8 +15,10 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models import fused
-from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
+from benchnav.models.nets.mdn import MixtureDensityNetwork
 from benchnav.models.predictor import (
     Oracle,
     class_mismatch,
@@ -314,6 +316,40 @@ def test_the_oracle_loads_no_heavy_library() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("without_gradients", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("kind", ["shallow", "deep", "pool", "mdn"])
+def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
+    kind: str, without_gradients: type, checkpoint_path: Path, tmp_path: Path
+) -> None:
+    path = {"deep": checkpoint_path, "shallow": Path("stakes-v1")}.get(kind, tmp_path / kind)
+    if kind == "pool":
+        there = load_checkpoint(checkpoint_path)
+        save_checkpoint(path, there.with_part("classifier-2", there.part("classifier")))
+    if kind == "mdn":
+        config = MDNConfig(encoder="mobilenet_v2", hidden=8)
+        network = MixtureDensityNetwork(config, torch.zeros(3), torch.ones(3), torch.ones(()), 1)
+        part = Part(
+            config=asdict(config),
+            tensors=dict(network.state_dict()),
+            seed=0,
+            metrics={},
+            data_id="",
+            data_digest="",
+        )
+        save_checkpoint(path, Checkpoint(class_names=("a",), model="mdn", parts={"mdn": part}))
+    terrain = make_terrain(classes=10)
+    wanted = predict(load_model(path.name if kind == "shallow" else path), terrain)
+    with without_gradients():
+        model = load_model(path.name if kind == "shallow" else path)
+        inside = predict(model, terrain)
+    assert torch.is_grad_enabled()
+    outside = predict(model, terrain)
+    for name in ("weights", "means", "stds"):
+        assert torch.equal(getattr(inside, name), getattr(wanted, name))
+        assert torch.equal(getattr(outside, name), getattr(wanted, name))
+        assert not getattr(outside, name).is_inference()
 
 
 def test_a_family_is_no_model_and_a_checkpoint_of_an_unknown_one_says_so(checkpoint_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_robots(name: str) -> None:
 
 @pytest.mark.parametrize("name", registry.names("objective"))
 def test_objectives(name: str) -> None:
-    objective = registry.make("objective", name, robot=Unicycle())
+    objective = registry.make("objective", name, robot=Unicycle(), goal_radius_m=1.0)
     state, target = gpu(BATCH, SAMPLES, 3), gpu(BATCH, 1, 2)
     expect(objective.stage(state, gpu(BATCH, SAMPLES, 2), gpu(BATCH, SAMPLES), target), BATCH, SAMPLES)
     expect(objective.terminal(state, gpu(BATCH, SAMPLES), target), BATCH, SAMPLES)

@@ -177,15 +177,14 @@ def test_an_objectives_reward_is_minus_its_stage_cost(dataset_path: Path) -> Non
 
 
 def test_an_objective_is_taken_by_name_with_options_and_the_robot(dataset_path: Path) -> None:
-    far = {"part": "travel_time", "options": {"arrival_m": 500.0}}
     slow = {"part": "unicycle", "options": {"dt_s": 0.5}}
     near = make(dataset_path, objective="travel_time", robot=slow)
     near.reset(seed=0)
     assert near.step(AHEAD)[1] == pytest.approx(-0.5)
-    arrived = make(dataset_path, objective=far, robot=slow)
+    arrived = make(dataset_path, objective="travel_time", robot=slow, goal_radius_m=500.0)
     arrived.reset(seed=0)
     assert arrived.step(AHEAD)[1] == 0
-    made = make(dataset_path, objective=TravelTime(Unicycle(dt_s=0.25)))
+    made = make(dataset_path, objective=TravelTime(Unicycle(dt_s=0.25), 1.0))
     made.reset(seed=0)
     assert made.step(AHEAD)[1] == pytest.approx(-0.25)
 
@@ -338,3 +337,18 @@ def test_a_world_may_be_given_as_itself(dataset_path: Path) -> None:
 def test_maps_without_a_reference_time_have_no_budget_by_it(dataset_path: Path) -> None:
     with pytest.raises(ConfigError, match="solvable"):
         make(dataset_path, split="train", world="stakes")
+
+
+def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the_command(
+    tmp_path: Path,
+) -> None:
+    recipe = factories.tiny_recipe()
+    split = replace(recipe.splits["train"], solvable=False)
+    path = factories.tiny_dataset(tmp_path / "d.h5", replace(recipe, splits={"train": split}))
+    with pytest.raises(
+        ConfigError, match=r"none on 8 of 8.*create RECIPE id=NAME splits\.train\.solvable=true"
+    ) as told:
+        make(path, world="stakes")
+    assert "\n" not in str(told.value)
+    made = make(path, world={"preset": "stakes", "time_budget_s": 60})  # as the line says
+    made.reset(seed=0)

@@ -3,7 +3,7 @@ import torch
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.planning.objective import GoalDistance, TravelTime, distance
+from benchnav.planning.objective import GoalDistance, TravelTime, distance, path_cost_of, toward_waypoints
 from benchnav.planning.robots import Bicycle, Unicycle
 
 STATE = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [0.0, 0.5, 2.0]])
@@ -20,19 +20,19 @@ def test_the_papers_objective_is_the_distance_and_knows_no_penalty() -> None:
 
 def test_travel_time_counts_the_steps_before_arrival() -> None:
     robot = Unicycle(dt_s=0.2)
-    cost = TravelTime(robot, arrival_m=4.7).stage(STATE, ACTION, GROUND, TARGET)
+    cost = TravelTime(robot, 4.7).stage(STATE, ACTION, GROUND, TARGET)
     assert cost.tolist() == pytest.approx([0.2, 0.0, 0.0])
 
 
 def test_what_is_left_costs_the_time_at_top_speed() -> None:
-    left = TravelTime(Bicycle(speed_mps=(0.0, 2.0)), arrival_m=1.0).terminal(STATE, GROUND, TARGET)
+    left = TravelTime(Bicycle(speed_mps=(0.0, 2.0)), 1.0).terminal(STATE, GROUND, TARGET)
     assert left.tolist() == pytest.approx([2.0, 0.0, 0.5 * ((9 + 3.5**2) ** 0.5 - 1)])
 
 
 def test_travel_time_along_a_straight_line_is_the_time_it_takes() -> None:
     """Whatever the horizon ends at, on ground of λ = 1 the sum is what is left of the way over the speed."""
     robot = Unicycle()
-    objective = TravelTime(robot)
+    objective = TravelTime(robot, 0.5)
     for steps in (0, 10, 35, 55):
         state, total = torch.tensor([[0.0, 0.0, 0.0]]), torch.zeros(1)
         for _ in range(steps):
@@ -42,16 +42,39 @@ def test_travel_time_along_a_straight_line_is_the_time_it_takes() -> None:
         assert total.item() == pytest.approx((5.25 - 0.5) / 1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("arrival_m", [0.0, -1.0, float("nan")])
-def test_a_distance_at_which_nothing_arrives_is_refused(arrival_m: float) -> None:
-    with pytest.raises(ConfigError, match="arrival_m"):
-        TravelTime(Unicycle(), arrival_m=arrival_m)
+@pytest.mark.parametrize("goal_radius_m", [0.0, -1.0, float("nan")])
+def test_a_distance_at_which_nothing_arrives_is_refused(goal_radius_m: float) -> None:
+    with pytest.raises(ConfigError, match="goal_radius_m"):
+        TravelTime(Unicycle(), goal_radius_m)
 
 
-def test_the_registry_gives_an_objective_the_tasks_robot() -> None:
+def test_the_registry_gives_an_objective_the_tasks_robot_and_goal_radius() -> None:
     robot = Unicycle(dt_s=0.25)
-    made = registry.make("objective", {"part": "travel_time", "options": {"arrival_m": 2.0}}, robot=robot)
+    made = registry.make("objective", "travel_time", robot=robot, goal_radius_m=2.0)
     assert made == TravelTime(robot, 2.0)
+    with pytest.raises(ConfigError, match=r"travel_time.*goal_radius_m"):
+        registry.make("objective", {"part": "travel_time", "options": {"goal_radius_m": 1.0}}, robot=robot)
+
+
+def test_a_way_point_nearer_than_the_goals_radius_is_still_to_be_reached() -> None:
+    objective = TravelTime(Unicycle(), 1.0)
+    near, target = torch.tensor([[0.7, 0.0, 0.0], [0.1, 0.0, 0.0]]), torch.zeros(2, 2)
+    assert objective.stage(near, ACTION[:2], torch.ones(2), target).tolist() == [0.0, 0.0]
+    local = toward_waypoints(objective)
+    assert local.stage(near, ACTION[:2], torch.ones(2), target).tolist() == pytest.approx([0.1, 0.0])
+    assert toward_waypoints(TravelTime(Unicycle(), 0.1)) == TravelTime(Unicycle(), 0.1)
+    paper = GoalDistance()
+    assert toward_waypoints(paper) is paper
+
+
+def test_a_metre_of_path_costs_its_time_or_its_length() -> None:
+    ground, grade = torch.tensor([1.0, 0.5, 0.05]), torch.tensor([0.0, 0.75, -0.75])
+    robot = Unicycle(speed_mps=(0.0, 2.0))
+    seconds, metres = [0.5, 1.0, 10.0], [1.0, 1.25, 1.25]
+    assert TravelTime(robot, 1.0).path_cost(ground, grade).tolist() == pytest.approx(seconds)
+    for objective in (GoalDistance(), object()):
+        assert path_cost_of(objective)(ground, grade).tolist() == pytest.approx(metres)
+    assert path_cost_of(TravelTime(robot, 1.0))(ground, grade).tolist() == pytest.approx(seconds)
 
 
 def test_distances_broadcast_and_agree_with_the_norm() -> None:
@@ -63,7 +86,7 @@ def test_distances_broadcast_and_agree_with_the_norm() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", registry.names("objective"))
 def test_an_objective_keeps_shape_and_dtype_for_any_leading_dimensions(name: str, dtype: torch.dtype) -> None:
-    objective = registry.make("objective", name, robot=Unicycle())
+    objective = registry.make("objective", name, robot=Unicycle(), goal_radius_m=1.0)
     for leading in ((3,), (3, 4), (3, 4, 2)):
         target = torch.rand(3, *[1] * (len(leading) - 1), 2, dtype=dtype)
         given = torch.rand(*leading, 3, dtype=dtype), torch.rand(*leading, 2, dtype=dtype)

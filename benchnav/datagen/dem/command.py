@@ -3,8 +3,6 @@
 This module imports nothing heavy, so that the command's help is quick.
 """
 
-from pathlib import Path
-
 
 def import_dem(
     dem: str,
@@ -52,8 +50,9 @@ def import_dem(
     from benchnav.datagen.files.hdf5 import is_one_file
     from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.datagen.recipe.recipe import load_recipe
+    from benchnav.files import output_path
 
-    path = Path(out).expanduser()
+    path = output_path(out)
     rasters = Rasters(
         dem=dem,
         classes=classes,
@@ -83,5 +82,11 @@ def import_dem(
         between = left_out.pop("between_splits")
         reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
         print(f"  left out of {split}: {reasons}")
+        if "group" in made.fields:
+            groups = len(set(made.read(split, fields=["group"])["group"].tolist()))
+            print(
+                f"  {entry['maps']} maps of {split} overlap and are {groups} group(s), the unit of statistics: for "
+                "a test split leave --stride out, so that maps lie side by side"
+            )
     if between:
         print(f"  left out between splits: {between}")

@@ -1,10 +1,17 @@
 """Real ground: rasters into maps of the dataset schema.
 
 Slopes follow from the real elevation, at a map's edge too, where that of the ground beyond is read. What the
-rasters do not say comes from the recipe. The truth of λ, its distribution in each cell, is always that of the
-recipe's class table, also where λ was measured; where the class is not known, it is not known either.
+rasters do not say comes from the recipe. The truth of λ, its distribution in each cell, is not known of real ground:
+`Terrain.truth` is what the recipe's class table would make it, and the dataset says that it is unknown.
+
+Maps that overlap say the same of the same ground. So they are stored with a `group`, the statistical unit: maps of one
+group overlap, directly or by others between them, and maps of two groups share no ground. Where all maps of a split
+are connected, it is one group, and statistics have one unit. Cutting such ground into smaller groups would need maps
+to be left out between them, and gives no more units than maps side by side.
 """
 
+import hashlib
+import json
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -21,9 +28,10 @@ from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import check_place, join
 from benchnav.datagen.files.folder import Contents, restore, take_place, write_manifest
 from benchnav.datagen.files.hdf5 import is_one_file, named_errors, pack
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.files.shard import SHARD_CELLS, Shard, write
 from benchnav.datagen.recipe.recipe import Recipe, Split
-from benchnav.datagen.schema import FIELDS, UNLABELLED, Maps, quantise
+from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 from benchnav.errors import DatasetError
 from benchnav.files import real_place, sole_writer
@@ -34,7 +42,7 @@ _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows w
 # Why maps are left out, in the order of being found.
 _REASONS = {
     "missing_elevation": "have cells without elevation",
-    "missing_classes": "have no cell with a class, or cells without one and no photo of them",
+    "missing_classes": "have no cell with a class or a measured λ, or cells without a class and no photo of them",
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
@@ -100,12 +108,15 @@ def import_dem(
         with named_errors(out):
             for part in parts.values():
                 part.flush()
+                if ground.tiling.overlaps:
+                    part.add_groups()
             sizes = {name: replace(splits[name], maps=len(part.numbers)) for name, part in parts.items()}
             contents = Contents(
                 id=dataset_id,
                 recipes=[replace(recipe, splits=sizes)],
                 splits={name: part.entry() for name, part in parts.items()},
                 files={name: part.files for name, part in parts.items()},
+                fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
             )
             check_place(out, overwrite)
             if is_one_file(out):
@@ -152,16 +163,39 @@ class _Part:
         write(self.files[-1], content)
         self.pending, self.written = [], shard.stop
 
-    def entry(self, first: int = 0) -> dict[str, Any]:
-        """The manifest's entry of the maps from one on."""
+    def add_groups(self) -> None:
+        """Writes the shards anew with each map's group, which is known only when all maps are.
+
+        Of the ground and its least map the number is a digest, so that datasets can be merged: the same on the
+        same ground, and else another.
+        """
+        source = self.ground.source
+        about = [source[key] for key in ("file", "sha256", "crs", "origin_m", "stride_m")]
+        shape = self.ground.tiling.shape
+        groups = self.ground.tiling.groups(self.numbers).tolist()
+        numbers = {
+            first: int(hashlib.sha256(json.dumps([*about, *shape, first]).encode()).hexdigest()[:13], 16)
+            for first in set(groups)
+        }
+        begin = 0
+        for file in self.files:
+            maps = TerrainDataset(file).read(self.name)
+            stop = begin + len(maps["environment"])
+            maps["group"] = np.array([numbers[first] for first in groups[begin:stop]])
+            content = pack(self.recipe.id, self.recipe, self.name, self.entry(begin, stop), maps)
+            write(file, content)
+            begin = stop
+
+    def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
+        """The manifest's entry of the maps from one on, to the last or before another."""
         kept = {
-            "kept": self.numbers[first:],
-            "lowest_m": self.lowest_m[first:],
-            "unlabelled": self.unlabelled[first:],
+            "kept": self.numbers[first:stop],
+            "lowest_m": self.lowest_m[first:stop],
+            "unlabelled": self.unlabelled[first:stop],
         }
         left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
-        source = {**self.ground.source, **kept, "left_out": left_out}
-        count = len(self.numbers) - first
+        source = {**self.ground.source, "truth": "unknown", **kept, "left_out": left_out}
+        count = len(self.numbers[first:stop])
         scenario = self.recipe.splits[self.name].scenario
         return {"scenario": scenario, "maps": count, "parts": [{"maps": count, "source": source}]}
 
@@ -175,8 +209,12 @@ def _make(
     lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
     if "class_id" in given:
         unlabelled = np.isnan(given["class_id"])
-        # Without a photo a cell is painted in the colour of its class.
-        lacking["missing_classes"] = (unlabelled.all if "rgb" in given else unlabelled.any)(axis=(1, 2, 3))
+        if "rgb" in given:
+            # A measured λ is worth learning from without a class.
+            unmeasured = np.isnan(given.get("traversability", np.nan))
+            lacking["missing_classes"] = (unlabelled & unmeasured).all(axis=(1, 2, 3))
+        else:  # a cell is painted in the colour of its class
+            lacking["missing_classes"] = unlabelled.any(axis=(1, 2, 3))
     if "rgb" in given:
         lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
     for reason, which in lacking.items():

@@ -15,7 +15,8 @@ import numpy as np
 
 from benchnav.errors import ConfigError, DatasetError
 
-_MOST_STRETCH = 0.02  # of a projection; within a UTM zone it is at most 0.001
+_MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
+_PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
 _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
 
 
@@ -46,29 +47,42 @@ class Raster:
     name: str
     file: Any
 
+    @property
+    def says_what_is_missing(self) -> bool:
+        """Whether it declares a value, or a mask, for cells without one."""
+        return any(flag.name != "all_valid" for flags in self.file.mask_flag_enums for flag in flags)
+
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
         """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.
 
-        The CRS is its own where a metre of that is one on the ground, else that of its UTM zone.
+        The CRS is its own where a metre of that is one on the ground, all over the raster. Else it is that of
+        its UTM zone, and off the Earth a transverse Mercator projection of the raster's middle.
 
         Raises:
-            DatasetError: it has neither.
+            DatasetError: there is none, as of ground that is too large.
         """
         own, bounds = _horizontal(self.file.crs), self.file.bounds
-        x, y = (bounds.left + bounds.right) / 2, (bounds.bottom + bounds.top) / 2
-        utm = _utm_of(own, x, y)
-        crs = own if own.is_projected and own.linear_units_factor[1] == 1 else utm
-        if crs is not None and utm is not None:
-            eastings, northings = _transformed(crs, utm, [x, x + 1000, x], [y, y, y + 1000])
-            sides = np.hypot(eastings[1:] - eastings[0], northings[1:] - northings[0])
-            crs = utm if abs(sides / 1000 - 1).max() > _MOST_STRETCH else crs
-        if crs is None:
+        x, y = np.meshgrid(
+            np.linspace(bounds.left, bounds.right, 3), np.linspace(bounds.bottom, bounds.top, 3)
+        )
+        local = local_crs(own, x[1, 1], y[1, 1])
+        if local is None:
             raise DatasetError(
-                f"Expected `{self.argument}` in a projected CRS in metres, or on the Earth, got {own.to_string()} "
-                f"in {self.name}. Reproject it: rio warp --dst-crs CRS {self.name} warped.tif"
+                f"Expected `{self.argument}` in a CRS of the Earth or another body, got {own.to_string()[:80]} in "
+                f"{self.name}. If you know it, declare it: rio edit-info --crs EPSG:CODE {self.name}"
             )
-        with self.warped(crs) as warped:
-            return crs, warped.bounds, (warped.res[1], warped.res[0])
+        for crs in (own, _utm_of(own, x[1, 1], y[1, 1]), local):
+            if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
+                places = zip(*_transformed(own, crs, x.ravel().tolist(), y.ravel().tolist()), strict=True)
+                if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:
+                    with self.warped(crs) as warped:
+                        return crs, warped.bounds, (warped.res[1], warped.res[0])
+        wide, high = bounds.right - bounds.left, bounds.top - bounds.bottom
+        raise DatasetError(
+            f"Expected `{self.argument}` of ground small enough for a map whose metres are metres on the ground, got "
+            f"{self.name} of {wide:g} × {high:g} units of {own.to_string()[:80]}. "
+            f"Cut out a part: rio clip {self.name} part.tif --bounds 'WEST SOUTH EAST NORTH'"
+        )
 
     def warped(self, crs: Any, **settings: Any) -> Any:
         """The raster in another CRS; where it has no values, that shows, if need be by one more band."""
@@ -185,8 +199,63 @@ def _utm_of(crs: Any, x: float, y: float) -> Any:
     return type(crs).from_epsg((326 if latitude >= 0 else 327) * 100 + zone)
 
 
+def local_crs(crs: Any, x: float, y: float) -> Any:
+    """A transverse Mercator projection of the same body and datum, true to scale at a place; None where it has none.
+
+    Args:
+        crs: of the place, on any ellipsoid.
+        x: eastward, or longitude.
+        y: northward, or latitude.
+    """
+    base = crs.to_dict(projjson=True)
+    while "base_crs" in base or "source_crs" in base:
+        base = base.get("base_crs") or base["source_crs"]
+    if base["type"] not in ("GeographicCRS", "GeodeticCRS"):
+        return None
+    (longitude,), (latitude,) = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])
+    if not (np.isfinite(longitude) and np.isfinite(latitude)):
+        return None
+    angle, length = {"unit": "degree"}, {"unit": "metre"}
+    origin = [
+        {"name": "Latitude of natural origin", "value": latitude, **angle},
+        {"name": "Longitude of natural origin", "value": longitude, **angle},
+        {"name": "Scale factor at natural origin", "value": 1, "unit": "unity"},
+        {"name": "False easting", "value": 0, **length},
+        {"name": "False northing", "value": 0, **length},
+    ]
+    axes = [
+        {"name": "Easting", "abbreviation": "E", "direction": "east", **length},
+        {"name": "Northing", "abbreviation": "N", "direction": "north", **length},
+    ]
+    local = {
+        "type": "ProjectedCRS",
+        "name": f"Transverse Mercator at {latitude:.6f}, {longitude:.6f}",
+        "base_crs": base,
+        "conversion": {"name": "local", "method": {"name": "Transverse Mercator"}, "parameters": origin},
+        "coordinate_system": {"subtype": "Cartesian", "axis": axes},
+    }
+    return type(crs).from_user_input(json.dumps(local))
+
+
+def stretch(crs: Any, x: float, y: float) -> float:
+    """How far a metre of a projection in metres is from one on the ground at a place, in the worst direction.
+
+    Returns:
+        |scale − 1|; infinite where the place is not on the ground.
+    """
+    local = local_crs(crs, x, y)
+    if local is None:
+        return np.inf
+    steps = _PROBE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    moved = np.transpose(_transformed(crs, local, *(np.array([x, y]) + steps).T.tolist()))
+    if not np.isfinite(moved).all():
+        return np.inf
+    scales = np.linalg.svd(moved[::2] - moved[1::2], compute_uv=False) / (2 * _PROBE_M)
+    return float(np.abs(scales - 1).max())
+
+
 def _transformed(crs: Any, to: Any, x: list[float], y: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Moves places from one CRS to another; NaN where there is no way, as from another planet."""
+    """Moves places from one CRS to another; not finite where there is no way, as from another planet."""
     try:
         moved = load_rasterio().warp.transform(crs, to, x, y)
     except Exception:  # rasterio gives PROJ's failures no public class

@@ -25,6 +25,7 @@ from benchnav.errors import ConfigError, DatasetError
 _SLACK = 1e-3  # of a cell that an extent may fall short by
 _KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
 _MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
+_CLIFF = 5.67  # of 80°, metres a metre: no ground has all its cells so far from those of height 0
 _METRES = ("m", "metre", "meter", "metres", "meters")
 
 
@@ -75,6 +76,7 @@ class Survey:
         layers: by field; under `FIELD min` and `FIELD max` what is averaged there.
         known: which rows and columns of the lattice, framed by a cell, lie wholly on the elevation model.
         indices: of classes, by value of their raster; NaN for no label.
+        cliff_m: height over 0 that only cells without a value leave bare; infinite where these are declared.
         source: what the manifest says of the rasters.
     """
 
@@ -82,6 +84,7 @@ class Survey:
     layers: Mapping[str, Layer]
     known: Sequence[np.ndarray]
     indices: Mapping[int, float]
+    cliff_m: float
     source: Mapping[str, Any]
 
     def read(self, run: Run) -> tuple[np.ndarray, Maps]:
@@ -101,6 +104,12 @@ class Survey:
             if high - low > _MOST_RELIEF_M:
                 expected = f"elevations of `dem` within {_MOST_RELIEF_M:g} m on a map"
                 raise self._out_of_range("elevation_m", expected, low, high, low if low < -1000 else high)
+            heights = np.abs(framed.get("elevation_m min", framed["elevation_m"])[place])
+            least = np.min(heights, initial=np.inf, where=heights > 0)
+            if (heights == 0).any() and self.cliff_m < least < np.inf:
+                raise self._out_of_range(
+                    "elevation_m", "elevations of `dem` without a gap next to 0", low, high, 0
+                )
         (north, east), (height, width) = self.tiling.stride, self.tiling.shape
         ground[:, ~self.known[0][run.row * north :][: height + 2]] = np.nan
         for place, column in enumerate(run.columns):
@@ -203,7 +212,7 @@ def survey(
 
     def lay(field: str, raster: Raster, how: str, bands: Sequence[int] = (1,)) -> None:
         layers[field] = stack.enter_context(raster.laid(lattice, list(bands), how))
-        if how == "average" and field != "rgb":
+        if how in ("average", "cubic") and field != "rgb":
             for end in ("min", "max"):
                 layers[f"{field} {end}"] = stack.enter_context(raster.laid(lattice, list(bands), end))
 
@@ -238,7 +247,8 @@ def survey(
         for edges, size in zip(edges_m, size_m, strict=True)
     ]
     indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
-    return Survey(tiling=tiling, layers=layers, known=known, indices=indices, source=source)
+    cliff_m = np.inf if dem.says_what_is_missing else _CLIFF * max(*cell_m, step)
+    return Survey(tiling=tiling, layers=layers, known=known, indices=indices, cliff_m=cliff_m, source=source)
 
 
 def _stride(recipe: Recipe, stride_m: float | None) -> tuple[int, int]:

@@ -7,10 +7,13 @@ neither overlap nor touch.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
 
 from benchnav.errors import ConfigError, DatasetError
 
@@ -49,6 +52,35 @@ class Tiling:
     def maps(self) -> int:
         """Number of maps of all splits."""
         return sum(len(strip) for strip in self.strips.values()) * min(self.tiles)
+
+    @property
+    def overlaps(self) -> bool:
+        """Whether neighbouring maps show some of the same ground."""
+        return any(step < size for step, size in zip(self.stride, self.shape, strict=True))
+
+    def groups(self, numbers: Sequence[int]) -> np.ndarray:
+        """Finds which maps overlap, directly or by others between them.
+
+        Args:
+            numbers: of some maps, as they are numbered in the ground.
+
+        Returns:
+            For each the least number of a map of its group, int64, shape of `numbers`.
+        """
+        # A map is drawn on every second place of a lattice as a block that reaches to the last map that it overlaps.
+        # So blocks share a place just where maps overlap, and never touch where they do not.
+        reach = [2 * (-(-size // step) - 1) for size, step in zip(self.shape, self.stride, strict=True)]
+        own = np.asarray(numbers, dtype=np.int64)
+        corners = tuple(2 * place for place in np.divmod(own, self.tiles[1]))
+        drawn = np.zeros(
+            [2 * tiles + most for tiles, most in zip(self.tiles, reach, strict=True)], dtype=np.uint8
+        )
+        drawn[corners] = 1
+        for axis, most in enumerate(reach):
+            drawn = ndimage.maximum_filter1d(drawn, most + 1, axis, origin=most // 2, mode="constant")
+        parts = ndimage.label(drawn)[0][corners]
+        _, firsts, inverse = np.unique(parts, return_index=True, return_inverse=True)
+        return own[firsts][inverse]
 
     @property
     def between(self) -> int:

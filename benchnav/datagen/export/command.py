@@ -3,8 +3,6 @@
 This module imports nothing heavy, so that the command's help is quick.
 """
 
-from pathlib import Path
-
 
 def export(
     file: str,
@@ -26,8 +24,8 @@ def export(
         splits: Only these splits, for example [test/std,test/hg].
         fields: Only these fields, for example [rgb,class_id].
         maps_per_file: Most maps of a file; 0 makes files of a few hundred MB at most.
-        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; MIT when not given. Imported maps need one.
-        creator: Who made the maps; the BenchNav authors when not given. Imported maps need one.
+        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; of maps of a shipped recipe MIT when not given.
+        creator: Who made the maps; of maps of a shipped recipe the BenchNav authors when not given.
         url: Where the dataset will be found.
         date: Date of publication, YYYY-MM-DD; today when not given.
         overwrite: Replace an exported dataset that is there.
@@ -35,21 +33,21 @@ def export(
     from rich.filesize import decimal
 
     from benchnav.command import show_progress
-    from benchnav.datagen.export.croissant import AUTHORS, Publication
+    from benchnav.datagen.export.croissant import AUTHORS, Publication, is_ours
     from benchnav.datagen.export.export import export as export_dataset
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
+    from benchnav.files import output_path
 
     dataset = TerrainDataset(find_dataset(file))
-    chosen = dataset.splits if splits is None else [name for name in splits if name in dataset.splits]
-    imported = any("source" in part for name in chosen for part in dataset.splits[name]["parts"])
-    if imported and not (license and creator):
+    chosen = list(dataset.splits) if splits is None else [name for name in splits if name in dataset.splits]
+    if not is_ours(dataset, chosen) and not (license and creator):
         raise ConfigError(
-            f"Expected `license` and `creator` of {dataset.id}, whose maps were imported, got none. Pass those of "
-            "the elevation model, its classes and photo."
+            f"Expected `license` and `creator` of {dataset.id}, whose maps are not of a shipped recipe, got none. Pass "
+            "yours; of imported maps those of the elevation model, its classes and photo."
         )
     publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
-    path = Path(out).expanduser()
+    path = output_path(out)
     steps = export_dataset(dataset, path, publication, splits, fields, maps_per_file, overwrite)
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))

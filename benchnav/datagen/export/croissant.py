@@ -7,15 +7,15 @@ import datetime
 import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from benchnav.datagen import schema
 from benchnav.datagen.export.parquet import FOLDER, MAP
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
 from benchnav.errors import ConfigError
 
 METADATA = "croissant.json"
@@ -91,6 +91,21 @@ class Publication:
         return self.license if is_url else f"https://spdx.org/licenses/{self.license}.html"
 
 
+def is_ours(dataset: TerrainDataset, splits: Sequence[str]) -> bool:
+    """Whether all maps of some splits were made by shipped recipes as they are."""
+    parts = [part for split in splits for part in dataset.splits[split]["parts"]]
+    if not all("recipe" in part for part in parts):
+        return False
+    made = {part["recipe"] for part in parts}
+    recipes = [recipe_from_dict(dataset.manifest["recipes"][number], f"in {dataset.path}") for number in made]
+    # How many maps there are of a split, and which splits, may differ: `create` has options for that.
+    return all(
+        recipe.id in shipped_recipes()
+        and replace(recipe, splits=load_recipe(recipe.id).splits) == load_recipe(recipe.id)
+        for recipe in recipes
+    )
+
+
 def describe(dataset: TerrainDataset, splits: Sequence[str]) -> str:
     """One sentence or two on what the maps are and where they come from."""
     grid, maps = dataset.grid, sum(dataset.map_count(split) for split in splits)
@@ -137,7 +152,7 @@ def metadata(
         "datePublished": publication.date,
         **({"version": f"{found[1]}.0.0"} if found else {}),
         "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
-        "citeAs": PAPER,
+        **({"citeAs": PAPER} if is_ours(dataset, list(names)) else {}),
         "distribution": [item for name, own in files.items() for item in _distribution(name, own, folder)],
         "recordSet": [
             _classes(dataset),
@@ -190,7 +205,7 @@ def _maps(
     about = dataset.splits[split]
     columns = [column(MAP, "sc:Integer", "number of the map in its split")]
     for of in fields:
-        field = schema.FIELDS[of]
+        field = dataset.fields[of]
         shape = field.entry_shape(*dataset.grid.shape)
         words = [field.meaning] + ([f"in {field.unit}"] if field.unit != "1" else [])
         words += [f"nested lists of shape {list(shape)}"] if shape else []
@@ -251,8 +266,10 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
         publication: licence, creator, place and date.
     """
     is_url = publication.license.startswith("http")
+    ours = is_ours(dataset, list(names))
+    title = f"BenchNav {dataset.id}" if ours else dataset.id
     head = {
-        "pretty_name": f"BenchNav {dataset.id}",
+        "pretty_name": title,
         "license": "other" if is_url else publication.license.lower(),
         **({"license_link": publication.license} if is_url else {}),
         "tags": ["robotics", "off-road-navigation", "traversability", "terrain"],
@@ -272,13 +289,13 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
     return "\n".join(
         [
             f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---\n",
-            f"# BenchNav {dataset.id}\n",
+            f"# {title}\n",
             f"{describe(dataset, list(names))}\n",
             f"A row is a map; arrays are nested lists. `{METADATA}` describes the columns and holds the SHA-256 of",
             "each file. The metadata of each Parquet file holds the recipes that make the maps again.\n",
             "| split here | split of the dataset | maps | digest of the dataset's maps |\n|---|---|---|---|",
             *rows,
             f"\nLicence: [{publication.license}]({publication.license_url}).\n",
-            f"```bibtex\n{PAPER}\n```\n",
+            *([f"```bibtex\n{PAPER}\n```\n"] if ours else []),
         ]
     )

@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from benchnav.datagen import schema
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
 from benchnav.datagen.files.hdf5 import named_errors
@@ -33,7 +32,7 @@ def export(
         out: the folder, which takes its name when it is whole.
         publication: licence, creator, place and date; without a date that of today.
         splits: which splits, in the dataset's order; None for all.
-        fields: which fields, in the order of `schema.FIELDS`; None for all.
+        fields: which of its fields, in their order; None for all.
         maps_a_file: most maps of a file; 0 for as many as make a file of a few hundred MB at most.
         overwrite: replace an exported dataset that is there.
 
@@ -41,7 +40,7 @@ def export(
         DatasetError: no such split or field, the dataset is damaged, or `out` is there or cannot be written.
     """
     names = split_names(_chosen("splits", splits, list(dataset.splits)))
-    columns = _chosen("fields", fields, list(schema.FIELDS))
+    columns = _chosen("fields", fields, list(dataset.fields))
     if maps_a_file < 0:
         raise DatasetError(f"Expected `maps_per_file` ≥ 0, got {maps_a_file}.")
     if not publication.date:

@@ -49,7 +49,7 @@ def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> 
     Args:
         dataset: where the split is.
         split: its name there.
-        fields: which fields of `schema.FIELDS`, in the order of the columns.
+        fields: which fields, in the order of the columns.
     """
     manifest = dataset.manifest
     about = {
@@ -61,13 +61,14 @@ def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> 
         "scenario": dataset.splits[split]["scenario"],
         "maps": dataset.map_count(split),
         "digest": dataset.splits[split]["digest"],
+        "truth": dataset.truth_of(split),
         "parts": dataset.splits[split]["parts"],
         "recipes": manifest["recipes"],
     }
     number = _column(MAP, pa.int64(), [], "1", "number of the map in its split")
     columns = []
     for name in fields:
-        field = schema.FIELDS[name]
+        field = dataset.fields[name]
         shape = field.entry_shape(*dataset.grid.shape)
         columns.append(_column(name, _nested_type(field.dtype, shape), shape, field.unit, field.meaning))
     return pa.schema([number, *columns], {"benchnav": json.dumps(about)})

@@ -74,7 +74,8 @@ def find_faults(path: str | Path) -> list[Fault]:
 
 
 def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
-    digest = schema.SplitDigest(dataset.map_count(split), *dataset.grid.shape)
+    own = dataset.fields
+    digest = schema.SplitDigest(dataset.map_count(split), *dataset.grid.shape, own)
     unlike: list[Fault] = []  # maps that do not match the digests beside them
     readable = True
     for piece in dataset.pieces(split):
@@ -88,29 +89,29 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
         with file:
             sound, faults = _arrays(file, split, piece.maps, dataset)
             yield from (replace(fault, file=name) for fault in faults)
-            readable = readable and set(schema.FIELDS) <= set(sound)
+            readable = readable and set(own) <= set(sound)
             for start, maps in _read_some(sound, piece.maps):
                 first = piece.first + start
                 yield from (
                     Fault(split, first, field, "is damaged", name) for field in sound if field not in maps
                 )
-                fields = [field for field in schema.FIELDS if field in maps]
+                fields = {name: field for name, field in own.items() if name in maps}
                 classes = len(dataset.recipe.classes)
                 unlabelled = schema.has_unlabelled(dataset.splits[split])
                 for field in fields:
-                    faulty = _out_of_range(field, maps[field], classes, unlabelled)
+                    faulty = _out_of_range(field, fields[field], maps[field], classes, unlabelled)
                     yield from (Fault(split, first + i, field, "is out of range", name) for i in faulty)
-                readable = readable and len(fields) == len(schema.FIELDS)
+                readable = readable and len(fields) == len(own)
                 if not fields:
                     continue
                 digests = schema.entry_digests(maps, fields)
                 if readable:
                     digest.update(digests)
                 if schema.ENTRY_DIGESTS in maps:
-                    columns = [list(schema.FIELDS).index(field) for field in fields]
+                    columns = [list(own).index(field) for field in fields]
                     differ = (digests != maps[schema.ENTRY_DIGESTS][:, columns]).any(axis=2)
                     unlike += [
-                        Fault(split, first + index, fields[column], "does not match its digest", name)
+                        Fault(split, first + index, list(fields)[column], "does not match its digest", name)
                         for index, column in np.argwhere(differ).tolist()
                     ]
     if readable and digest.hexdigest() == dataset.splits[split]["digest"]:
@@ -128,9 +129,9 @@ def _arrays(
     file: h5py.File, split: str, maps: int, dataset: TerrainDataset
 ) -> tuple[dict[str, h5py.Dataset], list[Fault]]:
     """The arrays of a split in a file that are as they should be, and what is wrong with the others."""
-    shapes = {name: field.entry_shape(*dataset.grid.shape) for name, field in schema.FIELDS.items()}
-    wanted = {name: (field.dtype, shapes[name]) for name, field in schema.FIELDS.items()}
-    wanted[schema.ENTRY_DIGESTS] = ("|u1", (len(schema.FIELDS), schema.DIGEST_BYTES))
+    shapes = {name: field.entry_shape(*dataset.grid.shape) for name, field in dataset.fields.items()}
+    wanted = {name: (field.dtype, shapes[name]) for name, field in dataset.fields.items()}
+    wanted[schema.ENTRY_DIGESTS] = ("|u1", (len(dataset.fields), schema.DIGEST_BYTES))
     sound, faults = {}, []
     for name, (dtype, entry) in wanted.items():
         try:
@@ -164,13 +165,15 @@ def _read_some(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int
                 yield index, readable
 
 
-def _out_of_range(name: str, values: np.ndarray, classes: int, unlabelled: bool) -> list[int]:
+def _out_of_range(
+    name: str, field: schema.Field, values: np.ndarray, classes: int, unlabelled: bool
+) -> list[int]:
     """Which maps have a value that may not be."""
-    field = schema.FIELDS[name]
     most = classes - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
     if name == "class_id" and unlabelled:
         allowed |= values == schema.UNLABELLED
-    if name in ("reference_time_s", "traversability"):  # not asked for; not observed
+    # Not asked for; not observed; what a field that is not ours means by it, it may mean.
+    if name in ("reference_time_s", "traversability") or name not in schema.FIELDS | schema.OPTIONAL:
         allowed |= np.isnan(values)
     return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

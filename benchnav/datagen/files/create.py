@@ -113,7 +113,7 @@ def join(path: Path, contents: Contents) -> None:
         contents: what it is to hold.
     """
     room = sum(file.stat().st_size for files in contents.files.values() for file in files)
-    with writing(path, contents.id, contents.recipes, contents.splits, room) as writer:
+    with writing(path, contents.id, contents.recipes, contents.splits, contents.fields, room) as writer:
         for split, files in contents.files.items():
             for file in files:
                 with open_file(file) as stored:

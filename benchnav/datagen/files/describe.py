@@ -11,6 +11,11 @@ from rich.table import Table
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, open_file
 
+_DIGESTS = {
+    "digest": "content digests",
+    "recorded_digest": "digests that models record: of content, class table, λ_stuck, resolution and kind of truth",
+}
+
 
 def describe(dataset: TerrainDataset) -> dict[str, Any]:
     """Gathers what `show` shows, ready for JSON."""
@@ -30,7 +35,15 @@ def describe(dataset: TerrainDataset) -> dict[str, Any]:
         "synthesis": recipe.synthesis,
         "places": None if recipe.places is None else asdict(recipe.places),
         "correlation_m": recipe.correlation_m,
-        "splits": {name: {**entry, "stored_bytes": stored[name]} for name, entry in dataset.splits.items()},
+        "splits": {
+            name: {
+                **entry,
+                "stored_bytes": stored[name],
+                "truth": dataset.truth_of(name),
+                "recorded_digest": dataset.split_digest(name),
+            }
+            for name, entry in dataset.splits.items()
+        },
         "classes": [asdict(item) for item in recipe.classes],
         "fields": manifest["fields"],
         "recipes": manifest["recipes"],
@@ -42,7 +55,7 @@ def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
     for piece in dataset.pieces(split):
         with open_file(piece.path) as file:
             try:
-                for name in schema.FIELDS:
+                for name in dataset.field_names:
                     total += file[split][name].id.get_storage_size()
             except READ_ERRORS as error:
                 raise damage(piece.path, split, name, error) from error
@@ -62,15 +75,24 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
         f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
     )
     yield _making(described)
-    splits = Table("split", "scenario", "maps", "MB", "made from", title="splits")
+    splits = Table("split", "scenario", "maps", "MB", "truth of λ", "made from", title="splits")
     for name, entry in described["splits"].items():
         origin = ", ".join(_origin(described, part) for part in entry["parts"])
         splits.add_row(
-            name, entry["scenario"], str(entry["maps"]), f"{entry['stored_bytes'] / 1e6:.1f}", origin
+            name,
+            entry["scenario"],
+            str(entry["maps"]),
+            f"{entry['stored_bytes'] / 1e6:.1f}",
+            entry["truth"],
+            origin,
         )
     yield splits
-    yield "content digests"
-    yield from (f"  {name:12} {entry['digest']}" for name, entry in described["splits"].items())
+    extra = [name for name in described["fields"] if name not in schema.FIELDS]
+    if extra:
+        yield f"fields beside those of every dataset: {', '.join(extra)}"
+    for key, title in _DIGESTS.items():
+        yield title
+        yield from (f"  {name:12} {entry[key]}" for name, entry in described["splits"].items())
     soft = any(item["soft"] for item in described["classes"])
     heads = ["id", "class", "colour", "a", "b", "o", "σ"]
     if soft:

@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.files import write_text
 
-FORMAT_VERSION = "1.2"
+FORMAT_VERSION = "1.2"  # at least
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,12 +25,14 @@ class Contents:
         recipes: what the splits' parts refer to by number.
         splits: by name, the manifest's entry of each split without its digest.
         files: by split the files that hold its maps, in their order, each under the split's name.
+        fields: what every map has.
     """
 
     id: str
     recipes: Sequence[Recipe]
     splits: Mapping[str, Mapping[str, Any]]
     files: Mapping[str, Sequence[Path]]
+    fields: Mapping[str, schema.Field] = field(default_factory=lambda: schema.FIELDS)
 
 
 def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
@@ -57,15 +59,15 @@ def write_manifest(folder: Path, contents: Contents) -> None:
     splits: dict[str, Any] = {}
     shards: dict[str, list[dict[str, Any]]] = {}
     for name, entry in contents.splits.items():
-        digest, shards[name] = schema.SplitDigest(entry["maps"], height, width), []
+        digest, shards[name] = schema.SplitDigest(entry["maps"], height, width, contents.fields), []
         for path in contents.files[name]:
             with open_file(path) as file:
                 digests = file[name][schema.ENTRY_DIGESTS][:]
             digest.update(digests)
             shards[name].append({"file": path.name, "maps": len(digests)})
         splits[name] = {**entry, "digest": digest.hexdigest()}
-    manifest = manifest_of(contents.id, contents.recipes, splits)
-    manifest |= {"format_version": FORMAT_VERSION, "shards": shards}
+    manifest = manifest_of(contents.id, contents.recipes, splits, contents.fields)
+    manifest |= {"format_version": max(manifest["format_version"], FORMAT_VERSION), "shards": shards}
     write_text(folder / FOLDER_MANIFEST, schema.seal(manifest))
 
 

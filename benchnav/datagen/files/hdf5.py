@@ -37,6 +37,7 @@ class Writer:
         dataset_id: name and version of the dataset.
         recipes: what the splits' parts refer to by number. The first gives grid and class table.
         splits: by name, the manifest's entry of each split without its digest.
+        fields: what every map has.
     """
 
     def __init__(
@@ -45,32 +46,34 @@ class Writer:
         dataset_id: str,
         recipes: Sequence[Recipe],
         splits: Mapping[str, Mapping[str, Any]],
+        fields: Mapping[str, schema.Field],
     ) -> None:
         """Makes the empty arrays."""
         self._file, self._id, self._recipes, self._splits = file, dataset_id, recipes, splits
+        self._fields = fields
         height, width = recipes[0].grid.shape
         # Kept until all is written: HDF5 writes an array out when it is let go.
         self._arrays = {
-            name: _new_arrays(file.create_group(name), entry["maps"], height, width)
+            name: _new_arrays(file.create_group(name), entry["maps"], height, width, fields)
             for name, entry in splits.items()
         }
         self._digests = {
-            name: schema.SplitDigest(entry["maps"], height, width) for name, entry in splits.items()
+            name: schema.SplitDigest(entry["maps"], height, width, fields) for name, entry in splits.items()
         }
         self._written = dict.fromkeys(splits, 0)
 
     def add(self, split: str, maps: Mapping[str, np.ndarray]) -> None:
-        """Writes the next maps of a split, every field of `schema.FIELDS` of shape [B, *entry shape]."""
-        digests = schema.entry_digests(maps)
-        for name in schema.FIELDS:
+        """Writes the next maps of a split, every field of shape [B, *entry shape]."""
+        digests = schema.entry_digests(maps, self._fields)
+        for name in self._fields:
             self._put(split, name, maps[name])
         self._finish(split, digests)
 
     def copy(self, split: str, stored: h5py.Group) -> None:
         """Writes all maps of a stored split as the next ones; what is packed alike is not unpacked."""
-        for name in schema.FIELDS:
+        for name, field in self._fields.items():
             target = self._arrays[split][name]
-            if name in schema.MAP_FIELDS and _packing(stored[name]) == _packing(target):
+            if "H" in field.shape and _packing(stored[name]) == _packing(target):
                 _copy_chunks(stored[name], target, self._written[split])
             else:
                 self._put(split, name, stored[name][:])
@@ -82,7 +85,7 @@ class Writer:
         splits = {
             name: {**entry, "digest": self._digests[name].hexdigest()} for name, entry in self._splits.items()
         }
-        text = schema.seal(manifest_of(self._id, self._recipes, splits)).encode()
+        text = schema.seal(manifest_of(self._id, self._recipes, splits, self._fields)).encode()
         self._file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
         self._file.flush()
 
@@ -97,15 +100,20 @@ class Writer:
 
 
 def manifest_of(
-    dataset_id: str, recipes: Sequence[Recipe], splits: Mapping[str, Mapping[str, Any]]
+    dataset_id: str,
+    recipes: Sequence[Recipe],
+    splits: Mapping[str, Mapping[str, Any]],
+    fields: Mapping[str, schema.Field],
 ) -> dict[str, Any]:
     """The manifest of a dataset, of splits with their digests."""
     return {
         "format": schema.FORMAT,
-        "format_version": schema.version_of([recipe.synthesis for recipe in recipes], splits.values()),
+        "format_version": schema.version_of(
+            [recipe.synthesis for recipe in recipes], splits.values(), fields
+        ),
         "id": dataset_id,
         "generator": {"package": "benchnav", "version": benchnav.__version__},
-        "fields": schema.field_table(*recipes[0].grid.shape),
+        "fields": schema.field_table(*recipes[0].grid.shape, fields),
         "splits": dict(splits),
         "recipes": [recipe.to_dict() for recipe in recipes],
     }
@@ -121,10 +129,10 @@ def pack(
         recipe: by which they were made.
         split: name of the split.
         entry: the manifest's entry of the split without its digest.
-        maps: every field of `schema.FIELDS` of shape [B, *entry shape].
+        maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
     """
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
-        writer = Writer(file, dataset_id, [recipe], {split: entry})
+        writer = Writer(file, dataset_id, [recipe], {split: entry}, schema.fields_in(maps))
         writer.add(split, maps)
         writer.close()
         return file.id.get_file_image()
@@ -155,6 +163,7 @@ def writing(
     dataset_id: str,
     recipes: Sequence[Recipe],
     splits: Mapping[str, Mapping[str, Any]],
+    fields: Mapping[str, schema.Field],
     room: int,
 ) -> Iterator[Writer]:
     """Writes a dataset file that takes its place when it is whole.
@@ -164,13 +173,14 @@ def writing(
         dataset_id: name and version of the dataset.
         recipes: what the splits' parts refer to by number. The first gives grid and class table.
         splits: by name, the manifest's entry of each split without its digest.
+        fields: what every map has.
         room: bytes that the maps take at most.
     """
     room += _SPARE_BYTES + _SPARE_BYTES_A_MAP * sum(entry["maps"] for entry in splits.values())
     with replacing(path) as unfinished:
         with h5py.File(unfinished, "w", libver=_LIBRARY) as file:
             _reserve(unfinished, room)
-            writer = Writer(file, dataset_id, recipes, splits)
+            writer = Writer(file, dataset_id, recipes, splits, fields)
             yield writer
             writer.close()
             size = file.id.get_filesize()
@@ -201,24 +211,23 @@ def named_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _new_arrays(group: h5py.Group, maps: int, height: int, width: int) -> dict[str, h5py.Dataset]:
+def _new_arrays(
+    group: h5py.Group, maps: int, height: int, width: int, fields: Mapping[str, schema.Field]
+) -> dict[str, h5py.Dataset]:
     """The empty arrays of a split, those of cells with a map a chunk."""
-    shapes = {name: field.entry_shape(height, width) for name, field in schema.FIELDS.items()}
-    kinds = {name: field.dtype for name, field in schema.FIELDS.items()}
-    shapes[schema.ENTRY_DIGESTS], kinds[schema.ENTRY_DIGESTS] = (
-        (len(schema.FIELDS), schema.DIGEST_BYTES),
-        "|u1",
-    )
+    shapes = {name: field.entry_shape(height, width) for name, field in fields.items()}
+    kinds = {name: field.dtype for name, field in fields.items()}
+    shapes[schema.ENTRY_DIGESTS], kinds[schema.ENTRY_DIGESTS] = (len(fields), schema.DIGEST_BYTES), "|u1"
     arrays = {}
     for name, entry in shapes.items():
-        chunk = 1 if name in schema.MAP_FIELDS else max(1, min(maps, _VALUES_A_CHUNK))
+        chunk = 1 if name in fields and "H" in fields[name].shape else max(1, min(maps, _VALUES_A_CHUNK))
         arrays[name] = group.create_dataset(
             name, (maps, *entry), kinds[name], chunks=(chunk, *entry),
             shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
         )  # fmt: skip
-        if name in schema.FIELDS:
-            arrays[name].attrs["unit"] = schema.FIELDS[name].unit
-            arrays[name].attrs["meaning"] = schema.FIELDS[name].meaning
+        if name in fields:
+            arrays[name].attrs["unit"] = fields[name].unit
+            arrays[name].attrs["meaning"] = fields[name].meaning
     return arrays
 
 

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from benchnav.datagen import schema
 from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, find_dataset, open_file
 from benchnav.errors import DatasetError
 
@@ -29,7 +28,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
     Args:
         path: dataset file or folder, or the id of one at hand.
         split: name of one of its splits.
-        fields: names of `schema.FIELDS`.
+        fields: names among `TerrainDataset.field_names`.
         in_memory: read all maps at once, here; worth it for what is read many times.
 
     Raises:
@@ -49,10 +48,10 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
             split,
             tuple(fields),
         )
-        unknown = sorted(set(fields) - set(schema.FIELDS))
+        unknown = sorted(set(fields) - set(self.dataset.field_names))
         if unknown or not fields:
             raise DatasetError(
-                f"Expected `fields` among {list(schema.FIELDS)}, got {unknown or list(fields)}."
+                f"Expected `fields` among {list(self.dataset.field_names)}, got {unknown or list(fields)}."
             )
         self._maps = self.dataset.map_count(split)
         self._pieces = self.dataset.pieces(split)

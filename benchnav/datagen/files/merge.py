@@ -105,7 +105,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
         ]
         for split in splits
     }
-    return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files)
+    return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files, fields=datasets[0].fields)
 
 
 def _of_shares(folders: Sequence[Path]) -> Contents:
@@ -158,6 +158,9 @@ def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
 
 
 def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]:
+    if first.fields != second.fields:
+        extra = sorted(set(first.fields) ^ set(second.fields)) or ["fields"]
+        yield f"unlike fields ({', '.join(extra)} of one alone)"
     for name in _SHARED:
         ours, theirs = getattr(first.recipe, name), getattr(second.recipe, name)
         if ours != theirs:
@@ -192,7 +195,7 @@ def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
 
 def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
     """The digests of all elevation maps, shape [N]."""
-    column = list(schema.FIELDS).index("elevation_m")
+    column = dataset.field_names.index("elevation_m")
     digests = [dataset.entry_digests(split)[:, column] for split in dataset.splits]
     return np.ascontiguousarray(np.concatenate(digests)).view(f"S{schema.DIGEST_BYTES}").ravel()
 
@@ -220,7 +223,9 @@ def _check(dataset: TerrainDataset, split: str) -> Iterator[int]:
         DatasetError: one does not match.
     """
     for indices, maps in dataset.chunks(split):
-        if not np.array_equal(dataset.entry_digests(split, indices), schema.entry_digests(maps)):
+        if not np.array_equal(
+            dataset.entry_digests(split, indices), schema.entry_digests(maps, dataset.fields)
+        ):
             raise DatasetError(
                 f"Maps of split {split!r} in {dataset.path} do not match their digests. "
                 "Run `benchnav-datagen validate` on it, which says how to make it anew."

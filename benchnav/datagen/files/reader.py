@@ -1,16 +1,17 @@
-"""Reading datasets of formats 1.0 to 1.2: a file (HDF5), or a folder of such files with one manifest.
+"""Reading datasets of formats 1.0 to 1.3: a file (HDF5), or a folder of such files with one manifest.
 
 Readers open files at each call, so they may be passed to other processes. PyTorch is imported where Terrain is
 asked for. Letters in shapes: B maps.
 """
 
+import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import h5py
 import numpy as np
@@ -82,10 +83,63 @@ class TerrainDataset:
         """Size and resolution of every map."""
         return self.recipe.grid
 
+    @cached_property
+    def fields(self) -> dict[str, schema.Field]:
+        """What every map has, by name: those of `schema.FIELDS`, and others that this dataset lists."""
+        return schema.read_field_table(self.manifest["fields"])
+
+    @property
+    def field_names(self) -> tuple[str, ...]:
+        """Names of `fields`."""
+        return tuple(self.fields)
+
+    @property
+    def truth(self) -> Literal["generated", "unknown"]:
+        """Whether the distribution of λ in each cell is known, `truth_of` all splits."""
+        known = all(self.truth_of(split) == "generated" for split in self.splits)
+        return "generated" if known else "unknown"
+
+    def truth_of(self, split: str) -> Literal["generated", "unknown"]:
+        """Whether the distribution of λ in each cell of a split is known.
+
+        Returns:
+            "generated" where a recipe made all its maps, λ by its class table; "unknown" where some were imported:
+            the class table says nothing of real ground, whether or not λ was measured there.
+
+        Raises:
+            DatasetError: there is no such split.
+        """
+        self.map_count(split)
+        known = all(_truth(part) == "generated" for part in self.splits[split]["parts"])
+        return "generated" if known else "unknown"
+
+    def about_digest(self, split: str) -> str:
+        """SHA-256 of what numbers on a split rest on beside its maps: class table, λ_stuck, resolution, kind of truth.
+
+        Raises:
+            DatasetError: there is no such split.
+        """
+        about = {
+            "classes": [asdict(item) for item in self.recipe.classes],
+            "stuck_threshold": self.recipe.stuck_threshold,
+            "resolution_m": self.recipe.resolution_m,
+            "truth": self.truth_of(split),
+        }
+        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+    def split_digest(self, split: str) -> str:
+        """SHA-256 of a split's maps and of what they mean, which models and results record: `about_digest` too.
+
+        Raises:
+            DatasetError: there is no such split.
+        """
+        about = self.about_digest(split)
+        return hashlib.sha256(f"{self.splits[split]['digest']} {about}".encode()).hexdigest()
+
     @property
     def digest(self) -> str:
-        """One digest for the file's splits, as `split:digest` joined in the manifest's order."""
-        return ",".join(f"{name}:{split['digest']}" for name, split in self.splits.items())
+        """One digest for the dataset, as `split:split_digest` joined in the manifest's order."""
+        return ",".join(f"{name}:{self.split_digest(name)}" for name in self.splits)
 
     def read(
         self, split: str, indices: Sequence[int] | None = None, fields: Iterable[str] | None = None
@@ -95,7 +149,7 @@ class TerrainDataset:
         Args:
             split: name of a split.
             indices: which maps, in any order; None for all.
-            fields: which fields of `schema.FIELDS`; None for all.
+            fields: which of `field_names`; None for all.
 
         Returns:
             Arrays by field, each of shape [B, *entry shape].
@@ -104,10 +158,10 @@ class TerrainDataset:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
         size = self.map_count(split)
-        names = tuple(schema.FIELDS if fields is None else fields)
-        unknown = [name for name in names if name not in schema.FIELDS]
+        names = self.field_names if fields is None else tuple(fields)
+        unknown = [name for name in names if name not in self.fields]
         if unknown:
-            raise DatasetError(f"Expected `fields` among {list(schema.FIELDS)}, got {unknown}.")
+            raise DatasetError(f"Expected `fields` among {list(self.fields)}, got {unknown}.")
         if indices is not None:
             chosen = np.asarray(indices)
             whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
@@ -183,10 +237,29 @@ class TerrainDataset:
             read = {}
             for name in names:
                 try:
-                    read[name] = _values(file[split][name], which)
+                    array = file[split][name]
+                    self._check_array(name, array, piece.maps)
+                    read[name] = _values(array, which)
+                    self._check_classes(read)
                 except READ_ERRORS as error:
                     raise damage(piece.path, split, name, error) from error
             return read
+
+    def _check_array(self, name: str, array: h5py.Dataset, maps: int) -> None:
+        """Refuses, by a ValueError, an array that is not what the manifest says."""
+        if name == schema.ENTRY_DIGESTS:
+            kind, shape = "|u1", [maps, len(self.fields), schema.DIGEST_BYTES]
+        else:
+            field = self.fields[name]
+            kind, shape = field.dtype, [maps, *field.entry_shape(*self.grid.shape)]
+        if array.dtype.str != kind or list(array.shape) != shape:
+            raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {shape}")
+
+    def _check_classes(self, read: Maps) -> None:
+        """Refuses, by a ValueError, classes that the table lacks."""
+        found = read.get("class_id", np.empty(0))
+        if ((found >= len(self.recipe.classes)) & (found != schema.UNLABELLED)).any():
+            raise ValueError(f"it has classes beyond {len(self.recipe.classes) - 1}")
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
@@ -246,8 +319,10 @@ def read_manifest(path: Path) -> dict[str, Any]:
         kind, version = manifest["format"], manifest["format_version"]
         major, minor = (int(part) for part in version.split("."))
         if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
-            return schema.unseal(text)
-    except (*READ_ERRORS, TypeError, AttributeError) as error:
+            manifest = schema.unseal(text)
+            schema.check(manifest)
+            return manifest
+    except (*READ_ERRORS, TypeError, AttributeError, IndexError) as error:
         raise DatasetError(
             f"The manifest of {path} is damaged: {str(error)[:200]}. Make the dataset again."
         ) from error
@@ -280,6 +355,11 @@ def _manifest_text(path: Path) -> str | bytes:
         if schema.MANIFEST not in file:
             raise DatasetError(f"Expected a {schema.FORMAT} file with a manifest, got {path} without one.")
         return file[schema.MANIFEST][()]
+
+
+def _truth(part: dict[str, Any]) -> str:
+    """Whether the truth of a part is known; files before 1.3 do not say it of what they import."""
+    return "generated" if "recipe" in part else part["source"].get("truth", "unknown")
 
 
 def _joined(parts: Sequence[Maps]) -> Maps:

@@ -28,6 +28,8 @@ def check_recipe(recipe: "Recipe") -> None:
     """
     if recipe.synthesis not in (1, 2):
         raise ConfigError(f"Expected `synthesis` 1 or 2, got {recipe.synthesis}.")
+    if not 0 <= recipe.seed < 2**63:
+        raise ConfigError(f"Expected `seed` in 0–2^63 − 1, got {recipe.seed}.")
     if not 0 <= recipe.stuck_threshold < 1:
         raise ConfigError(f"Expected `stuck_threshold` in [0, 1), got {recipe.stuck_threshold}.")
     _check_places(recipe)

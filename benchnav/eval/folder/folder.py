@@ -32,6 +32,12 @@ RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
 
 _METADATA = b"benchnav"
 
+# What reading a damaged file raises: of a trial's rules and world what refuses a suite, of a table its library's.
+_DAMAGE = (
+    *(ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError, OSError),
+    *(ConfigError, pa.ArrowException),
+)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
@@ -139,20 +145,7 @@ def _damaged(path: Path, remedy: str) -> Iterator[None]:
         yield
     except PermissionError:
         raise
-    # Of a trial's rules and world what refuses a suite; of a table what its library raises.
-    except (
-        *(
-            ValueError,
-            TypeError,
-            KeyError,
-            AttributeError,
-            OverflowError,
-            RecursionError,
-            MemoryError,
-            OSError,
-        ),
-        *(ConfigError, pa.ArrowException),
-    ) as error:
+    except _DAMAGE as error:
         said = error if isinstance(error, schema.DamageError | ConfigError) else one_line(error)
         raise ConfigError(f"{path} is damaged: {said}. {remedy}") from error
 

@@ -118,22 +118,74 @@ def describe_maps(trials: Trials) -> dict[str, Any]:
         data: {
             "id": datasets[data].id,
             "maps": {split: _map_digests(datasets[data], split, count) for split, count in splits.items()},
+            "about": {split: datasets[data].about_digest(split) for split in splits},
         }
         for data, splits in used.items()
     }
 
 
 def describe_parts(trials: Trials) -> dict[str, Any]:
-    """Models by the digests of their files, and parts that are not ours by origin and digest."""
+    """Models by the digests of their files, parts that are not ours by origin and digest, files that options name."""
     described: dict[str, Any] = {}
     for trial, _ in trials.values():
-        described[f"model {trial.model.part}"] = model_identity(trial.model.part)
-        for kind in PART_KINDS[1:]:
-            source = getattr(trial, kind).part
-            found = registry.find(kind, source)
-            if not found.shipped:
-                described[f"{kind} {source}"] = {"origin": found.origin, "digest": found.digest}
-    return described
+        for kind in PART_KINDS:
+            part = getattr(trial, kind)
+            name = f"{kind} {part.part}"
+            if kind == "model" and name not in described:
+                described[name] = model_identity(part.part)
+            elif name not in described:
+                found = registry.find(kind, part.part)
+                described[name] = {} if found.shipped else {"origin": found.origin, "digest": found.digest}
+            for text, digest in registry.option_files(kind, part).items():
+                described[f"{text} of {name}"] = {"digest": digest}
+    return {name: identity for name, identity in described.items() if identity}
+
+
+def code_of(about: Mapping[str, Any], trial: Trial) -> dict[str, Any]:
+    """What rows of a trial depend on beside its value and its maps, by what people call it.
+
+    Args:
+        about: the `run.json` of its run.
+        trial: of the run.
+    """
+    used = {
+        f"{kind} {getattr(trial, kind).part}": json.dumps(dict(getattr(trial, kind).options))
+        for kind in PART_KINDS
+    }
+
+    def bears(name: str) -> bool:
+        named = ((name.removesuffix(f" of {owner}"), options) for owner, options in used.items())
+        return name in used or any(text != name and json.dumps(text) in options for text, options in named)
+
+    parts = {name: identity for name, identity in about.get("parts", {}).items() if bears(name)}
+    return _code({**about, "parts": parts})
+
+
+def _code(about: Mapping[str, Any]) -> dict[str, Any]:
+    """All that rows depend on beside trials and maps; runs of earlier versions do not say all of it."""
+    code = about.get("code", {})
+    return {
+        **({"benchnav's own sources": {"digest": code["sources"]}} if "sources" in code else {}),
+        **code.get("versions", {}),
+        **{name: code[name] for name in ("processor", "compiles") if name in code},
+        **({"planner_limit_s": about["planner_limit_s"]} if "planner_limit_s" in about else {}),
+        "device": _device(about),
+        **about["parts"],
+    }
+
+
+def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Names what both have and what is not the same, with the values where they are short.
+
+    Args:
+        earlier: from `code_of`.
+        now: as well.
+    """
+    unlike = [name for name, value in earlier.items() if name in now and now[name] != value]
+    return [
+        name if isinstance(now[name], Mapping) else f"{name} ({earlier[name]} to {now[name]})"
+        for name in unlike
+    ]
 
 
 def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -143,30 +195,19 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         earlier: the `run.json` of the folder.
         now: what it would be.
     """
-    changed = []
-    if earlier["code"]["sources"] != now["code"]["sources"]:
-        changed.append("benchnav's own sources")
-    changed += [
-        f"{name} ({before} to {now['code']['versions'].get(name)})"
-        for name, before in earlier["code"]["versions"].items()
-        if before != now["code"]["versions"].get(name)
-    ]
-    for name in ("processor", "compiles"):
-        if earlier["code"][name] != now["code"][name]:
-            changed.append(f"{name} ({earlier['code'][name]} to {now['code'][name]})")
-    if earlier["planner_limit_s"] != now["planner_limit_s"]:
-        changed.append(f"planner_limit_s ({earlier['planner_limit_s']:g} to {now['planner_limit_s']:g})")
-    if _device(earlier) != _device(now):
-        changed.append(f"device ({_device(earlier)} to {_device(now)})")
-    changed += [
-        name for name, identity in earlier["parts"].items() if now["parts"].get(name, identity) != identity
-    ]
+    changed = code_differences(_code(earlier), _code(now))
     for data, about in earlier["datasets"].items():
         again = now["datasets"].get(data, {"maps": {}})["maps"]
         for split, digests in about["maps"].items():
             pairs = zip(digests, again.get(split, digests), strict=False)
             if any(before != after for before, after in pairs):
                 changed.append(f"maps of {data} {split}")
+        meanings = now["datasets"].get(data, {}).get("about", {})
+        changed += [
+            f"class table, λ_stuck, resolution or kind of truth of {data} {split}"
+            for split, digest in about.get("about", {}).items()  # not recorded by earlier versions
+            if meanings.get(split, digest) != digest
+        ]
     return changed
 
 

@@ -114,6 +114,12 @@ _COLUMNS = {
     **dict.fromkeys(("seed", "realisation", "instance"), "whole"),
     **dict.fromkeys((*_NUMBERS, "score", "roughness_radps2"), "number"),
     "success": "bool",
+    "compiled": "bool",
+}
+# Those that earlier versions did not write.
+_LATER = {
+    **dict.fromkeys(("group", "redrawn"), "whole"),
+    **dict.fromkeys(("planning_ms_p95", "planning_start_ms"), "number"),
 }
 _OUTCOMES = {outcome.name.lower() for outcome in Outcome if outcome != Outcome.RUNNING}
 
@@ -195,8 +201,9 @@ def check_rows(rows: pd.DataFrame, about: Mapping[str, Any], version: int) -> No
         DamageError: a column is missing or of another type, a row is there twice, missing or of another run, or an
             outcome or time is none.
     """
-    for name, kind in (_COLUMNS_1 if version == 1 else _COLUMNS).items():
-        if name not in rows or not _is(kind, rows[name]):
+    needed = _COLUMNS_1 if version == 1 else _COLUMNS
+    for name, kind in (needed | _LATER).items():
+        if (name in needed and name not in rows) or (name in rows and not _is(kind, rows[name])):
             raise DamageError(f"it has no column {name} of {_WORDS[kind]}")
     if rows.empty:
         raise DamageError("it has no rows")

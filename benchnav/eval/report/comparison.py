@@ -24,6 +24,7 @@ def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
     """
     shown = [name for name in _LABELS if name in table and _differs(table[name])]
     counts = ["n_maps"] if table["n_maps"].nunique() > 1 else []
+    unit = "% of T" if "time_difference_share" in table else "s"
     headings = (
         *shown,
         "",
@@ -35,9 +36,9 @@ def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
         "p",
         "told apart",
         "shows from",
-        "Δ T_total [s]",
+        f"Δ T_total [{unit}]",
         "95 %",
-        "p",
+        "p (ranks)",
         "Δ T if both arrive [s]",
         "95 %",
         "on maps",
@@ -58,6 +59,8 @@ def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
 
 
 def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    names = [f"time_{value}_share" for value in ("difference", "low", "high")]
+    late = [100 * row[name] if name in row else row[f"{name.removesuffix('share')}s"] for name in names]
     return (
         f"{_short(100 * row['success_one'])} : {_short(100 * row['success_other'])}",
         _signed(100 * row["success_difference"]),
@@ -65,8 +68,8 @@ def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
         _p(row["success_p_holm"]),
         "yes" if row["success_p_holm"] < ALPHA else "no",
         f"{100 * row['success_shown']:.0f}" if row["success_shown"] <= 1 else NOT_USED,
-        _signed(row["time_difference_s"]),
-        _range(row["time_low_s"], row["time_high_s"]),
+        _signed(late[0]),
+        _range(*late[1:]),
         _p(row["time_p_holm"]),
         _signed(row["arrival_time_difference_s"]),
         _range(row["arrival_time_low_s"], row["arrival_time_high_s"]),
@@ -79,11 +82,18 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
     points = f"{100 * difference:g} points"
     needed = table["maps_needed"]
     maps = f"{needed.min()}" if needed.nunique() == 1 else f"{needed.min()} to {needed.max()}"
+    share = (
+        " T differs between conditions, so that T_total and its difference are in shares of each condition's own T."
+        if "time_difference_share" in table
+        else ""
+    )
     return (
         f"Family: {pairs}. Holm's correction is over all of them, for success and for T_total apart.",
         "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
-        "interval of Bonett and Price. T_total: a failure counts as T; Wilcoxon's signed-rank test, and an "
-        "interval of the mean from those of success and of the time without failures.",
+        "interval of Bonett and Price. T_total: a failure counts as T; Δ and 95 % are of the mean, "
+        "from the intervals of success and of the time without failures." + share,
+        "p (ranks): Wilcoxon's signed-rank test of T_total. It compares the ranks of the maps' differences and not "
+        "their mean, so that it may disagree with the interval, which is of the mean.",
         "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "
         f"where there are fewer than {LEAST_MAPS} maps.",
         "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %; "

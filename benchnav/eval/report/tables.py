@@ -17,6 +17,8 @@ from benchnav.planning.world.outcome import FAILURES
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
 _ALWAYS = ("scenario", "planner", "risk")
+ALONE, IN_BATCH = "one robot [ms]", "per episode of a batch [ms]"
+LATENCIES = ("median_ms", "p95_ms", "max_ms")
 # What columns hold, by heading; only those that are shown are explained.
 _COLUMNS = {
     "data": "the dataset.",
@@ -37,11 +39,15 @@ _COLUMNS = {
     f"those of the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
     "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
     "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
-    "planning [ms]": "wall time of planning one step of one robot, from the second step on: the median over an "
-    "episode's steps and in brackets their 95th percentile, each as its median over episodes. It is measured over a "
-    "batch of at most 50 episodes on one thread and divided by their number; ¶ marks planners that were compiled.",
+    ALONE: "wall time of planning one step of one robot alone on one thread, replanning included: the median, and in "
+    "brackets the 95th percentile and the maximum, over at most 100 steps of one episode after its first.",
+    IN_BATCH: "wall time of planning one step of a batch of at most 50 episodes on one thread over their number, which "
+    "is no latency: the median over an episode's steps and in brackets their 95th percentile, each as its median over "
+    "episodes; ¶ marks planners that were compiled.",
     "failures": "how the other episodes ended.",
 }
+# Of the columns that not every run has, that of the summary which says so.
+_TIMES = {ALONE: "latency_median_ms", IN_BATCH: "planning_ms_median"}
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -75,7 +81,7 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
     are the numbers of maps and episodes.
 
     Args:
-        summary: from `summary.summarise`, joined with `best.against_best`.
+        summary: from `summary.summarise`, joined with `best.against_best` and perhaps with latencies.
         trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
@@ -93,16 +99,18 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         "T_total [s]",
         "T if success [s]",
         "λ̄ [%]",
-        *(["planning [ms]"] if summary["planning_ms_median"].notna().any() else []),
+        *(heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()),
         "failures",
     )
     rows = []
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
         labels = [str(row[name]) + (mark if name == "planner" else "") for name in shown]
         results = _results(row)
-        if "planning [ms]" not in headings:
-            results = (*results[:-2], results[-1])
-        rows.append((*labels, *(str(row[name]) for name in counts), *results))
+        rows.append(
+            (*labels, *(str(row[name]) for name in counts), *(results[h] for h in headings if h in results))
+        )
+    if any("¶" in cell for row in rows for cell in row):
+        notes.append("¶ compiled planner: its time is that of compiled code.")
     rate = headings.index("Succ. [%]")
     marked = [place for place, value in enumerate(summary["best_marked"]) if value]
     return ResultTable(
@@ -165,29 +173,36 @@ def failures_in_words(row: Mapping[Any, Any]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or NOT_USED
 
 
-def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
+def _results(row: Mapping[Any, Any]) -> dict[str, str]:
     met = _spread(100 * row["traversability_mean"], 100 * row["traversability_std"])
+    compiled = "¶" if row["compiled_share"] > 0 and not np.isnan(row["planning_ms_median"]) else ""
     # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the row.
     if 0 < row["traversability_n"] < row["n_episodes"]:
         met += f" (n = {row['traversability_n']})"
-    return (
-        rate_in_words(row),
-        f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}",
-        _with_interval(row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]),
-        _spread(row["success_time_mean_s"], row["success_time_std_s"]),
-        met,
-        _planning(row),
-        failures_in_words(row),
-    )
+    return {
+        "Succ. [%]": rate_in_words(row),
+        "95 % interval": f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}",
+        "T_total [s]": _with_interval(
+            row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]
+        ),
+        "T if success [s]": _spread(row["success_time_mean_s"], row["success_time_std_s"]),
+        "λ̄ [%]": met,
+        ALONE: _times(*(row.get(f"latency_{name}", np.nan) for name in LATENCIES)),
+        IN_BATCH: _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled,
+        "failures": failures_in_words(row),
+    }
 
 
-def _planning(row: Mapping[Any, Any]) -> str:
-    if np.isnan(row["planning_ms_median"]):
+def _times(middle: float, *others: float) -> str:
+    """Milliseconds by two digits that count; earlier versions did not measure the others."""
+    if np.isnan(middle):
         return NOT_USED
-    compiled = "¶" if row["compiled_share"] > 0 else ""
-    if np.isnan(row["planning_ms_p95_median"]):  # of an earlier version
-        return f"{row['planning_ms_median']:.2g}{compiled}"
-    return f"{row['planning_ms_median']:.2g} ({row['planning_ms_p95_median']:.2g}){compiled}"
+    first, *rest = (
+        np.format_float_positional(value, 2, fractional=False, trim="-")
+        for value in (middle, *others)
+        if not np.isnan(value)
+    )
+    return f"{first} ({', '.join(rest)})" if rest else first
 
 
 def _with_interval(mean: float, low: float, high: float) -> str:
@@ -211,8 +226,9 @@ def _notes(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> tu
     marks = []
     for trial in summary["trial"]:
         about = trials[trial]
-        texts = [f"objective: {about['follows']}"] if about["follows"] not in _USERS_OWN else []
-        own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]
+        follows = about.get("follows", "J")
+        texts = [] if follows in _USERS_OWN else [f"minimises, in place of the task's J: {follows}"]
+        own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about.get("remarks", ()))]
         marks.append(",".join(_raised(number) for number in own))
     return marks, [f"{_raised(number)} {text}" for text, number in numbers.items()]
 

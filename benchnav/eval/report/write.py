@@ -13,7 +13,7 @@ import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
-from benchnav.eval.folder.folder import ERRORS, open_run, read_table
+from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
 from benchnav.eval.report.charts.curves import curve_figure, sweep_name
 from benchnav.eval.report.charts.distributions import distribution_figure
 from benchnav.eval.report.charts.driven import write_driven
@@ -32,7 +32,14 @@ from benchnav.eval.report.page import Drawn, write_page
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recorded.recording import read_snapshots
 from benchnav.eval.report.rendering import markdown, to_latex, to_markdown, to_terminal
-from benchnav.eval.report.tables import NOT_USED, ResultTable, is_grouped, maps_in_words, result_table
+from benchnav.eval.report.tables import (
+    LATENCIES,
+    NOT_USED,
+    ResultTable,
+    is_grouped,
+    maps_in_words,
+    result_table,
+)
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.stats.best import against_best, told_the_truth
 from benchnav.eval.stats.hypotheses import test_hypotheses
@@ -113,6 +120,7 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     grouped = is_grouped(summary)
     best = against_best(episodes, summary, told_the_truth(about["trials"]))
     summary = summary.merge(best, on="trial", how="left", validate="1:1")
+    summary = _with_latency(summary, about["trials"])
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(folder, summary, failures, ground_of)
     left_out = [sheets.left_out] if sheets.left_out else []
@@ -120,7 +128,7 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
         header=(*_header(summary, about), *_redrawn(episodes, about["trials"])),
         findings=_findings(findings(summary, failures, sheets.told), tests, about, grouped),
         table=result_table(summary, about["trials"]),
-        warnings=(*_warnings(summary, folder), *left_out),
+        warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
         summary=summary,
         tests=tests,
         episodes=episodes,
@@ -130,31 +138,32 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     )
 
 
-def write_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
+def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | None = None) -> Report:
     """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
     Args:
         folder: a finished run.
         ground_of: gives the ground of failures; without it they are not shown on maps.
+        out: where to; the run folder when not given.
 
     Returns:
         What was written of.
     """
-    report = read_report(folder, ground_of)
+    report, out = read_report(folder, ground_of), out or folder
     name = folder.resolve().name
-    write_text(folder / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
-    write_text(folder / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
-    write_text(folder / "summary.tex", _as_latex(report, name))
+    write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
+    write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
+    write_text(out / "summary.tex", _as_latex(report, name))
     if not report.tests.empty:
-        write_text(folder / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
+        write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
         shown = hypothesis_table(report.tests, is_grouped(report.summary))
-        write_text(folder / "hypotheses.tex", to_latex(shown, _HYPOTHESES, f"{name}-hypotheses"))
-    figures = [*_charts(folder, report), *_trajectories(folder, report.summary), *_driven(folder)]
-    write_text(folder / "summary.md", _as_markdown(report, figures))
+        write_text(out / "hypotheses.tex", to_latex(shown, _HYPOTHESES, f"{name}-hypotheses"))
+    figures = [*_charts(out, report), *_trajectories(folder, out, report.summary), *_driven(folder, out)]
+    write_text(out / "summary.md", _as_markdown(report, figures))
     page = write_page(
         name, report.header, report.warnings, report.findings, report.table, figures, report.about
     )
-    write_text(folder / PAGE, page)
+    write_text(out / PAGE, page)
     return report
 
 
@@ -164,7 +173,7 @@ def print_report(report: Report) -> None:
     width = shutil.get_terminal_size().columns if is_terminal else None
     table = to_terminal(report.table, width, styled=is_terminal).rstrip()
     said = [line for finding in report.findings for line in (f"{finding.title}:", *finding.sentences)]
-    print("\n".join([*report.header, table, *said, *report.warnings]))
+    print("\n".join([*report.header, table, *report.warnings, *said]))
 
 
 def _findings(
@@ -177,7 +186,7 @@ def _findings(
     return (hypothesis_finding(tests, about, grouped), *rest)
 
 
-def _charts(folder: Path, report: Report) -> list[Drawn]:
+def _charts(out: Path, report: Report) -> list[Drawn]:
     """Draws the figures at the width of a column."""
     summary = report.summary
     marked = set(summary.loc[summary["best_marked"], "trial"])
@@ -199,19 +208,19 @@ def _charts(folder: Path, report: Report) -> list[Drawn]:
     drawn = []
     with matplotlib.rc_context(STYLE):
         for name, caption, make in made:
-            path = folder / "figures" / f"{name}.png"
+            path = out / "figures" / f"{name}.png"
             save(make(), path, trim=False)
             drawn.append(Drawn(path=path, caption=caption))
     return drawn
 
 
-def _trajectories(folder: Path, summary: pd.DataFrame) -> list[Drawn]:
+def _trajectories(folder: Path, out: Path, summary: pd.DataFrame) -> list[Drawn]:
     """Draws the trajectories of recorded episodes; none where nothing was recorded."""
     recorded = read_snapshots(folder)
     chosen = choose(recorded, list(summary["trial"]))
     if not chosen:
         return []
-    path = folder / "figures" / "trajectories.png"
+    path = out / "figures" / "trajectories.png"
     save(trajectory_figure(chosen), path)
     words = [_TRAJECTORIES, f"{len(chosen)} of {len(recorded)} recorded episodes."]
     if any(snapshot.field is not None for snapshot in chosen):
@@ -219,11 +228,18 @@ def _trajectories(folder: Path, summary: pd.DataFrame) -> list[Drawn]:
     return [Drawn(path=path, caption=" ".join(words))]
 
 
-def _driven(folder: Path) -> list[Drawn]:
+def _driven(folder: Path, out: Path) -> list[Drawn]:
     return [
-        Drawn(path=folder / "figures" / f"{name}.png", caption=caption)
-        for name, caption in write_driven(folder).items()
+        Drawn(path=out / "figures" / f"{name}.png", caption=caption)
+        for name, caption in write_driven(folder, out).items()
     ]
+
+
+def _with_latency(summary: pd.DataFrame, trials: Mapping[str, Any]) -> pd.DataFrame:
+    """A summary with how long a step of one robot takes, where the run measured it."""
+    known = [trials[trial].get("latency", {}) for trial in summary["trial"]]
+    columns = {f"latency_{name}": [one.get(name, float("nan")) for one in known] for name in LATENCIES}
+    return summary.assign(**columns)
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
@@ -300,8 +316,9 @@ def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
             to_markdown(hypothesis_table(report.tests, is_grouped(report.summary))),
             "",
         ]
-    lines += ["## Results", "", *(f"- {markdown(line)}" for line in (*report.header, *report.warnings)), ""]
+    lines += ["## Results", "", *(f"- {markdown(line)}" for line in report.header), ""]
     lines += [to_markdown(report.table)]
+    lines += [f"- {markdown(line)}" for line in report.warnings] + ([""] if report.warnings else [])
     for drawn in figures:
         lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", markdown(drawn.caption), ""]
     return "\n".join(
@@ -310,5 +327,5 @@ def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
 
 
 def _as_latex(report: Report, name: str) -> str:
-    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes))
+    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
     return comments + paper_table(report.summary, name)

@@ -107,21 +107,24 @@ class Recorder:
         return {"true_mean": mean, "field": field, "soft": soft, "holding": holding}
 
 
-def find_recording(folder: Path, unit: Unit, member: int) -> Recording:
+def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = None) -> Recording:
     """Gives the recording of an episode, running its unit again where it was not recorded.
 
     Args:
         folder: a finished run.
         unit: the episode's.
         member: which of the unit's episodes.
+        out: folder that the recording of an episode that is run again is written to; the run's when not given.
 
     Raises:
         ConfigError: the run has no row of the episode, or the device that it was computed on is not there.
         BenchnavError: the unit did not repeat what the run holds.
     """
-    stored = playback_path(folder, unit.stem(member), ".npz")
-    if stored.exists() and not is_snapshot(stored):
-        return Recording.load(stored)
+    out = out or folder
+    for place in (folder, out):
+        stored = playback_path(place, unit.stem(member), ".npz")
+        if stored.exists() and not is_snapshot(stored):
+            return Recording.load(stored)
     row = _row(folder, unit, unit.instances[member])
     with one_thread():
         about = open_run(folder).about
@@ -135,7 +138,7 @@ def find_recording(folder: Path, unit: Unit, member: int) -> Recording:
             f"The episode did not repeat: {folder} was made with other versions or on another machine type. "
             "Run the suite again here to replay it."
         )
-    write_playback(folder, unit.stem(member), recording)
+    write_playback(out, unit.stem(member), recording)
     return recording
 
 

@@ -1,6 +1,7 @@
-"""The table of a comparison: a row a pair of trials, corrected over all rows together."""
+"""The table of a comparison: a row a pair of conditions, corrected over all rows together."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,22 +31,27 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
         difference: of success, for which the maps that it would need are counted, in (0, 1].
 
     Returns:
-        A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_draws` (episodes of a trial on a map);
-        `success_one`, `success_other`; `success_difference` with its 95 % interval `_low`, `_high`, `success_p`
+        A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_groups`, the statistical units, which are as many
+        unless maps are grouped, and `n_episodes` of each condition; `success_one`, `success_other`;
+        `success_difference` with its 95 % interval `_low`, `_high`, `success_p`
         and, corrected, `success_p_holm`; `success_shown`, the smallest difference that so many maps show with a
         chance of 80 %, and `maps_needed` for `difference`, both at the level of the first step of Holm. The same of
-        `time`, T_total in seconds, where a failure counts as T; and of `arrival_time`, over episodes in which both
-        arrived: no test, since which these are hangs on both trials.
+        `time`, T_total in seconds, where a failure counts as T: `time_difference_s`, `time_low_s`, `time_high_s`. Where
+        the two conditions of some pair have unlike T, whose difference would else be that of the penalty, all are in
+        shares of T and end in `_share`. And of `arrival_time`, over episodes in which both arrived: no test, since
+        which these are hangs on both conditions.
     """
     alpha = ALPHA / len(pairs)
     table = pd.DataFrame([_compare_success(pair, alpha, difference) for pair in pairs])
-    late = [_late(pair.episodes) for pair in pairs]
-    table = table.join(_columns("time", [time_difference(pair.episodes) for pair in pairs]))
+    unit = "share" if any(map(budgets_differ, pairs)) else "s"
+    rows = [_in_shares(pair.episodes) if unit == "share" else pair.episodes for pair in pairs]
+    late = [_late(one) for one in rows]
+    table = table.join(_columns("time", unit, [time_difference(one) for one in rows]))
     table["time_p"] = [signed_rank_p(values) for values in late]
     arrived = [
         _late(pair.episodes[pair.episodes["success"] & pair.episodes["success_other"]]) for pair in pairs
     ]
-    table = table.join(_columns("arrival_time", [mean_interval(values) for values in arrived]))
+    table = table.join(_columns("arrival_time", "s", [mean_interval(values) for values in arrived]))
     table["arrival_time_n_maps"] = [len(values) for values in arrived]
     for name in ("success_p", "time_p"):
         table[f"{name}_holm"] = multipletests(table[name], ALPHA, method="holm")[1]
@@ -87,6 +93,13 @@ def _gain(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
     return by_unit, len(rows) / len(by_unit)
 
 
+def budgets_differ(pair: Pair) -> bool:
+    """Whether T of the two differs on some map."""
+    one, other = pair.episodes["time_budget_s"], pair.episodes["time_budget_s_other"]
+    known = one.notna() & other.notna()  # of an episode that began at its goal T is not known
+    return not np.allclose(one[known], other[known], rtol=1e-6)
+
+
 def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, object]:
     rows = pair.episodes
     one, other = rows["success"].astype(int), rows["success_other"].astype(int)
@@ -97,8 +110,9 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
         **pair.shared,
         "one": pair.one,
         "other": pair.other,
-        "n_maps": len(gain),
-        "n_draws": round(draws),
+        "n_maps": rows["instance"].nunique(),
+        "n_groups": len(gain),
+        "n_episodes": len(rows),
         "success_one": one.mean(),
         "success_other": other.mean(),
         "success_difference": float(mean),
@@ -111,11 +125,21 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
 
 
 def _late(rows: pd.DataFrame) -> np.ndarray:
-    """By how much longer one trial took, by map, shape [M]."""
+    """By how much longer one condition took, by map or group of maps, shape [M]."""
     late = (rows["total_time_s"] - rows["total_time_s_other"]).to_numpy()
     return by_map(late, units_of(rows).to_numpy())
 
 
-def _columns(name: str, intervals: Sequence[Sequence[float | np.ndarray]]) -> pd.DataFrame:
-    columns = [f"{name}_difference_s", f"{name}_low_s", f"{name}_high_s"]
+def _in_shares(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a pair with times in shares of each condition's own T."""
+    made: dict[str, Any] = {}
+    for suffix in ("", "_other"):
+        # An episode that began at its goal took no share of a T that is not known.
+        share = (rows[f"total_time_s{suffix}"] / rows[f"time_budget_s{suffix}"]).fillna(0)
+        made |= {f"total_time_s{suffix}": share, f"time_budget_s{suffix}": 1.0}
+    return rows.assign(**made)
+
+
+def _columns(name: str, unit: str, intervals: Sequence[Sequence[float | np.ndarray]]) -> pd.DataFrame:
+    columns = [f"{name}_{value}_{unit}" for value in ("difference", "low", "high")]
     return pd.DataFrame(np.array(intervals, dtype=float), columns=columns)

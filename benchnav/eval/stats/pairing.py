@@ -1,7 +1,7 @@
-"""Which trials are compared: those of one run or several that met the same maps under the same luck."""
+"""Which conditions are compared: those whose values differ in one thing, on the same maps and the same draws of λ."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -12,39 +12,50 @@ from benchnav.errors import ConfigError
 from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 
-# By what trials may differ. Other data or scenarios are other maps.
-COMPARED = ("risk", "planner", "model", "objective", "robot", "world", "run")
-_LUCK = ["seed", "realisation", "instance"]
+# By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
+_KEYS: Mapping[str, tuple[str, ...]] = {
+    **{name: (name,) for name in ("risk", "planner", "model", "objective", "robot")},
+    "world": ("world", "rules"),
+    "run": (),
+}
+COMPARED = tuple(_KEYS)
+DRAW = ["seed", "realisation", "instance"]
+# Of an episode, what pairs hold of both sides, where the tables have it.
+_MEASURES = ("success", "total_time_s", "time_budget_s", "score", "traversability", "path_length_m")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Compared:
-    """A trial of one of the runs.
+    """A condition of one of the runs, or of several that hold the same.
 
     Args:
-        labels: what tables call it, by column; `run` among them, `NOT_USED` where no two runs share a trial.
-        world: what λ did, as plain data.
+        labels: what tables call it, by column; `run` among them, `NOT_USED` where no two runs share a condition.
+        value: all that bears on its rows, as `run.json` holds it.
         maps: digests of its maps, in the order of instances.
         episodes: its rows, with T of each as `time_budget_s`.
+        code: what code made the rows, by run: names of sources, versions and parts with what identifies them.
     """
 
     labels: Mapping[str, str]
-    world: Mapping[str, Any]
+    value: Mapping[str, Any]
     maps: Sequence[str]
     episodes: pd.DataFrame
+    code: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pair:
-    """Two trials, and their episodes side by side.
+    """Two conditions, and their episodes side by side.
 
     Args:
-        one: what is compared.
-        other: with what.
+        one: label of what is compared.
+        other: and with what.
         shared: labels of the two; of a label that one of them does not use, the other's.
-        episodes: of both, one's `success`, `total_time_s` and `time_budget_s`, the other's with `_other`; maps of
-            which one trial has fewer episodes are left out.
-        left_out: episodes of either trial that the other does not have.
+        episodes: of both, paired by seed, realisation and instance, on all maps that both met: one's `success`,
+            `total_time_s`, `time_budget_s` and other measures, the other's with `_other`; and `group`, the statistical
+            unit, where the tables have it. Maps may have unequally many.
+        left_out: episodes of either condition that the other does not have.
+        members: the conditions.
     """
 
     one: str
@@ -52,18 +63,18 @@ class Pair:
     shared: Mapping[str, str]
     episodes: pd.DataFrame
     left_out: int
+    members: tuple[Compared, ...] = ()
 
 
 def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> list[Pair]:
-    """Pairs trials that differ in one label alone.
+    """Pairs conditions whose values differ in one thing alone.
 
-    A label that a trial does not use, such as the risk setting of a blind planner, is like any other.
+    What a condition does not use, such as the risk setting of a blind planner, is like any other.
 
     Args:
-        trials: of one run or several.
-        by: the label, of `COMPARED`. When not given: that in which `against` is found; `run` where runs share
-            trials; else `risk`.
-        against: a value of the label, which all others are compared with; all pairs when not given.
+        trials: conditions of one run or several, each once unless runs are compared with each other.
+        by: what differs, of `COMPARED`; see `by_what`.
+        against: a label, which all others are compared with; all pairs when not given.
 
     Returns:
         Pairs, those with the same other labels together.
@@ -71,12 +82,7 @@ def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> l
     Raises:
         ConfigError: there is nothing to compare, or it cannot be paired.
     """
-    by = by or _label_of(trials, against)
-    if by not in COMPARED:
-        why = " Other data or scenarios are other maps." if by in ("data", "scenario") else ""
-        raise ConfigError(
-            f"Expected `by` among {', '.join(COMPARED)}, got {by!r}.{registry.hint(by, COMPARED)}{why}"
-        )
+    by = by_what(trials, by, against)
     values = list(dict.fromkeys(trial.labels[by] for trial in trials if trial.labels[by] != NOT_USED))
     if against and against not in values:
         raise ConfigError(
@@ -96,7 +102,25 @@ def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> l
     return sorted(pairs, key=lambda pair: families.index(tuple(pair.shared.values())))
 
 
-def _label_of(trials: Sequence[Compared], against: str) -> str:
+def by_what(trials: Sequence[Compared], by: str = "", against: str = "") -> str:
+    """By what conditions are compared, of `COMPARED`.
+
+    Args:
+        trials: the conditions.
+        by: what was asked for. When empty: that in which `against` is found; `run` where runs share conditions; else
+            `risk`.
+        against: a label, or empty.
+
+    Raises:
+        ConfigError: `by` is none, or `against` is found nowhere or in several.
+    """
+    if by:
+        if by not in COMPARED:
+            why = " Other data or scenarios are other maps." if by in ("data", "scenario") else ""
+            raise ConfigError(
+                f"Expected `by` among {', '.join(COMPARED)}, got {by!r}.{registry.hint(by, COMPARED)}{why}"
+            )
+        return by
     if not against:
         return "run" if any(trial.labels["run"] != NOT_USED for trial in trials) else "risk"
     found = [name for name in COMPARED if any(trial.labels[name] == against for trial in trials)]
@@ -110,8 +134,42 @@ def _label_of(trials: Sequence[Compared], against: str) -> str:
     return found[0]
 
 
+def check_one_value_each(trials: Iterable[Compared]) -> None:
+    """Refuses two values under one label, which no reader of a table could distinguish.
+
+    Raises:
+        ConfigError: there are such.
+    """
+    known: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
+    for trial in trials:
+        for name, keys in _KEYS.items():
+            value = {key: trial.value[key] for key in keys}
+            label = trial.labels[name]
+            earlier, first = known.setdefault((name, label), (value, trial))
+            if earlier != value and label != NOT_USED:
+                runs = " and ".join(dict.fromkeys([*first.code, *trial.code]))
+                raise ConfigError(
+                    f"Expected one {name} under each label, got two that {runs} call {label!r}: "
+                    f"{', '.join(differences(earlier, value))}. Leave one of the runs out, or run one again under "
+                    "another label."
+                )
+
+
+def differences(one: Any, other: Any, name: str = "") -> list[str]:
+    """Names what differs between two values of plain data, with both, such as `options.level 0.5 and 0.9`."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        keys = dict.fromkeys([*one, *other])
+        inner = ((one.get(key), other.get(key), f"{name}.{key}".removeprefix(".")) for key in keys)
+        return [line for values in inner for line in differences(*values)]
+    return [] if one == other else [f"{name} {one} and {other}"]
+
+
 def _others(trials: Sequence[Compared], by: str) -> str:
-    """Names the labels in which the trials do differ."""
+    """Names the labels in which the conditions do differ, or what is unlike in their worlds."""
+    fields = {repr(field): field for trial in trials if (field := _field(trial))}
+    if by == "world" and len(fields) > 1:
+        first, second, *_ = fields.values()
+        return f" λ itself differs between their worlds: {', '.join(differences(first, second))}."
     several = {
         name: labels
         for name in COMPARED
@@ -124,11 +182,25 @@ def _others(trials: Sequence[Compared], by: str) -> str:
 
 
 def _differ_in(one: Compared, other: Compared, by: str) -> bool:
-    a, b = one.labels, other.labels
+    """Tells whether two values are alike in all but one thing, which both use, and met the same λ."""
+    if by == "run":
+        return one.value == other.value and one.labels["run"] != other.labels["run"]
+    unused = [name for name in COMPARED if NOT_USED in (one.labels[name], other.labels[name])]
+    keys = _KEYS[by]
     alike = all(
-        a[name] == b[name] or NOT_USED in (a[name], b[name]) for name in (*LABELS, "run") if name != by
+        one.value.get(key) == other.value.get(key) for key in {*one.value, *other.value} - {*keys, *unused}
     )
-    return alike and a[by] != b[by] and NOT_USED not in (a[by], b[by])
+    differ = any(one.value[key] != other.value[key] for key in keys)
+    return alike and differ and by not in unused and _field(one) == _field(other)
+
+
+def _field(trial: Compared) -> dict[str, Any]:
+    """What of a world decides which λ is drawn; time budgets do not, and what immobilises does where λ is frozen."""
+    world = trial.value["world"]
+    if world["noise"] != "frozen":
+        return {"noise": world["noise"]}
+    below = (world.get("immobile") or {}).get("below")
+    return {"noise": "frozen", "correlation_m": world.get("correlation_m"), "immobile.below": below}
 
 
 def _ordered(a: Compared, b: Compared, by: str, against: str) -> tuple[Compared, Compared]:
@@ -138,43 +210,44 @@ def _ordered(a: Compared, b: Compared, by: str, against: str) -> tuple[Compared,
 
 def _pair(one: Compared, other: Compared, by: str) -> Pair:
     names = f"{one.labels[by]!r} and {other.labels[by]!r}"
-    if one.world != other.world:
-        raise ConfigError(
-            f"Expected trials that met the same λ, got {names}, in whose worlds it differs "
-            f"({_difference(one, other)}), so that their episodes are no pairs."
-        )
-    common = min(len(one.maps), len(other.maps))
-    if list(one.maps[:common]) != list(other.maps[:common]):
-        raise ConfigError(f"Expected trials on the same maps, got {names}, whose maps have other digests.")
-    columns = [*_LUCK, "success", "total_time_s", "time_budget_s"]
-    grouped = [*columns, "group"] if "group" in one.episodes else columns
-    both = one.episodes[grouped].merge(other.episodes[columns], on=_LUCK, suffixes=("", "_other"))
+    check_maps(one, other, names)
+    columns = [name for name in (*DRAW, *_MEASURES) if name in one.episodes and name in other.episodes]
+    both = one.episodes[columns].merge(other.episodes[columns], on=DRAW, suffixes=("", "_other"))
     if both.empty:
         raise ConfigError(
-            f"Expected trials with episodes in common, got {names} with {_luck(one)} and {_luck(other)}."
+            f"Expected trials with episodes in common, got {names} with {_draws(one)} and {_draws(other)}."
         )
-    draws = both.groupby("instance")["success"].transform("size")
-    both = both[draws == draws.mode().max()]  # maps with as many draws as most episodes have
-    left_out = len(one.episodes) + len(other.episodes) - 2 * len(both)
+    grouped = next((trial.episodes for trial in (one, other) if "group" in trial.episodes), None)
+    if grouped is not None:
+        known = grouped.dropna(subset=["group"]).drop_duplicates("instance").set_index("instance")["group"]
+        both["group"] = both["instance"].map(known).fillna(both["instance"]).astype("int64")
     shared = {
         name: other.labels[name] if one.labels[name] == NOT_USED else one.labels[name]
         for name in (*LABELS, "run")
         if name != by
     }
-    return Pair(one=one.labels[by], other=other.labels[by], shared=shared, episodes=both, left_out=left_out)
+    return Pair(
+        one=one.labels[by],
+        other=other.labels[by],
+        shared=shared,
+        episodes=both,
+        left_out=len(one.episodes) + len(other.episodes) - 2 * len(both),
+        members=(one, other),
+    )
 
 
-def _difference(one: Compared, other: Compared) -> str:
-    names = dict.fromkeys([*one.world, *other.world])
-    told = [
-        f"{name} {one.world.get(name)} and {other.world.get(name)}"
-        for name in names
-        if one.world.get(name) != other.world.get(name)
-    ]
-    return ", ".join(told)
+def check_maps(one: Compared, other: Compared, names: str) -> None:
+    """Refuses conditions that did not meet the same maps.
+
+    Raises:
+        ConfigError: maps of one number have other digests.
+    """
+    common = min(len(one.maps), len(other.maps))
+    if list(one.maps[:common]) != list(other.maps[:common]):
+        raise ConfigError(f"Expected trials on the same maps, got {names}, whose maps have other digests.")
 
 
-def _luck(trial: Compared) -> str:
+def _draws(trial: Compared) -> str:
     def listed(values: Iterable[Any]) -> str:
         return ", ".join(str(value) for value in sorted(set(values)))
 

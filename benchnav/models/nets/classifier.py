@@ -5,6 +5,7 @@ ResNet-18 encoder of paper III-B. Cells whose class is not known count neither i
 in shapes: B maps, H×W cells, C classes.
 """
 
+import math
 from typing import Any
 
 import lightning
@@ -17,13 +18,13 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
-from benchnav.models.config import ClassifierConfig
+from benchnav.models.config import ClassifierConfig, rebuild
 from benchnav.models.nets.network import build_network
 from benchnav.models.nets.schedule import one_cycle
 
 
-class CrossEntropyWithDice(nn.Module):
-    """Cross-entropy plus a soft Dice loss, which weighs rare classes as much as frequent ones.
+class LabelledLoss(nn.Module):
+    """Cross-entropy, to which a soft Dice loss may be added, which weighs rare classes as much as frequent ones.
 
     Source: Milletari et al. (2016), "V-Net".
 
@@ -33,15 +34,38 @@ class CrossEntropyWithDice(nn.Module):
     """
 
     def __init__(self, dice: float, label_smoothing: float) -> None:
-        """Sets the two losses up."""
+        """Sets the losses up."""
         super().__init__()
         self.dice = dice
-        self.cross_entropy = nn.CrossEntropyLoss(ignore_index=UNLABELLED, label_smoothing=label_smoothing)
+        self.cross_entropy = nn.CrossEntropyLoss(
+            ignore_index=UNLABELLED, label_smoothing=label_smoothing, reduction="sum"
+        )
         self.overlap = smp.losses.DiceLoss("multiclass", ignore_index=UNLABELLED)
 
     def forward(self, logits: Tensor, class_id: Tensor) -> Tensor:
-        """Computes the loss of logits [B, C, H, W] where the classes are `class_id` [B, H, W]."""
-        return self.cross_entropy(logits, class_id) + self.dice * self.overlap(logits, class_id)
+        """Computes the loss of logits [B, C, H, W] where classes are `class_id` [B, H, W]; 0 where none is known."""
+        # The mean of PyTorch's own would be 0 / 0 for maps without labels.
+        loss = self.cross_entropy(logits, class_id) / (class_id != UNLABELLED).sum().clamp(min=1)
+        return loss + self.dice * self.overlap(logits, class_id) if self.dice else loss
+
+
+class MeanIoU(MulticlassJaccardIndex):
+    """Intersection over union in the mean over the classes that occur in truth; not a number where none does.
+
+    torchmetrics' own mean counts a class that no cell has as 0 as soon as one cell is taken for it.
+
+    Args:
+        class_count: C.
+        ignore_index: class of the cells that are left out.
+    """
+
+    def __init__(self, class_count: int, ignore_index: int | None = None) -> None:
+        """Starts with no cells."""
+        super().__init__(class_count, average="none", ignore_index=ignore_index)
+
+    def compute(self) -> Tensor:
+        """The mean over all cells so far."""
+        return super().compute()[self.confmat.sum(1) > 0].mean()
 
 
 class TerrainClassifier(lightning.LightningModule):
@@ -87,16 +111,14 @@ class TerrainClassifier(lightning.LightningModule):
 
     def configure_losses(self) -> nn.Module:
         """The training loss: cross-entropy, a proper score, unless more is asked for."""
-        if self.config.dice:
-            return CrossEntropyWithDice(self.config.dice, self.config.label_smoothing)
-        return nn.CrossEntropyLoss(ignore_index=UNLABELLED, label_smoothing=self.config.label_smoothing)
+        return LabelledLoss(self.config.dice, self.config.label_smoothing)
 
     def configure_metrics(self) -> MetricCollection:
         """What is measured on the validation maps."""
         return MetricCollection(
             {
                 "accuracy": MulticlassAccuracy(self.class_count, average="micro", ignore_index=UNLABELLED),
-                "miou": MulticlassJaccardIndex(self.class_count, average="macro", ignore_index=UNLABELLED),
+                "miou": MeanIoU(self.class_count, ignore_index=UNLABELLED),
             },
             prefix="valid_",
         )
@@ -126,7 +148,9 @@ class TerrainClassifier(lightning.LightningModule):
         """Computes the loss of a batch with `rgb` and `class_id`."""
         rgb, class_id = batch["rgb"], batch["class_id"].long()
         loss = self.loss(self(rgb), class_id)
-        self.log("train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=len(rgb))
+        self.log(
+            "train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=_labelled(class_id)
+        )
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
@@ -134,7 +158,7 @@ class TerrainClassifier(lightning.LightningModule):
         logits, class_id = self(batch["rgb"]).float(), batch["class_id"].long()
         loss = self.loss(logits, class_id)
         self.metrics.update(logits.argmax(1), class_id)
-        self.log("valid_loss", loss, on_epoch=True, batch_size=len(logits), sync_dist=True)
+        self.log("valid_loss", loss, on_epoch=True, batch_size=_labelled(class_id), sync_dist=True)
         self.log_dict(dict(self.metrics.items()), on_epoch=True, batch_size=len(logits))
 
     @classmethod
@@ -152,13 +176,16 @@ class TerrainClassifier(lightning.LightningModule):
             ConfigError: the settings are not those of a classifier.
             RuntimeError: the tensors do not fit them.
         """
-        try:
-            settings = {name: value for name, value in config.items() if name != "temperature"}
-            channels = tuple(settings.get("decoder_channels", ()))
-            built = ClassifierConfig(**{**settings, "pretrained": False, "decoder_channels": channels})
-            temperature = float(config.get("temperature", 1.0))
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"Expected the settings of a classifier, got {sorted(config)}.") from error
-        model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=temperature)
+        settings = {name: value for name, value in config.items() if name != "temperature"}
+        built = rebuild(ClassifierConfig, {**settings, "pretrained": False})
+        temperature = config.get("temperature", 1.0)
+        if not isinstance(temperature, int | float) or not 0 < temperature < math.inf:
+            raise ConfigError(f"Expected a `temperature` > 0, got {temperature!r}.")
+        model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=float(temperature))
         model.load_state_dict(tensors)
         return model.eval()
+
+
+def _labelled(class_id: Tensor) -> int:
+    """Cells whose class is known, of which a loss is the mean."""
+    return int((class_id != UNLABELLED).sum())

@@ -16,10 +16,10 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torchmetrics import MeanSquaredError
 
-from benchnav.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.errors import BenchnavError, CheckpointError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import Checkpoint
-from benchnav.models.config import ClassifierConfig, MDNConfig
+from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.schedule import one_cycle
 from benchnav.terrain import Observation
@@ -184,12 +184,7 @@ class MixtureDensityNetwork(lightning.LightningModule):
             ConfigError: the settings are not those of a mixture-density network.
             RuntimeError: the tensors do not fit them.
         """
-        try:
-            built = MDNConfig(**{**config, "pretrained": False})
-        except TypeError as error:
-            raise ConfigError(
-                f"Expected the settings of a mixture-density network, got {sorted(config)}."
-            ) from error
+        built = rebuild(MDNConfig, {**config, "pretrained": False})
         network = cls(built, torch.zeros(3), torch.ones(3), torch.ones(()))
         network.load_state_dict(tensors)
         return network.eval()
@@ -239,9 +234,9 @@ class MixtureDensityModel:
             return cls(MixtureDensityNetwork.from_tensors(part.config, part.tensors))
         except (BenchnavError, RuntimeError) as error:
             raise CheckpointError(
-                f"Expected tensors that fit the checkpoint's settings, got: {error}. Train the model again."
+                f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
             ) from error
 
 
 def _seen(batch: dict[str, Tensor]) -> int:
-    return max(1, int(batch["traversability"].isfinite().sum()))
+    return int(batch["traversability"].isfinite().sum())

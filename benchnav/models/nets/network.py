@@ -8,11 +8,13 @@ import inspect
 from typing import Any
 
 import segmentation_models_pytorch as smp
+import timm
 import torch
 from torch import Tensor, nn
 
 from benchnav.errors import ConfigError
 from benchnav.models.config import DEEPEST, ClassifierConfig
+from benchnav.options import hint, one_line
 
 _DETAIL_CHANNELS = 32
 _TRIAL_SIDE = 64
@@ -40,6 +42,7 @@ class WithFullResolution(nn.Module):
         return self.head(torch.cat([self.network(image), self.detail(image)], dim=1))
 
 
+@torch.inference_mode(False)  # idle stages are found by gradients, which a caller may have switched off
 def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.Module:
     """Builds the network with fresh weights; leaves PyTorch's global generator as it was.
 
@@ -69,6 +72,13 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
             )
             if config.encoder_depth < DEEPEST:
                 _drop_unused_stages(network, network.encoder)
+        except (OSError, KeyError, RuntimeError) as error:
+            if not config.pretrained:
+                raise
+            raise ConfigError(
+                f"Expected to download ImageNet weights of {config.encoder} for `pretrained`, got: {one_line(error)} "
+                "Try again where there is a connection, or leave --classifier.pretrained or --mdn.pretrained out."
+            ) from error
         except (ValueError, TypeError) as error:
             raise ConfigError(
                 f"Expected settings that {config.architecture} of {config.encoder} takes, got `encoder_depth` "
@@ -83,12 +93,19 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
 def _check_names(config: ClassifierConfig) -> None:
     architectures, encoder = smp.MODEL_ARCHITECTURES_MAPPING, config.encoder
     if config.architecture not in architectures:
+        near = hint(config.architecture.lower().replace("+", "plus"), architectures)
         raise ConfigError(
-            f"Expected `architecture` among {', '.join(architectures)}, got {config.architecture!r}."
+            f"Expected `architecture` among {', '.join(architectures)}, got {config.architecture!r}.{near}"
         )
-    if encoder not in smp.encoders.get_encoder_names() and not encoder.startswith("tu-"):
+    known, own = list(smp.encoders.get_encoder_names()), encoder.startswith("tu-")
+    # Of a name such as tu-resnet18.a1_in1k what follows the dot names weights; one with a colon is on a hub.
+    if encoder not in known and not (
+        own and (":" in encoder or timm.is_model(encoder[3:].partition(".")[0]))
+    ):
+        known += [f"tu-{name}" for name in timm.list_models()] if own else []
         raise ConfigError(
-            f"Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, got {encoder!r}."
+            "Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, or of timm, such as "
+            f"tu-resnet18, got {encoder!r}.{hint(encoder, known)}"
         )
 
 

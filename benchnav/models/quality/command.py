@@ -2,7 +2,7 @@
 
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,7 +52,9 @@ def evaluate(
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.errors import ConfigError
     from benchnav.files import write_text
+    from benchnav.models.config import check_seed
 
+    check_seed(seed)
     if maps < 0:
         raise ConfigError(f"Expected `maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
     _check_targets(out, json, overwrite)
@@ -61,7 +63,7 @@ def evaluate(
         dataset.map_count(split)  # refuses an unknown one before the slow imports
 
     from benchnav.device import find_device
-    from benchnav.models.predictor import load_model
+    from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.baseline import nearest_colour_accuracy
     from benchnav.models.quality.measure import choose_splits
     from benchnav.models.quality.measure import evaluate as evaluate_model
@@ -77,15 +79,19 @@ def evaluate(
             yield len(qualities), len(chosen)
 
     show_progress(steps(), "splits")
-    title, notes = f"{checkpoint} on {dataset.id}", []
+    title = f"{checkpoint} on {dataset.id}"
     console = Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False)
     console.print(quality_table(title, qualities))
     by_colour: dict[str, float] = {}
     if all(quality.classes for quality in qualities.values()):
         by_colour = {split: nearest_colour_accuracy(dataset, split) for split in chosen}
-        listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
-        notes.append(f"accuracy of the class of the nearest colour, without a model: {listed}")
-        console.print(notes[0], soft_wrap=True)
+    notes = [
+        *_beside_colour(by_colour, qualities),
+        *_seen(dataset, chosen, trained_on(checkpoint)),
+        *_without_truth(model, dataset, chosen),
+    ]
+    for note in notes:
+        console.print(note, soft_wrap=True)
     about = {
         "model": checkpoint,
         "dataset": {"id": dataset.id, "digest": dataset.digest},
@@ -93,6 +99,8 @@ def evaluate(
         "device": place.type,
         "package_version": __version__,
         "nearest_colour_accuracy": by_colour,
+        "truth": dataset.truth,
+        "notes": notes,
     }
     report = quality_json(about, qualities)
     if json:
@@ -106,12 +114,12 @@ def evaluate(
     write_text(folder / CSV, quality_csv(qualities))
     for old in (folder / FIGURES).glob("*.png"):
         old.unlink()
-    notes += _absent(model, qualities)
+    absent = _absent(model, qualities)
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
     about_maps = f"model {name} on dataset {dataset.id}"
     figures = _save_figures(about_maps, model, dataset, qualities, maps, folder / FIGURES)
-    write_text(folder / PAGE, quality_markdown(title, qualities, notes, figures))
-    for note in notes[len(by_colour) > 0 :]:
+    write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, figures))
+    for note in absent:
         print(note)
     print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(figures)} figures in {out}")
     print(f"what the columns and figures mean: {folder / PAGE}")
@@ -143,6 +151,58 @@ def _check_targets(out: str, json: str, overwrite: bool) -> None:
                 pass
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _beside_colour(by_colour: "Mapping[str, float]", qualities: "Mapping[str, Quality]") -> list[str]:
+    """Says how often the nearest colour is right, and where the model is right less often."""
+    if not by_colour:
+        return []
+    listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
+    lines = [f"accuracy of the class of the nearest colour, without a model: {listed}"]
+    worse = [split for split, share in by_colour.items() if qualities[split].classes[0].accuracy < share]
+    if worse:
+        lines.append(f"warning: the model is right less often than the nearest colour on {', '.join(worse)}")
+    return lines
+
+
+def _seen(dataset: "TerrainDataset", splits: "Sequence[str]", known: "Mapping[str, str]") -> list[str]:
+    """Says which splits hold the very maps that the model was trained on, by their digests."""
+    # Checkpoints of earlier versions hold the digest of the arrays alone.
+    digests = {split: (dataset.split_digest(split), dataset.splits[split]["digest"]) for split in splits}
+    found = [
+        f"{split} (its {known[digest]})"
+        for split, both in digests.items()
+        for digest in both
+        if digest in known
+    ]
+    if not found:
+        return []
+    return [
+        f"warning: the model was trained, or chosen and calibrated, on the maps of {', '.join(found)}: their "
+        "numbers say nothing of maps that it has not seen"
+    ]
+
+
+def _without_truth(model: "AnyModel", dataset: "TerrainDataset", splits: "Sequence[str]") -> list[str]:
+    """Says what cannot be measured where the truth is unknown, and what is measured in its place."""
+    from benchnav.models.predictor import Ideal, Oracle
+
+    if dataset.truth == "generated":
+        return []
+    sources = [part.get("source", {}) for split in splits for part in dataset.splits[split]["parts"]]
+    measured = all(source.get("traversability") for source in sources)
+    observed = (
+        "measured λ" if measured else "λ that was, at least in part, drawn by the class table, not measured"
+    )
+    lines = [
+        "RMSE E[λ] is –, since the true distribution of λ is unknown on imported ground; RMSE λ, NLL, CRPS, "
+        f"“in 90 %” and “< VaR” are against {observed}"
+    ]
+    if isinstance(model, Oracle | Ideal):
+        lines.append(
+            "warning: what this model says is the class table of the recipe, not the truth of this ground"
+        )
+    return lines
 
 
 def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
@@ -208,7 +268,7 @@ def _figures(
             [sum(counts) for counts in zip(*rows, strict=True)]
             for rows in zip(*(quality.slope_cells for quality in by_class.values()), strict=True)
         ]
-        yield "latent", partial(figures.latent_figure, table, classes, cells)
+        yield "latent", partial(figures.latent_figure, table, classes, cells, dataset.truth == "generated")
     if maps:
         sheets = [
             map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))

@@ -274,14 +274,18 @@ def ladder_figure(
 
 
 def latent_figure(
-    table: SlopeTable, classes: Sequence[TerrainClass], slope_cells: Sequence[Sequence[int]]
+    table: SlopeTable,
+    classes: Sequence[TerrainClass],
+    slope_cells: Sequence[Sequence[int]],
+    truth: bool = True,
 ) -> Figure:
     """Draws each class's GP over slope with its uncertainty, beside the true latent function and E[λ].
 
     Args:
         table: the GPs of the C classes.
-        classes: the true functions.
+        classes: the true functions, where these are known.
         slope_cells: measured cells by true class and whole degree of slope, [C][90].
+        truth: whether they are.
     """
     columns, rows = _grid(len(classes), 5)
     figure = _figure(columns / 5, rows, 1.55, 0.5 if columns == 5 else 1.0)
@@ -299,25 +303,28 @@ def latent_figure(
         panel.fill_between(x, mean - 2 * latent, mean + 2 * latent, color=_BLUE, alpha=0.45, lw=0)
         panel.plot(x, mean, color=_BLUE, lw=1.1)
         panel.plot(x, _with_soft(expected_traversability(mean, std), *soft[number]), color=_ORANGE, lw=1.1)
-        true = latent_mean(np.full(len(x), number), x, tuple(classes))
-        panel.plot(x, true, color="black", lw=0.9, ls="--")
-        firm = expected_traversability(true, np.full_like(x, one.noise))
-        true_soft = (one.soft.weight, one.soft.mean, one.soft.std) if one.soft else _NO_SOFT
-        panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":")
+        if truth:
+            true = latent_mean(np.full(len(x), number), x, tuple(classes))
+            panel.plot(x, true, color="black", lw=0.9, ls="--")
+            firm = expected_traversability(true, np.full_like(x, one.noise))
+            true_soft = (one.soft.weight, one.soft.mean, one.soft.std) if one.soft else _NO_SOFT
+            panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":")
         if soft[number][0]:
             panel.axhline(soft[number][1], color=_BLUE, lw=0.9, ls="-.")
         for share, shade in ((_RARE, 0.12), (0.0, 0.25)):
             panel.axvspan(_steeper_than(slope_cells[number], share), 90, color="0.4", alpha=shade, lw=0)
         panel.set_title(one.name.replace("_", " "), size=TITLE, parse_math=False)
-        panel.text(
-            0.05, 0.05, f"σ {noise[number]:.3f} ({one.noise:.3f})", size=TEXT, transform=panel.transAxes
-        )
+        true_noise = f" ({one.noise:.3f})" if truth else ""
+        panel.text(0.05, 0.05, f"σ {noise[number]:.3f}{true_noise}", size=TEXT, transform=panel.transAxes)
         thin_ticks(panel)
     panels[0, 0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     _drop_rest(panels, len(classes))
-    figure.supxlabel("slope [°]  (σ: noise, in brackets the true one)", size=TEXT)
+    figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})", size=TEXT)
     figure.supylabel("traversability", size=TEXT)
     handles: list[Line2D] = []
+    if truth:
+        handles.append(Line2D([], [], color="black", lw=0.9, ls="--", label="true latent function"))
+        handles.append(Line2D([], [], color="black", lw=1, ls=":", label="true E[λ]"))
     if table.soft:
         handles.append(Line2D([], [], color=_BLUE, lw=0.9, ls="-.", label="mean of soft spots"))
     _legend(
@@ -326,9 +333,7 @@ def latent_figure(
             Line2D([], [], color=_BLUE, lw=1.1, label="GP mean"),
             Patch(facecolor=_BLUE, alpha=0.45, label="± 2σ of the latent function"),
             Patch(facecolor=_SKY, alpha=0.3, label="± 2σ with noise"),
-            Line2D([], [], color="black", lw=0.9, ls="--", label="true latent function"),
             Line2D([], [], color=_ORANGE, lw=1.1, label="predicted E[λ]"),
-            Line2D([], [], color="black", lw=1, ls=":", label="true E[λ]"),
             *handles,
             Patch(facecolor="0.4", alpha=0.12, label="steeper: 1 cell in 1000"),
             Patch(facecolor="0.4", alpha=0.35, label="steeper: no cell of the class"),

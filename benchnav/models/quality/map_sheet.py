@@ -28,7 +28,9 @@ TITLES = {
     "class_true": "True class",
     "class_found": "Most likely class",
     "expected_true": "True E[λ]",
+    "observed": "Observed λ",
     "expected": "Predicted E[λ]",
+    "error_observed": "E[λ] − observed λ",
     "error": "Error of E[λ]",
     "width": "90 % interval of λ",
     "entropy": "Entropy",
@@ -37,7 +39,9 @@ TITLES = {
 
 _UNITS = {
     "expected_true": "λ",
+    "observed": "λ",
     "expected": "λ",
+    "error_observed": "predicted − observed",
     "error": "predicted − true",
     "width": "width",
     "entropy": "nats",
@@ -82,15 +86,16 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
     terrain = dataset.terrain(split, indices)
     with torch.inference_mode():
         mixture = predict(model, terrain)
-        true = Oracle().predict_terrain(terrain).mean()
+        known = dataset.truth == "generated"
+        true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if isinstance(model, ClassModel):
             classes = class_probabilities(mixture, len(model.class_names))
             layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
         layers |= {
-            "expected_true": true,
+            "expected_true" if known else "observed": true,
             "expected": mixture.mean(),
-            "error": mixture.mean() - true,
+            "error" if known else "error_observed": mixture.mean() - true,
             "width": mixture.var(0.05) - mixture.var(0.95),
         }
         if isinstance(model, ClassModel):
@@ -120,18 +125,22 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
     }  # fmt: skip
     share = {"cmap": "viridis", "vmin": 0, "vmax": 1}
     scales: dict[str, dict[str, Any]] = {
-        "rgb": {}, "class_true": kinds, "class_found": kinds, "expected_true": share, "expected": share
+        "rgb": {}, "class_true": kinds, "class_found": kinds, "expected_true": share, "observed": share,
+        "expected": share,
     }  # fmt: skip
     for name, palette in (
         ("error", "RdBu_r"),
+        ("error_observed", "RdBu_r"),
         ("width", "magma"),
         ("entropy", "magma"),
         ("information", "magma"),
     ):
         values = [np.abs(sheet.layers[name]).ravel() for sheet in sheets if name in sheet.layers]
         if values:
-            most = _round_up(float(np.nanquantile(np.concatenate(values), _SHOWN_SHARE)))
-            scales[name] = {"cmap": palette, "vmin": -most if name == "error" else 0, "vmax": most}
+            shown = np.concatenate(values)
+            shown = shown[np.isfinite(shown)]
+            most = _round_up(float(np.quantile(shown, _SHOWN_SHARE)) if len(shown) else 0.0)
+            scales[name] = {"cmap": palette, "vmin": -most if name.startswith("error") else 0, "vmax": most}
     return scales
 
 
@@ -150,7 +159,7 @@ def map_sheet_figure(
     width_m, height_m = sheet.extent_m
     high = _PANEL * float(np.clip(height_m / width_m, 0.3, 3))
     shown = _shown_classes(sheet)
-    lacking = bool(np.isnan(sheet.layers["error"]).any())
+    lacking = any(bool(np.isnan(layer).any()) for layer in sheet.layers.values())
     legend_rows = -(-(len(shown) + lacking) // _LEGEND_COLUMNS)
     bottom = _TOP + len(sheet.indices) * (high + _GAP) - _GAP
     size = (
@@ -185,10 +194,13 @@ def map_sheet_figure(
         write(figure, middle, bottom + 0.2, "x [m]", ha="center", va="top")
         if name in _UNITS:
             bar = add_axes(figure, (left + 0.06, bottom + 0.42, _PANEL - 0.12, 0.07), f"{name} bar")
-            extend = {"error": "both", "expected": "neither", "expected_true": "neither"}.get(name, "max")
+            extend = "both" if name.startswith("error") else "max"
+            extend = "neither" if name in ("expected", "expected_true", "observed") else extend
             drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
             drawn.outline.set_linewidth(0.5)
-            bar.xaxis.set_major_locator(MaxNLocator(2 if name == "error" else 4, steps=[1, 2, 2.5, 5, 10]))
+            bar.xaxis.set_major_locator(
+                MaxNLocator(2 if name.startswith("error") else 4, steps=[1, 2, 2.5, 5, 10])
+            )
             bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             thin_ticks(bar)
             write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")

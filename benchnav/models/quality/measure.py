@@ -26,6 +26,7 @@ from benchnav.device import CPU, exact_convolutions
 from benchnav.errors import CheckpointError, DatasetError
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
+from benchnav.models.nets.classifier import MeanIoU
 from benchnav.models.predictor import PRIVILEGED, AnyModel, ClassModel, EnsembleModel, predict
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.scores import (
@@ -66,7 +67,9 @@ class ClassQuality:
 
     Args:
         accuracy: share of cells whose most likely class is right.
-        miou: intersection over union, averaged over the classes that occur.
+        miou: intersection over union, averaged over the classes that occur in truth.
+        miou_predicted: the same over those that are predicted somewhere too, of which each that does not occur
+            counts as 0.
         ece: expected calibration error of the most likely class, 15 bins.
         brier: Brier score, the squared distance of the probabilities to the class that is there, 0–2.
         entropy: mean predictive entropy, in nats.
@@ -83,6 +86,7 @@ class ClassQuality:
 
     accuracy: float
     miou: float
+    miou_predicted: float
     ece: float
     brier: float
     entropy: float
@@ -101,7 +105,8 @@ class TraversabilityQuality:
 
     Args:
         rmse_observed: root mean square of E[λ] − λ as realised.
-        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none.
+        rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none
+            or the truth is not known.
         nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1.
         crps: continuous ranked probability score of λ as realised.
         coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
@@ -184,11 +189,11 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    alike = twins(dataset.recipe.classes)
+    alike, truth = twins(dataset.recipe.classes), dataset.truth == "generated"
     for split in choose_splits(model, dataset, splits):
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
         chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))
-        yield split, measure(model, chunks, generator, alike)
+        yield split, measure(model, chunks, generator, alike, truth)
 
 
 def measure(
@@ -196,6 +201,7 @@ def measure(
     chunks: Iterable[Terrain],
     generator: torch.Generator,
     alike: Sequence[tuple[int, ...]] = (),
+    truth: bool = True,
 ) -> Quality:
     """Measures a model on some maps.
 
@@ -204,6 +210,7 @@ def measure(
         chunks: the maps, at least one, a few at a time.
         generator: of the draws within atoms, on the CPU.
         alike: of each class those that look like it, itself among them; empty where none do.
+        truth: whether the maps' true distribution of λ is known.
     """
     maps, cells, sums = 0, 0, torch.zeros(7, dtype=torch.float64)
     histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
@@ -222,7 +229,7 @@ def measure(
             classes[0].add(probabilities, members, terrain.class_id, terrain.slope_deg)
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    squared_expected = float(sums[5] / sums[6])
+    squared_expected = float(sums[5] / sums[6]) if truth else math.nan
     squared_observed, nll, score, covered, in_tail = (sums[:5] / cells).tolist()
     return Quality(
         maps=maps,
@@ -270,7 +277,8 @@ class _ClassTally:
         self.by_class = MetricCollection(
             {
                 "accuracy": MulticlassAccuracy(count, average="micro"),
-                "miou": MulticlassJaccardIndex(count, average="macro"),
+                "miou": MeanIoU(count),
+                "miou_predicted": MulticlassJaccardIndex(count, average="macro"),
                 "confusion": MulticlassConfusionMatrix(count),
             }
         ).to(device)
@@ -308,6 +316,7 @@ class _ClassTally:
         return ClassQuality(
             accuracy=float(by_class["accuracy"]),
             miou=float(by_class["miou"]),
+            miou_predicted=float(by_class["miou_predicted"]),
             ece=calibration_error(curve),
             brier=float(self.brier.compute()),
             entropy=self.entropy.mean,

@@ -19,6 +19,7 @@ from benchnav.models.quality.words import COLUMNS, caption
 HEADINGS = {
     "accuracy": "accuracy\n",
     "miou": "mIoU\n",
+    "miou_predicted": "mIoU\n∪ pred.",
     "twin_accuracy": "accuracy\ntwins=1",
     "twin_miou": "mIoU\ntwins=1",
     "twin_share_error": "twins\noff ½",
@@ -38,6 +39,7 @@ HEADINGS = {
 }
 TWINS = ("twin_accuracy", "twin_miou", "twin_share_error", "twin_share_ece")  # where classes look alike
 _FILES_ONLY = (
+    "miou_predicted",
     "entropy",
     "mutual_information",
     "twin_miou",
@@ -153,8 +155,12 @@ def _has_twins(quality: Quality) -> bool:
 
 
 def _shown(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of the numbers that some split has."""
-    return [name for name in HEADINGS if any(math.isfinite(row.get(name, math.nan)) for row in rows.values())]
+    """Names of the numbers that some split has, and of the one whose truth may be unknown."""
+    return [
+        name
+        for name in HEADINGS
+        if name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values())
+    ]
 
 
 def _decimal(value: float | None) -> str:

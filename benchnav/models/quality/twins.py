@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 from torchmetrics import MetricCollection
-from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
+from torchmetrics.classification import MulticlassAccuracy
 
+from benchnav.models.nets.classifier import MeanIoU
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 
 
@@ -22,7 +23,7 @@ class TwinQuality:
 
     Args:
         twin_accuracy: share of cells whose most likely class is right, look-alikes merged into one.
-        twin_miou: intersection over union, look-alikes merged, averaged over the classes that occur.
+        twin_miou: intersection over union, look-alikes merged, averaged over the classes that occur in truth.
         twin_share_error: over the cells of classes with look-alikes, mean distance of the share of the
             true class within them to that which a perfect classifier says: 1/2 of two.
         twin_share_ece: expected calibration error of the larger share, 15 bins.
@@ -51,7 +52,7 @@ class TwinTally:
         self.scores = MetricCollection(
             {
                 "accuracy": MulticlassAccuracy(count, average="micro"),
-                "miou": MulticlassJaccardIndex(count, average="macro"),
+                "miou": MeanIoU(count),
             }
         ).to(device)
         self.curve = ReliabilityCurve().to(device)

@@ -6,7 +6,9 @@ from collections.abc import Iterable
 COLUMNS = {
     "accuracy": "share of cells whose most likely class is the true one; 1 is perfect.",
     "miou": "mean intersection over union: the cells where a class is both predicted and true, over those where it is "
-    "either, in the mean over classes; 1 is perfect.",
+    "either, in the mean over the classes that occur in truth; 1 is perfect.",
+    "miou_predicted": "the same in the mean over the classes that are true or predicted somewhere; one that never "
+    "occurs counts as 0 as soon as a cell is taken for it.",
     "twin_accuracy": "accuracy with classes of one colour counted as one, as no image tells them apart; 1 is perfect.",
     "twin_miou": "mean intersection over union with classes of one colour counted as one; 1 is perfect.",
     "twin_share_error": "of two classes that share a colour, how far the share of the true one is from ½, which is all "
@@ -23,7 +25,8 @@ COLUMNS = {
     "mutual_information_auroc": "the same of mutual information.",
     "rmse_observed": "typical distance of the predicted mean to λ as observed; the noise of the ground stays in it, "
     "even for a perfect model.",
-    "rmse_expected": "typical distance of the predicted mean to the true mean of λ; 0 is perfect.",
+    "rmse_expected": "typical distance of the predicted mean to the true mean of λ; 0 is perfect, and – stands where "
+    "the true mean is unknown.",
     "nll": "minus the logarithm of the predicted density at λ as observed, in the mean; lower is better, and it may be "
     "negative.",
     "crps": "continuous ranked probability score: distance of the predicted distribution to λ as observed, in units of "
@@ -61,13 +64,14 @@ _FIGURES = {
     ),
     "latent": (
         "What the Gaussian processes have learned",
-        "Traversability over slope, class by class, beside the truth in black. Where it is grey, few of the measured "
-        "cells are as steep, or none.",
+        "Traversability over slope, class by class, beside the truth in black where it is known. Where it is grey, few "
+        "of the measured cells are as steep, or none.",
     ),
     "maps": (
         "Maps of",
-        "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty. A quantity "
-        "has the same scale in all sheets of an evaluation.",
+        "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty; where the "
+        "true distribution of λ is unknown, λ as observed stands for it. A quantity has the same scale in all sheets "
+        "of an evaluation.",
     ),
 }
 

@@ -91,10 +91,13 @@ def read_cells(dataset: TerrainDataset, split: str, chunk_cells: int = CHUNK_CEL
 
 
 def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
-    """Splits cells at random, class by class.
+    """Splits cells class by class: those held out follow one another, from a place that is drawn.
+
+    Rows that a robot logs one after the other are alike, so that single rows drawn from among them would tell how well
+    neighbours are known rather than the ground of another drive.
 
     Args:
-        cells: of any classes.
+        cells: of any classes, in the order in which they were driven over.
         share: of each class's cells to hold out, in (0, 1); rounded down, so that one cell is kept.
         seed: root seed of the draw.
 
@@ -116,8 +119,8 @@ def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
     key = rng.stream_key(seed, "models", "held-out cells")
     held = torch.zeros(len(cells), dtype=torch.bool)
     for c, (count, few) in enumerate(zip(counts.tolist(), out.tolist(), strict=True)):
-        order = torch.from_numpy(rng.permutation(key, np.array([c]), count)[0])
-        held[(cells.class_id == c).nonzero().flatten()[order[:few]]] = True
+        first = int(rng.uniform(key, np.array([c]))[0] * (count - few + 1))
+        held[(cells.class_id == c).nonzero().flatten()[first : first + few]] = True
     return cells.select(~held), cells.select(held)
 
 

@@ -1,4 +1,4 @@
-"""A robot's own slip logs: a table with a row for each place driven over, CSV or Parquet.
+"""A robot's own slip logs: a table with a row for each place driven over, CSV, TSV or Parquet.
 
 Columns: `class` (a class's name, or its integer id), `slope_deg` (0–90) and `traversability` (λ, 0–1;
 1 minus the slip ratio where the robot holds its commanded speed). Others are ignored, and so are rows
@@ -7,7 +7,9 @@ in which slope or traversability is missing.
 
 import difflib
 import hashlib
+import re
 import warnings
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,10 +21,12 @@ from torch import Tensor
 from benchnav.errors import DatasetError
 from benchnav.models.slope_gp.cells import Cells, observed_cells
 
+ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
 COLUMNS = ("class", "slope_deg", "traversability")
 
 _LIMITS = {"slope_deg": 90, "traversability": 1}
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
+_ENOUGH = 20  # rows of which some would be steeper than 1.6° if slopes were in degrees
 _MOST_CLASSES = 256  # class ids are stored in a byte
 
 
@@ -72,7 +76,7 @@ def read_slip_logs(path: str | Path) -> SlipLogs:
     """Reads a slip log.
 
     Args:
-        path: a file that ends in .csv or .parquet.
+        path: a file that ends in one of `ENDINGS`.
 
     Raises:
         DatasetError: there is no such file, it cannot be read, lacks a column or rows, or a value is no
@@ -93,6 +97,12 @@ def read_slip_logs(path: str | Path) -> SlipLogs:
             f"Expected rows with a slope and a traversability in {path}, got none among {len(rows)}. "
             "Log places that the robot has driven over."
         )
+    steepest = numbers["slope_deg"][observed].max()
+    if 0 < steepest <= np.pi / 2 and observed.sum() >= _ENOUGH:
+        raise DatasetError(
+            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {observed.sum()} rows, as of "
+            "radians. Multiply radians by 57.2958; where the ground is that level, write 0."
+        )
     names, by_id, ids = _read_classes(rows["class"], observed, path)
     slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -107,8 +117,8 @@ def read_slip_logs(path: str | Path) -> SlipLogs:
 
 
 def _read(path: Path) -> pd.DataFrame:
-    if path.suffix not in (".csv", ".parquet"):
-        raise DatasetError(f"Expected a slip log that ends in .csv or .parquet, got {path}.")
+    if not path.name.endswith(ENDINGS):
+        raise DatasetError(f"Expected a slip log that ends in {', '.join(ENDINGS)}, got {path}.")
     if not path.is_file():
         raise DatasetError(f"Expected a slip log, got {path}, which is not there.")
     try:
@@ -117,9 +127,16 @@ def _read(path: Path) -> pd.DataFrame:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # As text: a class may be called NA, and a bad number is to be found in its row.
-            rows = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, index_col=False)
+            rows = pd.read_csv(
+                path,
+                sep="\t" if ".tsv" in path.suffixes else ",",
+                dtype=str,
+                keep_default_na=False,
+                skipinitialspace=True,
+                index_col=False,
+            )
         return rows.rename(columns=str.strip)
-    except (OSError, ValueError, pd.errors.ParserWarning) as error:
+    except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
         why = str(error).strip().splitlines()
         raise DatasetError(
             f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be "
@@ -154,6 +171,14 @@ def _read_classes(
             f"Expected a `class` in every row of {path}, got none in row {absent[0] + 1} below the header."
         )
     found = text.to_numpy(dtype=str)[observed]
+    if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
+        # pandas writes ids so where some are missing: 0.0
+        broken = [name for name in found if float(name) % 1]
+        if broken:
+            raise DatasetError(
+                f"Expected class ids as whole numbers in {path}, got {broken[0]}. Number or name the classes."
+            )
+        found = np.array([name.partition(".")[0] for name in found])
     names, ids = np.unique(found, return_inverse=True)
     by_id = all(name.isascii() and name.isdigit() for name in names)
     count = max(int(name) for name in names) + 1 if by_id else len(names)

@@ -23,12 +23,13 @@ class KeepBest(Callback):
 
     def __init__(self) -> None:
         """Starts with none."""
-        self.loss = float("inf")
+        self.loss, self.validated = float("inf"), False
         self.metrics: dict[str, float] = {}
         self.weights: dict[str, Tensor] = {}
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Copies the weights when they are the best so far."""
+        self.validated = True
         found = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
         if found["valid_loss"] < self.loss:
             self.loss, self.metrics = found["valid_loss"], {**found, "epoch": trainer.current_epoch + 1}
@@ -36,6 +37,11 @@ class KeepBest(Callback):
 
     def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Puts the best weights back."""
+        if not self.weights and not self.validated:
+            raise ConfigError(
+                "Expected settings of `trainer` under which the split valid is measured, got an end of training before "
+                "it ever was. Train for longer, or validate more often."
+            )
         if not self.weights:
             raise ConfigError(
                 "Expected a finite validation loss, got none. Train with a lower `learning_rate`."

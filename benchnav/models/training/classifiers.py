@@ -3,15 +3,14 @@
 from dataclasses import asdict
 
 import torch
-from torchmetrics.classification import MulticlassJaccardIndex
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER, Part, as_stored, member_name, member_names
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.training.data import VALID, MapData, MapDataset, read_maps, training_digest
-from benchnav.models.training.fit import FitOptions, fit_network, is_first_process, say
+from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
+from benchnav.models.training.data import VALID, MapData, MapDataset, check_known, read_maps, training_digest
+from benchnav.models.training.fit import FitOptions, check_network, fit_network, is_first_process, say
 from benchnav.models.training.target import Target
 from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
 
@@ -50,6 +49,19 @@ def fit_classifier(
     return model.cpu(), metrics
 
 
+def check_classifier(config: ClassifierConfig, dataset: TerrainDataset, options: FitOptions) -> None:
+    """Refuses a classifier that could not be trained, before anything is.
+
+    Raises:
+        ConfigError: its settings or those of the trainer do not fit.
+        DatasetError: the maps are too few, or none of their cells has a class.
+    """
+    check_known(dataset, "class_id")
+    network = TerrainClassifier(config, len(dataset.recipe.classes), torch.zeros(3), torch.ones(3))
+    image = torch.zeros(1, 3, *dataset.grid.shape, dtype=torch.uint8)
+    check_network(network, [image], config, dataset, options)
+
+
 def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, float]:
     """Measures a classifier as training does: `valid_loss`, `valid_accuracy` and `valid_miou`.
 
@@ -58,17 +70,18 @@ def measure_classifier(model: TerrainClassifier, maps: MapDataset) -> dict[str, 
         maps: with `rgb` and `class_id`.
     """
     device, loss, right, cells = model.device, 0.0, 0, 0
-    miou = MulticlassJaccardIndex(model.class_count, ignore_index=UNLABELLED).to(device)
+    miou = MeanIoU(model.class_count, ignore_index=UNLABELLED).to(device)
     with torch.inference_mode():
-        for indices, some in maps.chunks(device):
+        for _, some in maps.chunks(device):
             logits, class_id = model(some["rgb"]), some["class_id"].long()
-            loss += float(model.loss(logits, class_id)) * len(indices)
+            labelled = int((class_id != UNLABELLED).sum())
+            loss += float(model.loss(logits, class_id)) * labelled
             chosen = logits.argmax(1)
             right += int((chosen == class_id).sum())
-            cells += int((class_id != UNLABELLED).sum())
+            cells += labelled
             miou.update(chosen, class_id)
     return {
-        "valid_loss": loss / len(maps),
+        "valid_loss": loss / max(1, cells),
         "valid_accuracy": right / max(1, cells),
         "valid_miou": float(miou.compute()),
     }
@@ -86,7 +99,7 @@ def train_members(
     """Trains the classifiers that a checkpoint lacks, with the seeds `seed`, `seed` + 1, …, and pools them all."""
     for index in range(members):
         part = member_name(index)
-        if not target.holds(part, asdict(config), seed + index, asdict(ClassifierConfig())):
+        if not target.holds(part, asdict(config), seed + index, asdict(ClassifierConfig()), half_precision):
             target.add(part, _train_member(config, dataset, seed + index, options, part, half_precision))
     _calibrate_pool(target, dataset, seed, options.place)
 
@@ -113,6 +126,7 @@ def _train_member(
         data_id=dataset.id,
         data_digest=training_digest(dataset),
         half_precision=half_precision,
+        trainer=options.trainer_settings,
     )
 
 

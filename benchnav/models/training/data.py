@@ -18,6 +18,7 @@ from torchvision.transforms.v2 import functional as photometry
 
 from benchnav import rng
 from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
+from benchnav.datagen.schema import UNLABELLED
 from benchnav.device import CPU
 from benchnav.errors import ConfigError, DatasetError
 
@@ -198,8 +199,7 @@ class MapData(lightning.LightningDataModule):
             raise ConfigError(f"Expected `batch_size` ≥ 2, got {batch_size}.")
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
         self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
-        if len(self.train) < 2:
-            raise DatasetError(f"Expected at least 2 training maps in {dataset.path}, got {len(self.train)}.")
+        check_maps(dataset)
         self.digest = training_digest(dataset)
 
     def colour_statistics(self) -> tuple[Tensor, Tensor]:
@@ -233,9 +233,39 @@ class MapData(lightning.LightningDataModule):
         )  # fmt: skip
 
 
+def check_maps(dataset: TerrainDataset) -> None:
+    """Refuses a dataset with fewer than two maps to train on, or none to measure on.
+
+    Raises:
+        DatasetError: there are too few.
+    """
+    for split, least in ((TRAIN, 2), (VALID, 1)):
+        if dataset.map_count(split) < least:
+            raise DatasetError(
+                f"Expected at least {least} maps in split {split} of {dataset.path}, got {dataset.map_count(split)}."
+            )
+
+
+def check_known(dataset: TerrainDataset, field: str) -> None:
+    """Refuses maps that a network cannot learn from since no cell has what it learns.
+
+    Args:
+        dataset: the maps.
+        field: `class_id` or `traversability`.
+
+    Raises:
+        DatasetError: in `train` or `valid` none has.
+    """
+    what = {"class_id": "cells with a class", "traversability": "observed traversability"}[field]
+    for split in (TRAIN, VALID):
+        chunks = (maps[field] for _, maps in dataset.chunks(split, (field,)))
+        if not any(bool((np.isfinite(values) & (values != UNLABELLED)).any()) for values in chunks):
+            raise DatasetError(f"Expected {what} in split {split} of {dataset.path} to learn from, got none.")
+
+
 def training_digest(dataset: TerrainDataset) -> str:
-    """Content digest of what of a dataset is trained on."""
-    return ",".join(f"{name}:{dataset.splits[name]['digest']}" for name in (TRAIN, VALID))
+    """Digest of what of a dataset is trained on, and of what its maps mean."""
+    return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))
 
 
 def read_maps(

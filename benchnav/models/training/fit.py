@@ -13,7 +13,7 @@ import os
 import pickle
 import signal
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -25,14 +25,17 @@ from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from torch import Tensor
 
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.device import find_device
 from benchnav.errors import CheckpointError, ConfigError
 from benchnav.files import sole_writer, write_text
 from benchnav.models.checkpoint import as_stored
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.training.callbacks import History, KeepBest, Progress, WholeFiles, measured
-from benchnav.models.training.data import MapData, MapDataset
+from benchnav.models.training.data import TRAIN, VALID, MapData, MapDataset, check_maps
+from benchnav.options import one_line
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 
@@ -48,6 +51,14 @@ _OWN |= {
     "model_registry",
     "profiler",
 }
+
+
+_OF_NO_ACCOUNT = {
+    "max_epochs",
+    "log_every_n_steps",
+    "detect_anomaly",
+    "accelerator",
+}  # to the outcome, or said elsewhere
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +107,22 @@ class FitOptions:
         """The device."""
         return find_device(self.device)
 
+    @property
+    def trainer_settings(self) -> dict[str, Any]:
+        """The settings of the trainer on which the outcome of a network's training depends, as plain data."""
+        defaults = inspect.signature(lightning.Trainer.__init__).parameters
+        chosen = {
+            name: value
+            for name, value in self.chosen().items()
+            if name not in _OF_NO_ACCOUNT and value != defaults[name].default
+        }
+        return json.loads(json.dumps(chosen, default=str, sort_keys=True))
+
+    def chosen(self, **trainer: Any) -> dict[str, Any]:
+        """All settings of the trainer, of those given here and others, by name."""
+        chosen: dict[str, Any] = {"devices": 1, **trainer, **self.trainer, "accelerator": self.place.type}
+        return {"precision": default_precision(self.place.type), **chosen}
+
 
 def fit(
     module: lightning.LightningModule,
@@ -127,9 +154,7 @@ def fit(
         KeyboardInterrupt: the user has stopped it.
     """
     folder = options.folder / part if options.folder else None
-    chosen: dict[str, Any] = {"devices": 1, **trainer, **options.trainer}
-    chosen["accelerator"] = options.place.type
-    chosen.setdefault("precision", default_precision(chosen["accelerator"]))
+    chosen = options.chosen(**trainer)
     callbacks = [*callbacks, Progress(part)]
     with _quiet():
         if folder is None:
@@ -138,7 +163,8 @@ def fit(
             return measured(lightning_trainer)
         with sole_writer(folder, f"{folder}") if is_first_process() else nullcontext():
             folder.mkdir(parents=True, exist_ok=True)
-            state = _prepare(folder, options.resume, {**settings, "precision": chosen["precision"]})
+            trainers = {f"trainer.{name}": value for name, value in options.trainer_settings.items()}
+            state = _prepare(folder, options.resume, {**settings, **trainers})
             keep = ModelCheckpoint(
                 folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
             )
@@ -150,6 +176,58 @@ def fit(
             )
             _run(lightning_trainer, module, data, state)
             return measured(lightning_trainer)
+
+
+def check_network(
+    network: lightning.LightningModule,
+    inputs: Sequence[Tensor],
+    config: ClassifierConfig | MDNConfig,
+    dataset: TerrainDataset,
+    options: FitOptions,
+) -> None:
+    """Refuses what could not be trained before anything is: builds the trainer and tries the network on a batch.
+
+    Args:
+        network: like the one that is to be trained; it is not to be used afterwards.
+        inputs: what it takes of one map, each of shape [1, *, H, W].
+        config: its settings.
+        dataset: the maps.
+        options: how it is to be trained.
+
+    Raises:
+        ConfigError: Lightning or the network does not take the settings, or nothing would be trained or measured.
+        DatasetError: there are too few maps.
+    """
+    check_maps(dataset)
+    with _quiet():
+        trainer = _trainer(
+            [], logger=False, enable_checkpointing=False, **options.chosen(max_epochs=config.max_epochs)
+        )
+    every = trainer.check_val_every_n_epoch
+    if every is not None and every > config.max_epochs:
+        raise ConfigError(
+            f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
+            f"got {every}."
+        )
+    sizes = {}
+    for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
+        maps, limit = dataset.map_count(split), getattr(trainer, name)
+        batches = -(-maps // config.batch_size)
+        sizes[split] = maps // batches
+        if (batches * limit if isinstance(limit, float) else limit) < 1:
+            raise ConfigError(
+                f"Expected `trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
+                "Leave it out to take all."
+            )
+    try:
+        with torch.no_grad():
+            network.train()(*(values.expand(sizes[TRAIN], *values.shape[1:]) for values in inputs))
+    except (RuntimeError, ValueError, TypeError, AssertionError) as error:
+        height, width = dataset.grid.shape
+        raise ConfigError(
+            f"Expected a network that takes batches of {sizes[TRAIN]} maps of {height}×{width} cells, got "
+            f"{config.architecture} of {config.encoder}, which does not: {one_line(error)} Choose another."
+        ) from error
 
 
 def fit_network(
@@ -182,7 +260,7 @@ def fit_network(
         network,
         part,
         options,
-        {"config": asdict(config), "data": data.digest, "seed": seed},
+        {"config": asdict(config), "data": data.digest, "seed": seed, "half_precision": half_precision},
         [KeepBest(), stopping],
         {"datamodule": data},
         max_epochs=config.max_epochs,
@@ -262,6 +340,10 @@ def _run(
     except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
         signal.signal(signal.SIGINT, handler)
         raise KeyboardInterrupt from None
+    except MisconfigurationException as error:
+        raise ConfigError(
+            f"Expected settings of `trainer` that Lightning takes, got: {one_line(error)}"
+        ) from error
     except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
         if state is None or trainer.global_step:
             raise

@@ -9,8 +9,8 @@ from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import Part
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MDN, MixtureDensityNetwork, censored_nll
-from benchnav.models.training.data import MapData, MapDataset, training_digest
-from benchnav.models.training.fit import FitOptions, fit_network, say
+from benchnav.models.training.data import MapData, MapDataset, check_known, training_digest
+from benchnav.models.training.fit import FitOptions, check_network, fit_network, say
 
 _DEFAULT = FitOptions()
 
@@ -46,6 +46,19 @@ def fit_mdn(
     network = MixtureDensityNetwork(config, *data.colour_statistics(), scale, seed)
     metrics = fit_network(network, MDN, config, data, seed, options, half_precision, measure_network)
     return network.cpu(), metrics
+
+
+def check_mdn(config: MDNConfig, dataset: TerrainDataset, options: FitOptions) -> None:
+    """Refuses a network that could not be trained, before anything is.
+
+    Raises:
+        ConfigError: its settings or those of the trainer do not fit.
+        DatasetError: the maps are too few, or no traversability was observed in them.
+    """
+    check_known(dataset, "traversability")
+    network = MixtureDensityNetwork(config, torch.zeros(3), torch.ones(3), torch.ones(()))
+    image = torch.zeros(1, 3, *dataset.grid.shape, dtype=torch.uint8)
+    check_network(network, [image, torch.zeros(1, *dataset.grid.shape)], config, dataset, options)
 
 
 def measure_network(network: MixtureDensityNetwork, maps: MapDataset) -> dict[str, float]:
@@ -86,4 +99,5 @@ def train_mdn_part(
         data_id=dataset.id,
         data_digest=training_digest(dataset),
         half_precision=half_precision,
+        trainer=options.trainer_settings,
     )

@@ -49,6 +49,7 @@ class Target:
         config: Mapping[str, Any],
         seed: int,
         defaults: Mapping[str, Any] = MappingProxyType({}),
+        half_precision: bool | None = None,
     ) -> bool:
         """Tells whether an interrupted run has left a part, trained in the same way.
 
@@ -57,6 +58,8 @@ class Target:
             config: settings of its training.
             seed: its root seed.
             defaults: what settings are that a part of an earlier version does not name.
+            half_precision: of a network, whether its kernels are kept as float16; such a part was trained under the
+                settings of the trainer as well.
 
         Raises:
             CheckpointError: it was trained in another way.
@@ -67,15 +70,25 @@ class Target:
         wanted, there = (
             json.loads(json.dumps(dict(settings))) for settings in (config, {**defaults, **part.config})
         )
-        if wanted.items() <= there.items() and (part.seed, part.data_digest) == (seed, self.digest):
+        others = [key for key, value in wanted.items() if there.get(key) != value]
+        if half_precision is not None:
+            others += ["half_precision"] * (half_precision != part.half_precision)
+            # A part of an earlier version does not say under which settings of the trainer it was trained.
+            asked = self.options.trainer_settings
+            known = asked if part.trainer is None else dict(part.trainer)
+            others += [
+                f"trainer.{key}" for key in sorted({*asked, *known}) if asked.get(key) != known.get(key)
+            ]
+        if not others and (part.seed, part.data_digest) == (seed, self.digest):
             self._forget(name)  # a kill may have come between saving and forgetting
             return True
         remedy = "pass --overwrite instead of --resume"
         if self.options.folder and interrupted(self.options.folder, [name]):
             remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
+        named = f", another {' and '.join(f'`{key}`' for key in others)}" if others else ""
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
-            f"{part.seed} and {part.data_id}. Repeat its settings, or {remedy}."
+            f"{part.seed} and {part.data_id}{named}. Repeat its settings, or {remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:

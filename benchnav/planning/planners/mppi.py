@@ -7,10 +7,15 @@ model-based reinforcement learning", algorithm 2; for γ, α and bounds Williams
 episodes, K samples, T horizon steps, S state, A action dimensions; in formulas u is the mean, ε the noise,
 Σ its covariance.
 
-What differs: samples are clipped to the action bounds before they are averaged, where Williams averages them
-as drawn and clips within F. The control cost, a ratio of densities, weighs the noise as drawn in both; it is
-off by default. The mean is not smoothed. Noise is read anew from one bank, a pure function of seed and step
-(`noise`); the episodes of a batch share it, so an episode has the same noise alone as in any batch.
+As in Williams et al. (2018), rollouts run on clipped actions F(x, clip(u + ε)), while the mean is moved by the
+noise as drawn: u ← clip(u + Σwε). Were clipped samples averaged, the mean would drift to the middle of the
+bounds wherever costs are flat, since samples beyond a bound are drawn back onto it. The mean is clipped too, so
+that it cannot wind up beyond the bounds, where no sample would reach back.
+
+What differs: noise and temperature are relative by default, so that one setting serves robots and objectives of
+any unit. The control cost is off by default. The mean is not smoothed. Noise is read anew from one bank, a pure
+function of seed and step (`noise`); the episodes of a batch share it, so an episode has the same noise alone as
+in any batch.
 """
 
 import math
@@ -22,6 +27,7 @@ from torch import Tensor
 
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
+from benchnav.planning.free_space import PRICE
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
@@ -34,6 +40,7 @@ _CHUNK_STEPS = 10
 _WORTH_COMPILING = 2000  # samples
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
 _DRAWN_SAMPLES = 40
+_LEAST_SPREAD = 1e-30  # where all samples cost alike, all weigh alike
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,29 +48,44 @@ class MPPIConfig:
     """Settings of MPPI; the paper gives none, these are ours.
 
     Args:
-        horizon: steps T.
+        horizon_s: how far rollouts look ahead, in seconds; T is the nearest number of steps, at least 1.
         samples: action sequences K.
-        noise: standard deviation of each sampled action; by default for (v, ω) in m/s and rad/s.
-        temperature: scale of cost below which samples count alike; λ in the source.
+        noise_share: standard deviation of each sampled action, as a share of the range from its least to its
+            greatest value.
+        noise: the same in the units of the actions, such as m/s and rad/s, in place of `noise_share`.
+        temperature_share: the scale of cost below which samples count alike, as a share of the spread of costs
+            (`cost_spread`) of the episode and step.
+        temperature: the same in the units of J, in place of `temperature_share`; λ in the source.
         control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the current mean
-            itself as the base distribution (α = 1 in the source), `temperature` takes 0 (α = 0).
+            itself as the base distribution (α = 1 in the source), the value of `temperature` takes 0 (α = 0).
     """
 
-    horizon: int = 50
+    horizon_s: float = 5.0
     samples: int = 5000
-    noise: tuple[float, ...] = (0.5, 0.5)
-    temperature: float = 0.5
+    noise_share: float = 0.5
+    noise: tuple[float, ...] | None = None
+    temperature_share: float = 0.1
+    temperature: float | None = None
     control_cost: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuses settings that sample nothing."""
-        for name in ("horizon", "samples", "temperature"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {getattr(self, name)}.")
-        if not self.noise or not all(0 < scale < math.inf for scale in self.noise):
+        for name in ("horizon_s", "samples", "noise_share", "temperature_share", "temperature"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {value}.")
+        if self.noise is not None and not (self.noise and all(0 < scale < math.inf for scale in self.noise)):
             raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
         if not 0 <= self.control_cost < math.inf:
             raise ConfigError(f"Expected `control_cost` ≥ 0 for MPPI, got {self.control_cost}.")
+
+    def steps(self, dt_s: float) -> int:
+        """Steps T of the horizon for a time step."""
+        return max(1, round(self.horizon_s / dt_s))
+
+    def scale(self, low: Tensor, high: Tensor) -> Tensor:
+        """Standard deviations of the noise for actions within bounds [A], shape [A]."""
+        return self.noise_share * (high - low) if self.noise is None else low.new_tensor(self.noise)
 
 
 @dataclass(frozen=True)
@@ -114,15 +136,16 @@ class MPPI:
             ConfigError: the robot has another number of actions than there are noise scales.
         """
         names, config = problem.robot.action_names, self.config
-        if len(names) != len(config.noise):
+        if config.noise is not None and len(names) != len(config.noise):
             raise ConfigError(
                 f"Expected option `noise` of MPPI with {len(names)} values, for {', '.join(names)}, "
                 f"got {config.noise}."
             )
         seed = int(torch.randint(2**62, (), generator=generator))
-        mean = problem.start.new_zeros(len(problem), config.horizon, len(names))
-        scale = problem.start.new_tensor(config.noise)
-        return MPPIState(problem, mean, scale, draw_bank(seed, config.horizon, config.samples, scale), 0)
+        low, high = problem.action_bounds
+        mean = problem.start.new_zeros(len(problem), config.steps(problem.dt_s), len(names))
+        scale = config.scale(low, high)
+        return MPPIState(problem, mean, scale, draw_bank(seed, mean.shape[1], config.samples, scale), 0)
 
     def plan(self, step: Step, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
         """Solves one step toward the goal; see `Planner`."""
@@ -139,7 +162,8 @@ class MPPI:
             cost = cost + config.control_cost * control_cost(mean, noise, plan_state.scale)
         weights, updated = self._weigh(
             states, cost, mean, noise, *problem.action_bounds, problem.padded_ground,
-            target_m[:, None].contiguous(), problem.grid, problem.objective, config.temperature,
+            target_m[:, None].contiguous(), problem.grid, problem.objective,
+            config.temperature, config.temperature_share,
         )  # fmt: skip
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
         plan = Plan.empty(len(problem), step.state.device)
@@ -247,22 +271,42 @@ def advance_chunk(
 
 def weigh(
     states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective, temperature: float,
+    padded_ground: Tensor, target: Tensor, grid: Grid, objective: Objective,
+    temperature: float | None, temperature_share: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Adds the cost of the last states and averages the samples by exp(−cost / temperature).
+    """Adds the cost of the last states, weighs the samples by exp(−cost / temperature) and moves the mean.
 
     Returns:
         Weights of the samples, shape [B, K], and the mean action sequences, shape [B, T, A].
     """
     ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
     cost = cost + terminal_cost(objective, states, ground, target)
-    weights = torch.softmax(-cost / temperature, dim=1)
+    scale = temperature_share * cost_spread(cost) if temperature is None else temperature
+    weights = torch.softmax((cost.amin(dim=1, keepdim=True) - cost) / scale, dim=1)
     return weights, average(mean, noise, weights, low, high)
 
 
+def cost_spread(cost: Tensor) -> Tensor:
+    """How far the costs of samples lie above the least, on average: the unit of the relative temperature.
+
+    Samples that pay the price of ground that is not free for more steps than the best does are left out: else the
+    temperature near such ground would be that of the price, and all ways over free ground would count alike.
+
+    Args:
+        cost: shape [B, K].
+
+    Returns:
+        More than 0, shape [B, 1].
+    """
+    excess = cost - cost.amin(dim=1, keepdim=True)
+    counted = excess < 0.5 * PRICE
+    spread = torch.where(counted, excess, 0).sum(dim=1, keepdim=True) / counted.sum(dim=1, keepdim=True)
+    return spread.clamp(min=_LEAST_SPREAD)
+
+
 def average(mean: Tensor, noise: Tensor, weights: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Averages the sampled action sequences by their weights w [B, K]: Σ w·clip(u + ε), shape [B, T, A]."""
-    return (_perturb(mean[..., None], noise, low, high) * weights[:, None, None]).sum(-1)
+    """Moves the mean by the noise as drawn, weighed by w [B, K]: clip(u + Σ w·ε), shape [B, T, A]."""
+    return torch.clamp(mean + (noise * weights[:, None, None]).sum(-1), low, high)
 
 
 def _perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:

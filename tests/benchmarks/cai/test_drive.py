@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.cai.drive import average_as_drawn, drive, has_arrived, move, traction_at
+from benchmarks.cai.drive import drive, has_arrived, move, traction_at
 from benchmarks.cai.task import STEPS, Setup, pose
 from benchmarks.cai.world import GRID, draw_vegetation
 from benchnav import rng
@@ -105,11 +105,3 @@ def test_traction_is_read_by_row_and_column_and_is_nothing_off_the_map() -> None
 def test_arrival_is_within_half_a_metre() -> None:
     state = torch.tensor([[8.5, 8.01, 0.0], [8.5, 7.99, 0.0], [8.1, 8.1, 0.0]])
     assert has_arrived(state).tolist() == [True, False, False]
-
-
-def test_the_average_as_drawn_reaches_the_bounds() -> None:
-    mean, noise = torch.tensor([[[3.0, 0.0]]]), torch.tensor([[[-1.0, 1.0], [0.5, 1.5]]])
-    weights, low, high = torch.full((1, 2), 0.5), torch.tensor([0.0, -1.0]), torch.tensor([3.0, 1.0])
-    averaged = average_as_drawn(mean, noise, weights, low, high)
-    assert averaged[0, 0].tolist() == [3.0, 1.0]
-    assert average_as_drawn(mean, noise, torch.tensor([[1.0, 0.0]]), low, high)[0, 0].tolist() == [2.0, 0.5]

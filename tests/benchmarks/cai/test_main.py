@@ -17,9 +17,13 @@ def test_a_changed_option_leaves_the_others_theirs() -> None:
     assert given() == Setup()
     changed = given("--setup.mppi.samples", "16", "--setup.risk_map", "histogram")
     assert changed.mppi.samples == 16
-    assert (changed.mppi.horizon, changed.mppi.control_cost) == (THEIR_MPPI.horizon, THEIR_MPPI.control_cost)
+    assert (changed.mppi.horizon_s, changed.mppi.control_cost) == (
+        THEIR_MPPI.horizon_s,
+        THEIR_MPPI.control_cost,
+    )
     assert changed.mppi.noise == THEIR_MPPI.noise
-    assert (changed.risk_map, changed.average) == ("histogram", "clipped")
+    assert changed.mppi.temperature == THEIR_MPPI.temperature == 1.0
+    assert changed.risk_map == "histogram"
 
 
 def test_trials_are_written_and_shown(

@@ -15,9 +15,11 @@ from benchnav.datagen.dem.importer import import_dem
 from benchnav.datagen.dem.raster import Layer
 from benchnav.datagen.dem.survey import Rasters
 from benchnav.datagen.files.check import find_faults
+from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.places import PlacesRule
-from benchnav.errors import BenchnavError, ConfigError
+from benchnav.datagen.schema import FIELDS
+from benchnav.errors import BenchnavError, ConfigError, DatasetError
 from tests.datagen.dem.rasters import (
     ANY,
     FLAT,
@@ -54,8 +56,8 @@ def test_the_manifest_says_where_the_maps_came_from(tmp_path: Path) -> None:
 
 
 def test_with_solvable_maps_behind_a_wall_are_left_out(tmp_path: Path) -> None:
-    values = np.zeros((16, 72))
-    values[:, 24 + 12 :] = 50  # through map 1, between start and goal
+    values = np.full((16, 72), 10.0)
+    values[:, 24 + 12 :] = 60  # through map 1, between start and goal
     flat = np.zeros((16, 72), np.uint8)
     dem, classes = write(tmp_path / "dem.tif", values), write(tmp_path / "classes.tif", flat)
     dataset = read(dem, classes=classes, solvable=True)
@@ -206,6 +208,48 @@ def test_maps_closer_than_their_width_overlap(tmp_path: Path) -> None:
     for number in range(9):
         own = values[::-1, 3 * number : 3 * number + 24].astype(np.float64)
         np.testing.assert_allclose(stored[number] + source["lowest_m"][number], own, atol=STEP)
+
+
+@pytest.mark.parametrize("suffix", [".h5", ""])
+def test_maps_that_overlap_are_of_one_group_and_ground_apart_is_of_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    monkeypatch.setattr(importer, "SHARD_CELLS", 4 * 16 * 24)  # several files of a split
+    values = rough(16, 160)
+    values[:, 70:80] = np.nan  # no map that shows these is kept
+    dataset = read(write(tmp_path / "dem.tif", values), stride_m=1.5, suffix=suffix)
+    assert dataset.field_names == (*FIELDS, "group")
+    assert dataset.manifest["format_version"] == "1.3"
+    kept, groups = np.array(source_of(dataset)["kept"]), dataset.read("test/real", fields=["group"])["group"]
+    assert groups.dtype == np.int64
+    assert set(kept) == {*range(16), *range(27, 46)}
+    assert len(set(groups[kept < 16])) == len(set(groups[kept > 16])) == 1
+    assert groups[0] != groups[-1]
+    some = dataset.read("test/real", [20, 3], ["group"])["group"]
+    assert some.tolist() == [groups[20], groups[3]]
+
+
+def test_the_numbers_of_groups_differ_between_grounds_and_maps_side_by_side_have_none(tmp_path: Path) -> None:
+    first, second = (write(tmp_path / f"{name}.tif", rough(16, 48, seed)) for seed, name in enumerate("ab"))
+    made = [read(dem, stride_m=1.5) for dem in (first, second)]
+    groups = [set(maps_of(dataset)["group"].tolist()) for dataset in made]
+    assert [len(own) for own in groups] == [1, 1]
+    assert not groups[0] & groups[1]
+    both = tmp_path / "both.h5"
+    for _ in merge([dataset.path for dataset in made], both):
+        pass
+    assert find_faults(both) == []
+    assert set(maps_of(TerrainDataset(both))["group"].tolist()) == groups[0] | groups[1]
+    plain = read(first)
+    assert plain.field_names == tuple(FIELDS)
+    with pytest.raises(DatasetError, match=r"unlike fields \(group of one alone\)"):
+        list(merge([made[1].path, plain.path], tmp_path / "neither.h5"))
+
+
+def test_the_truth_of_imported_ground_is_unknown(tmp_path: Path) -> None:
+    dataset = read(write(tmp_path / "dem.tif", FLAT))
+    assert source_of(dataset)["truth"] == "unknown"
+    assert dataset.truth == dataset.truth_of("test/real") == "unknown"
 
 
 @pytest.mark.parametrize("stride", [0.7, 0, -1, np.nan])

@@ -207,12 +207,77 @@ def test_ground_is_laid_where_metres_are_metres(tmp_path: Path, profile: dict[st
     assert source_of(read(write(tmp_path / "dem.tif", np.zeros((120, 120)), **profile)))["crs"] == crs
 
 
-def test_ground_off_the_earth_needs_metres_of_its_own(tmp_path: Path) -> None:
+# Radii in metres, the northing of a latitude, and how long a metre of ground is in the projection, eastward and
+# northward: closed forms of Snyder (1987), with the ellipsoid's radii of curvature N and M.
+def cylindrical(radius: float, _: float, latitude: float) -> tuple[float, float, float]:
+    return radius * latitude, 1 / np.cos(latitude), 1.0
+
+
+def mercator(semi_major: float, eccentricity: float, latitude: float) -> tuple[float, float, float]:
+    sine = eccentricity * np.sin(latitude)
+    isometric = np.arctanh(np.sin(latitude)) - eccentricity * np.arctanh(sine)
+    scale = np.sqrt(1 - sine**2) / np.cos(latitude)
+    return semi_major * isometric, scale, scale
+
+
+def web_mercator(semi_major: float, eccentricity: float, latitude: float) -> tuple[float, float, float]:
+    sine, cosine = eccentricity * np.sin(latitude), np.cos(latitude)
+    across, along = 1 / np.sqrt(1 - sine**2), (1 - eccentricity**2) / (1 - sine**2) ** 1.5
+    return semi_major * np.arctanh(np.sin(latitude)), 1 / (across * cosine), 1 / (along * cosine)
+
+
+BODIES = {
+    "moon": (cylindrical, "+proj=eqc +R=1737400 +units=m +no_defs", 1737400.0, 0.0),
+    "mars": (cylindrical, "IAU_2015:49910", 3396190.0, 0.0),
+    "mars ellipsoid": (mercator, "+proj=merc +a=3396190 +b=3376200 +units=m +no_defs", 3396190.0, 0.108337),
+    "earth": (web_mercator, "EPSG:3857", 6378137.0, 0.0818191908),
+}
+
+
+@pytest.mark.parametrize("latitude", [0, 60, 85])
+@pytest.mark.parametrize("body", BODIES)
+def test_slopes_are_those_of_the_ground_wherever_the_scale_of_the_map_is_another(
+    tmp_path: Path, body: str, latitude: int
+) -> None:
+    formula, crs, radius, eccentricity = BODIES[body]
+    north, across, along = formula(radius, eccentricity, np.radians(latitude))
+    east, cells = radius * np.radians(10), np.arange(80) - 39.5
+    values = 50 + 0.2 * 0.5 * cells - 0.1 * 0.5 * cells[:, None]  # rising 20 % eastward, 10 % northward
+    transform = rasterio.Affine(
+        across * 0.5, 0, east - 40 * across * 0.5, 0, -along * 0.5, north + 40 * along * 0.5
+    )
+    dataset = read(write(tmp_path / "dem.tif", values, crs=crs, transform=transform))
+    source, maps = source_of(dataset), maps_of(dataset)
+    # 40 m × 40 m of ground hold four rows of maps, and a column between the edges that interpolation lacks.
+    assert len(source["kept"]) >= 4
+    np.testing.assert_allclose(source["resolution_m"], 0.5, rtol=0.02)
+    inner = maps["slope_deg"][:, 2:-2, 2:-2]  # the raster's edge may lie oblique
+    np.testing.assert_allclose(inner, np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.1)
+    rises = (np.gradient(maps["elevation_m"][0], 0.5, axis=axis).mean() for axis in (1, 0))
+    # Northward is that of the projection: on the Earth UTM's grid is turned by its convergence.
+    turn = np.radians(7) if body == "earth" and latitude == 85 else 0.03
+    np.testing.assert_allclose(list(rises), [0.2, 0.1], atol=0.01 + 0.25 * turn)
+
+
+def test_ground_off_the_earth_may_be_in_degrees_and_its_own_metres_are_kept_where_they_are_true(
+    tmp_path: Path,
+) -> None:
     moon = "+proj=longlat +R=1737400 +no_defs"
-    profile = {"crs": moon, "transform": rasterio.Affine(1e-4, 0, 0, 0, -1e-4, 0)}
-    assert "projected CRS in metres" in refusal(write(tmp_path / "degrees.tif", FLAT, **profile))
+    cell = np.degrees(0.5 / 1737400)  # 0.5 m northward, and half of that eastward at 60°
+    profile = {"crs": moon, "transform": rasterio.Affine(2 * cell, 0, 20, 0, -cell, 60)}
+    maps = maps_of(read(write(tmp_path / "degrees.tif", plane(80, 80, 0.5), **profile)))
+    np.testing.assert_allclose(maps["slope_deg"], np.degrees(np.arctan(np.hypot(0.2, 0.1))), atol=0.02)
     plain = "+proj=stere +lat_0=-90 +R=1737400 +units=m +no_defs"
-    assert len(maps_of(read(write(tmp_path / "metres.tif", FLAT, crs=plain)))["rgb"]) == 1
+    near = write(tmp_path / "pole.tif", FLAT, crs=plain, transform=rasterio.Affine(0.5, 0, 100, 0, -0.5, 100))
+    assert source_of(read(near))["origin_m"] == [100, 92]
+
+
+def test_ground_that_no_map_shows_true_to_scale_is_refused(tmp_path: Path) -> None:
+    globe = {"crs": "+proj=eqc +R=1737400 +units=m +no_defs"}
+    globe |= {"transform": rasterio.Affine(136e3, 0, -5.44e6, 0, -136e3, 2.72e6)}
+    message = refusal(write(tmp_path / "globe.tif", np.zeros((40, 80)), **globe))
+    assert "small enough" in message
+    assert "rio clip" in message
 
 
 @pytest.mark.parametrize("turn", ["mirrored", "rotated"])
@@ -540,3 +605,41 @@ def test_traversability_out_of_range_is_refused_however_small_its_share(
     message = refusal(dem, traversability=measured, random_classes=True)
     assert "`traversability` in [0, 1]" in message
     assert f"--nodata {value}" in message
+
+
+@pytest.mark.parametrize("cell", [0.5, 0.25, 0.8])
+def test_zeros_for_missing_heights_are_refused_unless_something_is_declared(
+    tmp_path: Path, cell: float
+) -> None:
+    values = 900 + rough(64, 96)
+    values[:20, :30] = 0
+    message = refusal(write(tmp_path / "dem.tif", values, cell))
+    assert "If 0 stands for missing, declare it: rio edit-info --nodata 0" in message
+    declared = read(write(tmp_path / "zero.tif", values, cell, nodata=0))
+    assert source_of(declared)["left_out"]["missing_elevation"] > 0
+    kept = read(write(tmp_path / "other.tif", values, cell, nodata=-9999))
+    assert maps_of(kept)["slope_deg"].max() > 85  # a cliff at the sea, by their word
+    # Down to the sea by steps of less than a metre.
+    sea = write(tmp_path / "sea.tif", np.linspace(0, 30, 64)[:, None].repeat(96, 1).round(), cell)
+    assert len(maps_of(read(sea))["rgb"]) >= 1
+
+
+def test_a_map_of_no_class_is_kept_where_its_traversability_was_measured(tmp_path: Path) -> None:
+    dem = write(tmp_path / "dem.tif", rough(16, 72))
+    kinds = np.full((16, 72), 255, np.uint8)
+    kinds[:, :24] = 1
+    photo = np.full((3, 16, 72), 90, np.uint8)
+    measured = np.full((16, 72), np.nan, np.float32)
+    measured[4, 30] = 0.25  # of the second map alone
+    rasters = {
+        "classes": write(tmp_path / "classes.tif", kinds, nodata=255),
+        "photo": write(tmp_path / "photo.tif", photo),
+        "traversability": write(tmp_path / "measured.tif", measured),
+    }
+    dataset = read(dem, **rasters)
+    assert source_of(dataset)["kept"] == [0, 1]
+    assert source_of(dataset)["left_out"]["missing_classes"] == 1
+    maps = maps_of(dataset)
+    assert (maps["class_id"][1] == 255).all()
+    assert maps["traversability"][1, 11, 6] == 0.25
+    assert np.isnan(maps["traversability"][1]).sum() == 16 * 24 - 1

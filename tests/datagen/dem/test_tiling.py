@@ -2,6 +2,7 @@
 
 import itertools
 
+import networkx as nx
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -109,3 +110,27 @@ def test_shares_of_another_form_are_refused(text: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read_shares(text)
     assert said in str(caught.value)
+
+
+@given(
+    st.tuples(st.integers(1, 6), st.integers(1, 6)),
+    st.tuples(st.integers(1, 7), st.integers(1, 7)),
+    st.sets(st.integers(0, 41), min_size=1, max_size=25),
+)
+def test_maps_are_of_one_group_just_where_they_overlap_directly_or_by_others(
+    shape: tuple[int, int], stride: tuple[int, int], numbers: set[int]
+) -> None:
+    tiling = Tiling(shape=shape, stride=stride, tiles=(7, 6), strips={"train": range(7)})
+    own = sorted(numbers)
+    cells = {
+        number: {
+            (number // 6 * stride[0] + row, number % 6 * stride[1] + column)
+            for row in range(shape[0])
+            for column in range(shape[1])
+        }
+        for number in own
+    }
+    graph = nx.Graph([(one, other) for one in own for other in own if cells[one] & cells[other]])
+    expected = {number: min(part) for part in nx.connected_components(graph) for number in part}
+    assert tiling.groups(own).tolist() == [expected[number] for number in own]
+    assert tiling.overlaps == (stride[0] < shape[0] or stride[1] < shape[1])

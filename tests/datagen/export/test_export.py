@@ -27,6 +27,7 @@ from benchnav.errors import ConfigError, DatasetError
 from tests import factories
 
 Call = Callable[..., int]
+OWN = ("--license", "CC-BY-4.0", "--creator", "The survey")
 
 
 @pytest.fixture
@@ -259,16 +260,16 @@ def test_the_command_and_its_options(
 def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
     datagen: Call, dataset_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert datagen("export", dataset_path, "--out", "out") == 0
-    assert datagen("export", dataset_path, "--out", "out") == 2
+    assert datagen("export", dataset_path, "--out", "out", *OWN) == 0
+    assert datagen("export", dataset_path, "--out", "out", *OWN) == 2
     assert "Pass --overwrite" in capsys.readouterr().err
-    assert datagen("export", dataset_path, "--out", "out", "--splits", "[valid]", "--overwrite") == 0
+    assert datagen("export", dataset_path, "--out", "out", "--splits", "[valid]", "--overwrite", *OWN) == 0
     assert len(list(Path("out/data").iterdir())) == 1
     Path("own").mkdir()
     Path("own/thesis.tex").write_text("years of work")
     Path("file").write_text("a day's work")
     for own in ("own", "file"):
-        assert datagen("export", dataset_path, "--out", own, "--overwrite") == 2
+        assert datagen("export", dataset_path, "--out", own, "--overwrite", *OWN) == 2
         assert "is no exported dataset" in capsys.readouterr().err
     assert Path("own/thesis.tex").exists()
     assert {path.name for path in Path.cwd().iterdir()} == {"out", "own", "file"}
@@ -290,7 +291,7 @@ def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
 def test_bad_input_is_one_line(
     datagen: Call, dataset_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], told: str
 ) -> None:
-    assert datagen("export", dataset_path, "--out", "out", *options) == 2
+    assert datagen("export", dataset_path, "--out", "out", *OWN, *options) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert told in line
     assert list(Path.cwd().iterdir()) == []
@@ -303,11 +304,55 @@ def test_imported_maps_need_a_licence_and_a_creator(
     manifest["splits"]["valid"]["parts"] = [{"maps": 3, "source": {"file": "site.tif"}}]
     monkeypatch.setattr(reader, "read_manifest", lambda path: manifest)
     assert datagen("export", dataset_path, "--out", "out", "--license", "CC-BY-4.0") == 2
-    assert "whose maps were imported" in capsys.readouterr().err
-    assert datagen("export", dataset_path, "--out", "made", "--splits", "[train]") == 0
-    own = ("--license", "CC-BY-4.0", "--creator", "The survey")
-    assert datagen("export", dataset_path, "--out", "out", *own) == 0
+    assert "maps are not of a shipped recipe" in capsys.readouterr().err
+    assert datagen("export", dataset_path, "--out", "out", *OWN) == 0
     assert "file site.tif" in metadata(Path("out"))["description"]
+
+
+def test_maps_of_others_are_never_ours(
+    datagen: Call, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "tiny-v1.h5"
+    assert datagen("create", "tiny-v1", "--splits", "[test/std]", "--first", "1", "--out", own) == 0
+    changed = (
+        "create",
+        "tiny-v1",
+        "id=mine-v1",
+        "--splits",
+        "[test/std]",
+        "--first",
+        "1",
+        "--out",
+        "mine.h5",
+    )
+    assert datagen(*changed) == 0
+    for half in (OWN[:2], OWN[2:], ()):
+        assert datagen("export", "mine.h5", "--out", "theirs", *half) == 2
+        assert "Expected `license` and `creator`" in capsys.readouterr().err
+    assert datagen("export", "mine.h5", "--out", "theirs", *OWN) == 0
+    assert datagen("export", own, "--out", "ours") == 0
+    ours, theirs = (metadata(Path(name)) for name in ("ours", "theirs"))
+    cards = [Path(name, "README.md").read_text() for name in ("ours", "theirs")]
+    assert (ours["creator"]["name"], ours["license"][-8:]) == ("The BenchNav authors", "MIT.html")
+    assert theirs["creator"]["name"] == "The survey"
+    assert ("endo2024" in ours["citeAs"], "citeAs" in theirs) == (True, False)
+    assert (
+        ["endo2024" in card for card in cards]
+        == ["# BenchNav tiny-v1" in card for card in cards]
+        == [True, False]
+    )
+
+
+def test_the_documented_lines_make_arrays_of_parquet(dataset_path: Path, tmp_path: Path) -> None:
+    out = exported(dataset_path, tmp_path / "out")
+    guide = (Path(__file__).parents[3] / "docs/guide.md").read_text()
+    (lines,) = (part.split("```")[0] for part in guide.split("```python\n")[1:] if "read_table" in part)
+    (place,) = out.glob("data/valid*")
+    own: dict[str, Any] = {}
+    exec(lines.replace("exports/stakes-v1/data/test_std-00000-of-00001.parquet", str(place)), own)
+    np.testing.assert_array_equal(
+        own["rgb"], TerrainDataset(dataset_path).read("valid", fields=["rgb"])["rgb"]
+    )
 
 
 def test_splits_of_one_name_in_parquet_are_refused() -> None:

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -40,7 +41,7 @@ def test_foreign_newer_and_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no readable HDF5"):
         TerrainDataset(tmp_path / "text.h5")
     path = tiny_dataset(tmp_path / "d.h5")
-    rewrite(path, {"format_version": "1.3"})
+    rewrite(path, {"format_version": "1.4"})
     with pytest.raises(DatasetError, match="newer benchnav"):
         TerrainDataset(path)
     rewrite(path, {"format": "other"})
@@ -119,3 +120,28 @@ def test_want_of_memory_is_not_taken_for_damage(which: slice | np.ndarray) -> No
     with pytest.raises(OSError, match="no room"):
         reader._values(Tight(values, damaged=4), which)
     assert not issubclass(MemoryError, reader.READ_ERRORS)
+
+
+def test_recorded_digests_cover_what_maps_mean(tmp_path: Path) -> None:
+    dataset = TerrainDataset(tiny_dataset(tmp_path / "d.h5"))
+    recipe, split = tiny_recipe(), "train"
+    kinds = (replace(recipe.classes[0], noise=0.123), *recipe.classes[1:])
+    digests = {dataset.split_digest(split)}
+    for changed in (
+        recipe,
+        replace(recipe, classes=kinds),
+        replace(recipe, stuck_threshold=0.17),
+        replace(recipe, resolution_m=0.6),
+    ):
+        other = TerrainDataset(dataset.path)
+        other.recipe = changed  # of the same arrays
+        digests.add(other.split_digest(split))
+    other = TerrainDataset(dataset.path)
+    other.manifest["splits"][split]["parts"] = [{"maps": 8, "source": {}}]
+    assert (dataset.truth_of(split), other.truth_of(split)) == ("generated", "unknown")
+    assert (dataset.truth, other.truth, other.truth_of("valid")) == ("generated", "unknown", "generated")
+    digests.add(other.split_digest(split))
+    assert len(digests) == 5
+    assert dataset.about_digest("train") == dataset.about_digest("valid")
+    assert dataset.split_digest("train") != dataset.split_digest("valid")
+    assert dataset.digest.startswith(f"train:{dataset.split_digest('train')},")

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import write_run
 from benchnav.eval.folder.steps import align_steps, read_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.rows import step_table
@@ -96,7 +97,7 @@ def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path:
     place = run(dataset_path, tmp_path / "run", planners=PLANNERS[:1], risks=("mean",), seeds=(0,))
     run(
         dataset_path, place, risks=("mean",), seeds=(0,), robots=("bicycle",),
-        planners=({"part": "mppi", "options": {"samples": 4, "horizon": 3}},),
+        planners=({"part": "mppi", "options": {"samples": 4, "horizon_s": 0.3}},),
     )  # fmt: skip
     steps = pd.read_parquet(place / "steps")
     assert {"speed_mps", "turn_rate_radps", "steering_rad"} <= set(steps.columns)
@@ -129,7 +130,7 @@ def test_steps_of_recorded_episodes_alone_or_none(dataset_path: Path, tmp_path: 
 def test_the_table_of_format_version_2_is_read(folder: Path, tmp_path: Path) -> None:
     everything = read_steps(folder)
     about = json.loads((folder / "run.json").read_text()) | {"format_version": 2}
-    (tmp_path / "run.json").write_text(json.dumps(about))
+    write_run(tmp_path, about)
     everything.to_parquet(tmp_path / "steps.parquet")
     pd.testing.assert_frame_equal(read_steps(tmp_path), everything)
     trial = everything["trial"].iloc[0]

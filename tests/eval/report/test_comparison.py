@@ -8,9 +8,7 @@ from tests.eval.stats.test_comparison import A, B, pair
 
 def cells(table: pd.DataFrame, difference: float = 0.05) -> list[dict[str, str]]:
     shown = comparison_table(table, difference)
-    names = [
-        f"{heading}{i}" if heading in ("95 %", "p") else heading for i, heading in enumerate(shown.headings)
-    ]
+    names = [f"{heading}{i}" if heading == "95 %" else heading for i, heading in enumerate(shown.headings)]
     return [dict(zip(names, row, strict=True)) for row in shown.rows]
 
 
@@ -67,3 +65,22 @@ def test_maps_too_few_to_show_any_difference_say_so() -> None:
     assert table["success_shown"][0] > 1
     assert few["shows from"] == "–"
     assert many["shows from"] == f"{100 * table['success_shown'][1]:.0f}"
+
+
+def test_what_test_p_is_of_stands_in_heading_and_note() -> None:
+    """An interval of the mean that leaves 0 out may stand beside a p of ranks of 1."""
+    shown = comparison_table(compare([pair(A, B)]), 0.05)
+    assert shown.headings[shown.headings.index("Δ T_total [s]") + 2] == "p (ranks)"
+    notes = " ".join(shown.notes)
+    assert "p (ranks): Wilcoxon's signed-rank test of T_total" in notes
+    assert "Δ and 95 % are of the mean" in notes
+    assert "shares" not in notes
+
+
+def test_times_in_shares_of_unlike_budgets_say_so() -> None:
+    table = compare([pair([30.0, 300, 60], [10.0, 50, 25], budgets_s=(300.0, 100.0))])
+    shown = comparison_table(table, 0.05)
+    (row,) = cells(table)
+    assert row["Δ T_total [% of T]"] == "+15.0"  # shares 0.1, 1, 0.2 less 0.1, 0.5, 0.25
+    assert not [heading for heading in shown.headings if "T_total [s]" in heading]
+    assert "in shares of each condition's own T" in " ".join(shown.notes)

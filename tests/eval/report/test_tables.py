@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchnav.eval.report.paper_table import paper_table
-from benchnav.eval.report.rendering import to_markdown
+from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import failures_in_words, result_table
 from benchnav.eval.stats.summary import LABELS
 from tests.eval.report import made
@@ -37,14 +37,15 @@ def test_golden_table() -> None:
     table = table_of(made.rows(quick, slow, blind), **notes)
     assert to_markdown(table).partition("\n\n- **")[0] == (
         "| scenario | planner | risk | Succ. [%] | 95 % interval | T_total [s] | T if success [s] | λ̄ [%] "
-        "| planning [ms] | failures |\n"
+        "| per episode of a batch [ms] | failures |\n"
         "|---|---|---|---|---|---|---|---|---|---|\n"
         "| std | mppi | cvar | 100 | 34–100 | 25.0 | 25.0 ± 7.1 | 70.0 ± 0.0 | 1 (2)¶ | – |\n"
         "| std | cl_rrt¹,² | mean | 50 | 9–91 | 70.0 | 40.0 | 70.0 ± 28.3 | 1 (3) | 1 stuck |\n"
         "| std | straight | – | 0 | 0–66 | 100.0 | – | 80.0 (n = 1) | – | 1 out of bounds, "
         "1 planner failure |\n"
-        "\n¹ objective: its own time\n"
-        "\n² limits 0.5 m/s²"
+        "\n¹ minimises, in place of the task's J: its own time\n"
+        "\n² limits 0.5 m/s²\n"
+        "\n¶ compiled planner: its time is that of compiled code."
     )
 
 
@@ -62,8 +63,18 @@ def test_only_columns_that_are_shown_are_explained_each_in_one_sentence() -> Non
     assert all(text.endswith(".") for _, text in table.explained)
     earlier = made.rows(made.row(made.trial())).drop(columns=["planning_ms_p95", "planning_start_ms"])
     assert "1¶" in table_of(earlier).rows[0]
+
+
+def test_the_mark_of_compiled_planners_is_explained_wherever_it_stands() -> None:
+    compiled, eager = (table_of(made.rows(made.row(made.trial(), compiled=value))) for value in (True, False))
+    for written in (to_terminal(compiled), to_markdown(compiled), to_latex(compiled, "", "")):
+        assert "compiled planner: its time is that of compiled code" in written
+    assert not eager.notes
+
+
+def test_tables_without_planning_have_no_column_of_it() -> None:
     without = table_of(made.rows(made.row(made.trial(), planning_ms=np.nan)))
-    assert "planning [ms]" not in without.headings
+    assert "per episode of a batch [ms]" not in without.headings
     assert {len(row) for row in without.rows} == {len(without.headings)}
     assert without.rows[0][-1] == "–"
     others = [(name, value, n) for name in LABELS for n, value in enumerate("abc", 1)]
@@ -140,17 +151,19 @@ def test_numbers_of_maps_and_episodes_are_shown_where_they_are_not_the_same() ->
 
 def test_notes_are_numbered_once_and_marked_at_every_trial_they_hold_for() -> None:
     episodes = made.rows(
-        made.row(made.trial(planner, risk)) for planner in ("mppi", "a", "b") for risk in ("mean", "cvar")
+        made.row(made.trial(planner, risk), compiled=False)
+        for planner in ("mppi", "a", "b")
+        for risk in ("mean", "cvar")
     )
     shared = {"follows": "path length", "remarks": []}
     table = table_of(episodes, a=shared, b=shared | {"remarks": ["slow"]})
     assert [row[1] for row in table.rows] == ["mppi", "mppi", "a¹", "a¹", "b¹,²", "b¹,²"]
-    assert table.notes == ("¹ objective: path length", "² slow")
+    assert table.notes == ("¹ minimises, in place of the task's J: path length", "² slow")
 
 
 @pytest.mark.parametrize("follows", ["", "J"])
 def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows: str) -> None:
-    table = table_of(made.rows(made.row(made.trial())), mppi={"follows": follows})
+    table = table_of(made.rows(made.row(made.trial(), compiled=False)), mppi={"follows": follows})
     assert table.rows[0][1] == "mppi"
     assert table.notes == ()
 

@@ -73,7 +73,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
         "- World paper: λ resampled, T = 100 s, free where the risk map is above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
         "- Each trial: 4 episodes on 2 maps.",
-        "¹ objective: its own time",
+        "¹ minimises, in place of the task's J: its own time",
         "    benchnav-eval run --seeds '[0,7]'",
     ):
         assert line in text.splitlines()
@@ -170,7 +170,7 @@ def test_what_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     printed = capsys.readouterr().out
     assert printed.startswith("World paper: λ resampled, T = 100 s")
     assert "T if success [s]" in printed
-    assert "¹ objective: its own time" in printed
+    assert "¹ minimises, in place of the task's J: its own time" in printed
     assert "\nstd:\nThe highest success rate is that of " in printed
     assert "\x1b" not in printed
 

@@ -11,6 +11,7 @@ import pandas as pd
 from benchnav.eval.report.charts.driven import GROUND, DrivenGround, telling_map
 from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.run.driven_ground import keep_ground
+from tests.eval.forged import forge_rows
 from tests.eval.run.test_recorder import SEEDS, recordings, run
 from tests.eval.run.test_recorder import dataset as dataset
 
@@ -43,7 +44,8 @@ def test_whichever_map_is_telling_is_kept_under_its_own_luck(dataset: Path, tmp_
     for seed, realisation, instance in itertools.product(SEEDS, range(2), range(2)):
         here = (rows["seed"] == seed) & (rows["realisation"] == realisation) & (rows["instance"] == instance)
         # All succeed but one of the two on this map.
-        rows.assign(success=~here | (rows["planner"] == "straight")).to_parquet(folder / "episodes.parquet")
+        arrived = ~here | (rows["planner"] == "straight")
+        forge_rows(folder, rows.assign(outcome=np.where(arrived, "success", "timeout")))
         keep_ground(folder)
         kept = DrivenGround.load(folder / GROUND)
         asked = {"seed": seed, "realisation": realisation, "instance": instance}

@@ -17,7 +17,7 @@ import pytest
 
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
-from benchnav.eval.folder.folder import open_run, read_table
+from benchnav.eval.folder.folder import open_run, read_table, write_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
@@ -182,7 +182,7 @@ def test_missing_units_are_told_with_their_shards(parts: list[Path], tmp_path: P
 def change_run(part: Path, change: Callable[[dict], None]) -> None:  # type: ignore[type-arg]
     about = json.loads((part / "run.json").read_text())
     change(about)
-    (part / "run.json").write_text(json.dumps(about))
+    write_run(part, about)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,10 @@ def change_run(part: Path, change: Callable[[dict], None]) -> None:  # type: ign
         (lambda about: next(iter(about["datasets"].values()))["maps"]["test/hs"].reverse(), "maps of .* test/hs"),
         (lambda about: about["shard"].update(of=4), "number of shards"),
         (lambda about: about["trials"].popitem(), "lacks .*hs .*bad"),
-        (lambda about: [t["draws"].pop() for t in about["trials"].values()], "seeds, realisations or instances"),
+        (
+            lambda about: [(t["draws"].pop(), t["seeds"].pop()) for t in about["trials"].values()],
+            "seeds, realisations or instances",
+        ),
         (lambda about: [t["labels"].update(risk="other") for t in about["trials"].values()], "labels"),
     ],
 )  # fmt: skip

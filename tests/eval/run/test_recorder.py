@@ -25,6 +25,7 @@ from benchnav.eval.suite import Suite
 from benchnav.eval.unit import Unit
 from benchnav.planning.planners.planner import Plan
 from tests import factories
+from tests.eval.forged import forge_rows
 
 BELOW, HELD_S, SEEDS = 0.45, 0.4, (3, 4)
 SOFT = (1, 3, 4)  # classes with soft spots
@@ -177,7 +178,7 @@ def test_an_episode_that_does_not_repeat_is_refused(name: str, dataset: Path, tm
     again(folder, 0, 0)
     rows = pd.read_parquet(folder / "episodes.parquet")
     rows[name] = "planner_failure" if name == "outcome" else rows[name] + 0.1
-    rows.to_parquet(folder / "episodes.parquet")
+    forge_rows(folder, rows)
     with pytest.raises(BenchnavError, match="did not repeat"):
         again(folder, 0, 1)
 

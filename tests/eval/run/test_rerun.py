@@ -15,12 +15,13 @@ import torch
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.folder import open_run, write_run
 from benchnav.eval.run.rerun import Comparison, compare, rerun
 from benchnav.eval.run.runner import Workers, run_suite
 from benchnav.eval.suite import Suite
 from benchnav.share import Share
 from tests import factories
+from tests.eval.forged import forge_rows
 
 HERE = Workers()
 MINE = "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
@@ -53,7 +54,7 @@ def change_rows(run: Path, changes: Mapping[str, object], where: str) -> None:
     chosen = rows.eval(where)
     for name, value in changes.items():
         rows.loc[chosen, name] = value
-    rows.to_parquet(run / "episodes.parquet")
+    forge_rows(run, rows)
 
 
 def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_the_time_limit_of_planners_is_repeated(suite: Suite, tmp_path: Path) ->
     run = finish(suite, tmp_path / "run")
     about = json.loads((run / "run.json").read_text())
     assert "planner_limit_s" in about
-    (run / "run.json").write_text(json.dumps({**about, "planner_limit_s": 77.0}))
+    write_run(run, {**about, "planner_limit_s": 77.0})
     next(steps := rerun(run, tmp_path / "again", HERE))
     steps.close()
     assert open_run(tmp_path / "again").about["planner_limit_s"] == 77.0
@@ -88,7 +89,7 @@ def test_the_device_is_repeated_and_refused_where_it_is_not(
     run = finish(suite, tmp_path / "run")
     about = json.loads((run / "run.json").read_text())
     assert about["device"] == "cpu"
-    (run / "run.json").write_text(json.dumps({**about, "device": "cuda"}))
+    write_run(run, {**about, "device": "cuda"})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU"):
         next(rerun(run, tmp_path / "again", HERE))
@@ -137,6 +138,47 @@ def test_code_that_changed_is_named_beside_the_rows(suite: Suite, tmp_path: Path
     assert len(comparison.different) == 2
     assert comparison.lines[-1].startswith("what differs in the environment: ")
     assert "mine.py" in comparison.lines[-1]
+
+
+def test_files_that_a_part_imports_or_is_named_are_seen_by_extension_resumption_and_repetition(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    helper, weights = tmp_path / "helper_of_mine.py", tmp_path / "weights.txt"
+    helper.write_text("from tests.eval.parts import Faulty\n")
+    weights.write_text("1.0")
+    (tmp_path / "mine.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom helper_of_mine import Faulty\n\n"
+        "class Mine(Faulty):\n    def __init__(self, weights: str = ''):\n"
+        "        super().__init__('give up', float(open(weights).read()))\n"
+    )
+    own = {"part": f"{tmp_path / 'mine.py'}:Mine", "options": {"weights": "weights.txt"}}
+    suite = replace(suite, planners=(own,))
+    run = finish(suite, tmp_path / "run")
+    assert repeat(run, tmp_path / "same").lines[-1] == "nothing that is known of the environment differs"
+    name = f"planner {tmp_path / 'mine.py'}:Mine"
+    for changed, content, told in (
+        (helper, "from tests.eval.parts import Faulty\nx = 1\n", f"these changed: {name}. Choose"),
+        (weights, "2.0", f"these changed: weights.txt of {name}. Choose"),
+    ):
+        before = changed.read_text()
+        changed.write_text(content)
+        for asked in (suite, replace(suite, realisations=2)):
+            with pytest.raises(ConfigError, match=told):
+                finish(asked, run)
+        if changed is weights:
+            comparison = repeat(run, tmp_path / "again")
+            assert (len(comparison.different), comparison.lines[-1]) == (
+                2, f"what differs in the environment: weights.txt of {name}",
+            )  # fmt: skip
+        changed.write_text(before)
+    steps = run_suite(suite, tmp_path / "other")
+    next(steps)
+    weights.write_text("3.0")
+    with pytest.raises(ConfigError, match=r"While .* running these changed: weights\.txt of"):
+        list(steps)
+    del sys.modules["helper_of_mine"]
 
 
 def test_maps_that_changed_are_named(suite: Suite, tmp_path: Path) -> None:

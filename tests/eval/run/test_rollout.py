@@ -10,6 +10,7 @@ from benchnav.eval.run import rollout
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem
+from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
@@ -69,6 +70,33 @@ def test_a_plan_that_was_never_made_has_no_time(monkeypatch: pytest.MonkeyPatch)
     episodes = run(monkeypatch, raises_at=3)
     assert episodes.planning_s.tolist() == [1, 2]
     assert episodes.errors == ("RuntimeError: enough",) * BATCH
+
+
+class Watch:
+    """Stands still and notes what time it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[float] = []
+
+    def init(self, problem: Problem, generator: torch.Generator) -> None:
+        return None
+
+    def plan(self, step: Step, plan_state: None) -> Any:
+        self.told.append(step.time_s)
+        return torch.zeros(BATCH, 2), plan_state, Plan.empty(BATCH)
+
+
+@pytest.mark.parametrize("dt_s", [0.1, 0.25])
+def test_a_planner_is_told_the_time_by_the_steps_of_its_robot(dt_s: float) -> None:
+    ground, robot = torch.full((BATCH, 16, 16), 0.8), Unicycle(dt_s=dt_s)
+    problem = factories.problem(ground, robot=robot, time_budget_s=1.0)
+    goals = factories.places(torch.tensor([[6.75, 6.75]] * BATCH))
+    simulation = Simulation(
+        factories.terrain(ground), factories.task(robot), World(time_budget_s=1.0), goals, 0, range(BATCH)
+    )
+    planner: Any = Watch()
+    rollout.run_episodes(planner, problem, simulation, torch.Generator())
+    assert planner.told == pytest.approx([dt_s * step for step in range(round(1 / dt_s))])
 
 
 class Homing:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,14 +12,18 @@ from benchnav.eval.stats.power import maps_needed, smallest_difference
 
 
 def pair(
-    one: list[float], other: list[float], names: tuple[str, str] = ("cvar", "mean"), draws: int = 1
+    one: list[float],
+    other: list[float],
+    names: tuple[str, str] = ("cvar", "mean"),
+    draws: int = 1,
+    budgets_s: tuple[float, float] = (100.0, 100.0),
 ) -> Pair:
-    """Times of two trials by episode, 100 s of a failure; `draws` episodes in a row are on one map."""
+    """Times of two conditions by episode, T of a failure; `draws` episodes in a row are on one map."""
     episodes = pd.DataFrame({"instance": np.arange(len(one)) // draws})
-    for suffix, times in (("", one), ("_other", other)):
-        episodes[f"success{suffix}"] = np.array(times) < 100
+    for suffix, times, budget_s in (("", one, budgets_s[0]), ("_other", other, budgets_s[1])):
+        episodes[f"success{suffix}"] = np.array(times) < budget_s
         episodes[f"total_time_s{suffix}"] = times
-        episodes[f"time_budget_s{suffix}"] = 100.0
+        episodes[f"time_budget_s{suffix}"] = budget_s
     return Pair(one=names[0], other=names[1], shared={"planner": "mppi"}, episodes=episodes, left_out=0)
 
 
@@ -27,12 +33,12 @@ B = [29.0, 100, 100, 100, 30, 28, 32, 100]
 
 def test_a_pair_of_one_episode_a_map() -> None:
     (row,) = compare([pair(A, B)]).to_dict("records")
-    assert (row["one"], row["other"], row["planner"], row["n_maps"], row["n_draws"]) == (
+    assert (row["one"], row["other"], row["planner"], row["n_maps"], row["n_episodes"]) == (
         "cvar",
         "mean",
         "mppi",
         8,
-        1,
+        8,
     )
     assert (row["success_one"], row["success_other"]) == (6 / 8, 4 / 8)
     gain = np.array([0, 1, 0, 1, 0, -1, 0, 1])
@@ -54,7 +60,7 @@ def test_a_pair_of_one_episode_a_map() -> None:
 
 def test_episodes_of_a_map_are_one_number() -> None:
     (row,) = compare([pair(A, B, draws=2)]).to_dict("records")
-    assert (row["n_maps"], row["n_draws"], row["success_difference"]) == (4, 2, 0.25)
+    assert (row["n_maps"], row["n_episodes"], row["success_difference"]) == (4, 8, 0.25)
     gain = np.array([1, 1, -1, 1])
     assert row["success_low"] == pytest.approx(success_interval(gain, 2)[1])
     assert row["success_p"] == pytest.approx(10 / 16)  # of 16 ways to set four signs
@@ -133,10 +139,46 @@ def test_intervals_of_a_difference_of_time_cover_it_on_few_maps(maps: int) -> No
     assert held >= 135  # 93 % of 150 are 139.5
 
 
-def test_maps_of_one_group_are_one_number() -> None:
-    one = pair(A, B)
-    one.episodes["group"] = one.episodes["instance"] // 2
-    (row,) = compare([one]).to_dict("records")
-    (expected,) = compare([pair(A, B, draws=2)]).to_dict("records")
-    assert row == pytest.approx(expected, nan_ok=True)
-    assert row["n_maps"] == 4
+def test_a_group_of_maps_is_one_number() -> None:
+    given = pair(A, B)
+    grouped = replace(given, episodes=given.episodes.assign(group=np.arange(8) // 2))
+    (row,) = compare([grouped]).to_dict("records")
+    (by_map,) = compare([pair(A, B, draws=2)]).to_dict("records")
+    assert (row.pop("n_maps"), row["n_groups"], row["n_episodes"]) == (8, 4, 8)
+    assert by_map.pop("n_maps") == 4
+    assert repr(row) == repr(by_map)
+
+
+def test_maps_with_unequally_many_draws_all_count() -> None:
+    """Twenty maps under seed 0, of which nine under seed 1 too: a map that both arrived on more often has its share."""
+    one, other = [30.0] * 29, [30.0] * 20 + [100.0] * 9
+    given = pair(one, other)
+    given.episodes["instance"] = [*range(20), *range(9)]
+    (row,) = compare([given]).to_dict("records")
+    assert (row["n_maps"], row["n_episodes"]) == (20, 29)
+    assert row["success_difference"] == pytest.approx(9 / 29)
+    assert row["success_one"] - row["success_other"] == pytest.approx(9 / 29)
+    assert row["success_p"] == pytest.approx(2 / 2**9)
+
+
+def test_times_under_unlike_budgets_are_compared_in_shares_of_them() -> None:
+    """A slow robot and one of thrice its speed that ends each drive alike: it has a third of the time."""
+    slow = np.array([30.0, 60, 300, 45, 300, 90, 75, 33])
+    (seconds,) = compare([pair(list(slow), list(slow / 3), budgets_s=(300.0, 300.0))]).to_dict("records")
+    assert seconds["time_difference_s"] == pytest.approx((slow - slow / 3).mean())
+    given = pair(list(slow), list(slow / 3), budgets_s=(300.0, 100.0))
+    table = compare([given, pair(A, B)])
+    assert table["time_difference_share"].to_numpy() == pytest.approx([0, (np.array(A) - B).mean() / 100])
+    assert not {"time_difference_s", "time_low_s", "time_high_s"} & set(table)
+    assert table["time_p"][0] == 1
+    late = (np.array(A) - B) / 100
+    assert table["time_p"][1] == pytest.approx(wilcoxon(late).pvalue)
+    # Of episodes in which both arrived there is no penalty, so that their seconds can be compared.
+    assert table["arrival_time_difference_s"][0] == pytest.approx((slow - slow / 3)[slow < 300].mean())
+
+
+def test_an_episode_that_began_at_its_goal_took_no_share() -> None:
+    given = pair([0.0, 30.0, 60.0], [20.0, 10.0, 20.0], budgets_s=(300.0, 100.0))
+    given.episodes.loc[0, "time_budget_s"] = np.nan
+    (row,) = compare([given]).to_dict("records")
+    assert row["time_difference_share"] == pytest.approx((0 - 0.2 + 0 + 0) / 3)

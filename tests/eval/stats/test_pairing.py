@@ -1,20 +1,40 @@
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pytest
 
 from benchnav.errors import ConfigError
-from benchnav.eval.stats.pairing import Compared, Pair, find_pairs
+from benchnav.eval.stats.pairing import Compared, Pair, check_one_value_each, find_pairs
 from benchnav.eval.trial import NOT_USED
 from tests.eval.report.made import row, rows, trial
 
-STAKES = {"noise": "frozen", "correlation_m": 1.5}
+STAKES = {
+    "noise": "frozen",
+    "correlation_m": 1.5,
+    "immobile": {"below": 0.1, "for_s": 2.0},
+    "time_budget_s": 100.0,
+}
+RULES = {"free_space": {"by": "risk", "above": 0.1}, "slowest": 0.1, "goal_radius_m": 1.0}
+
+
+def value_of(labels: Mapping[str, str], **changes: Any) -> dict[str, Any]:
+    """What `run.json` says of a condition with these labels; parts stand in for what is not used."""
+    kinds = ("model", "risk", "planner", "robot", "objective")
+    stand_in = {"model": "oracle", "risk": "mean"}
+    parts = {
+        kind: {"part": stand_in[kind] if labels[kind] == NOT_USED else labels[kind], "options": {}}
+        for kind in kinds
+    }
+    own = {"data": labels["data"], "split": f"test/{labels['scenario']}", "rules": RULES, "world": STAKES}
+    return own | parts | changes
 
 
 def compared(planner: str = "mppi", risk: str = "mean", **changes: Any) -> Compared:
-    """A trial on four maps, all of which it solves in 30 s."""
-    given = {"world": STAKES, "maps": ["a", "b", "c", "d"], "episodes": None, "run": NOT_USED} | changes
+    """A condition on four maps, all of which it solves in 30 s."""
+    given = {"maps": ["a", "b", "c", "d"], "episodes": None, "run": NOT_USED, "value": {}} | changes
     labels = {
-        name: value for name, value in given.items() if name not in ("world", "maps", "episodes", "run")
+        name: value for name, value in given.items() if name not in ("maps", "episodes", "run", "value")
     }
     names = trial(planner, risk, **labels)
     episodes = given["episodes"]
@@ -22,9 +42,10 @@ def compared(planner: str = "mppi", risk: str = "mean", **changes: Any) -> Compa
         episodes = [row(names, instance) for instance in range(4)]
     return Compared(
         labels={**names, "run": given["run"]},
-        world=given["world"],
+        value=value_of(names, **given["value"]),
         maps=given["maps"],
         episodes=rows(episodes).assign(time_budget_s=100.0),
+        code={given["run"]: {}},
     )
 
 
@@ -92,12 +113,12 @@ def test_what_only_one_trial_met_is_left_out_and_counted() -> None:
     more = [row(trial("mppi", "cvar"), instance, seed=seed) for seed in (0, 1) for instance in range(4)]
     (pair,) = find_pairs([compared(), compared(risk="cvar", episodes=more)])
     assert (len(pair.episodes), pair.left_out) == (4, 4)
-    # A map that one trial met under one seed of two is left out, so that maps count alike.
+    # A map that one met under one seed of two counts with that one.
     both = [row(trial(), instance, seed=seed) for seed in (0, 1) for instance in range(3)]
     part = [row(trial("mppi", "cvar"), i, seed=s) for s, i in ((0, 0), (1, 0), (0, 1), (0, 2), (1, 2))]
     (pair,) = find_pairs([compared(episodes=both), compared(risk="cvar", episodes=part)])
-    assert sorted(set(pair.episodes["instance"])) == [0, 2]
-    assert pair.left_out == 6 + 5 - 2 * 4
+    assert sorted(pair.episodes["instance"]) == [0, 0, 1, 2, 2]
+    assert pair.left_out == 6 + 5 - 2 * 5
 
 
 def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
@@ -109,22 +130,30 @@ def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
             for risk, own, more in zip(("mean", "cvar"), plain, again, strict=True)
         ]
     )
-    # Of four maps the one that has two draws is left out, not the three that have one.
-    assert sorted(pair.episodes["instance"]) == [1, 2, 3]
-    assert pair.left_out == 4
+    assert sorted(pair.episodes["instance"]) == [0, 0, 1, 2, 3]
+    assert pair.left_out == 0
 
 
 def test_runs_that_share_trials_are_compared_with_each_other() -> None:
     trials = [compared(run=run, risk=risk) for run in ("before", "after") for risk in ("mean", "var")]
     assert names(find_pairs(trials)) == [("after", "before")] * 2
     assert names(find_pairs(trials, against="before")) == [("after", "before")] * 2
-    assert [pair.shared["run"] for pair in find_pairs(trials, by="risk")] == ["before", "after"]
 
 
 @pytest.mark.parametrize(
     ("changes", "asked", "message"),
     [
-        ({"world": {**STAKES, "correlation_m": 3.0}}, {}, "correlation_m 3.0 and 1.5"),
+        (
+            {"value": {"world": {**STAKES, "correlation_m": 3.0}}},
+            {},
+            "differ in their risk and in nothing else",
+        ),
+        ({"value": {"planner": {"part": "mppi", "options": {"samples": 9}}}}, {}, "and in nothing else"),
+        (
+            {"value": {"rules": {**RULES, "goal_radius_m": 2.0}}},
+            {},
+            "differ in their risk and in nothing else",
+        ),
         ({"maps": ["a", "b", "x", "d"]}, {}, "other digests"),
         ({"episodes": [row(trial("mppi", "cvar"), 0, seed=7)]}, {}, "seeds 7, realisations 0 and seeds 0"),
         ({"scenario": "hg"}, {}, "differ in their risk and in nothing else"),
@@ -153,10 +182,90 @@ def test_a_shorter_trial_is_paired_on_the_maps_it_met() -> None:
     assert (len(pair.episodes), pair.left_out) == (2, 2)
 
 
-def test_one_world_under_two_rules_can_be_paired() -> None:
-    trials = [compared(), compared(**{"risk": "mean"})]
-    labelled = [
-        Compared(labels={**t.labels, "world": name}, world=t.world, maps=t.maps, episodes=t.episodes)
-        for t, name in zip(trials, ("stakes", "stakes above=0.3"), strict=True)
+def world(label: str, **changes: Any) -> Compared:
+    rules = {name: changes.pop(name) for name in list(changes) if name in RULES}
+    own = {"world": {**STAKES, **changes}, "rules": {**RULES, **rules}}
+    return compared(world=label, value=own)
+
+
+def test_worlds_are_paired_where_the_same_λ_is_drawn() -> None:
+    same = [
+        world("stakes"),
+        world("stakes radius", goal_radius_m=2.0),
+        world("stakes T", time_budget_s=50.0),
+        world("stakes for", immobile={"below": 0.1, "for_s": 5.0}),
     ]
-    assert names(find_pairs(labelled, by="world")) == [("stakes above=0.3", "stakes")]
+    assert len(find_pairs(same, by="world")) == 6
+    for other in ({"correlation_m": 3.0}, {"noise": "stored"}, {"immobile": {"below": 0.2, "for_s": 2.0}}):
+        with pytest.raises(ConfigError, match="λ itself differs between their worlds"):
+            find_pairs([world("stakes"), world("other", **other)], by="world")
+    resampled = [
+        world("paper", noise="resampled"),
+        world("paper held", noise="resampled", immobile={"below": 0.2, "for_s": 2.0}),
+    ]
+    assert names(find_pairs(resampled, by="world")) == [("paper held", "paper")]
+
+
+def test_values_decide_and_labels_are_for_people() -> None:
+    one_value = {"risk": {"part": "cvar", "options": {"level": 0.5}}}
+    trials = [compared(risk="cvar:0.5", value=one_value), compared(risk="half", value=one_value)]
+    with pytest.raises(ConfigError, match="differ in their risk and in nothing else"):
+        find_pairs(trials)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        ("risk", {"risk": {"part": "mean", "options": {"level": 0.9}}}),
+        ("planner", {"planner": {"part": "mppi", "options": {"level": 0.9}}}),
+        ("model", {"model": {"part": "paper-v1", "options": {"level": 0.9}}}),
+        ("robot", {"robot": {"part": "unicycle", "options": {"level": 0.9}}}),
+        ("objective", {"objective": {"part": "goal_distance", "options": {"level": 0.9}}}),
+        ("world", {"world": {**STAKES, "level": 0.9}}),
+        ("world", {"rules": {**RULES, "level": 0.9}}),
+    ],
+)
+def test_two_values_under_one_label_are_refused(kind: str, value: dict[str, Any]) -> None:
+    trials = [compared(run="a"), compared(run="b", value=value)]
+    with pytest.raises(
+        ConfigError, match=rf"one {kind} under each label, got two that a and b call .*level None and 0\.9"
+    ):
+        check_one_value_each(trials)
+    check_one_value_each([compared(run="a"), compared(run="b")])
+
+
+def test_what_is_not_used_needs_no_one_value() -> None:
+    check_one_value_each(
+        [
+            compared("straight", NOT_USED, model=NOT_USED),
+            compared("straight", NOT_USED, model=NOT_USED, value={"risk": {"part": "other", "options": {}}}),
+        ]
+    )
+
+
+def test_pairs_hold_the_group_of_each_map_where_a_table_has_it() -> None:
+    """Tables of earlier versions have none."""
+    grouped = [row(trial("mppi", "cvar"), i, group=i // 2 + 7) for i in range(4)]
+    for trials in (
+        [compared(), compared(risk="cvar", episodes=grouped)],
+        [compared(risk="cvar", episodes=grouped)],
+    ):
+        (pair,) = find_pairs([*trials, *([] if len(trials) > 1 else [compared(risk="mean")])])
+        assert list(pair.episodes.sort_values("instance")["group"]) == [7, 7, 8, 8]
+        assert pair.episodes["group"].dtype == np.int64
+    (pair,) = find_pairs([compared(), compared(risk="cvar")])
+    assert "group" not in pair.episodes
+
+
+def test_pairs_hold_every_measure_of_both() -> None:
+    other = [
+        row(trial("mppi", "cvar"), i, score=0.25, path_length_m=9.0, traversability=0.5) for i in range(4)
+    ]
+    (pair,) = find_pairs([compared(), compared(risk="cvar", episodes=other)])
+    first = pair.episodes.iloc[0]
+    assert tuple(first[["score", "path_length_m", "traversability"]]) == (0.25, 9.0, 0.5)
+    assert tuple(first[["path_length_m_other", "traversability_other", "time_budget_s_other"]]) == (
+        22.0,
+        0.8,
+        100.0,
+    )

@@ -1,14 +1,16 @@
 from types import SimpleNamespace
 
+import lightning
 import pytest
 import segmentation_models_pytorch as smp
 import torch
+from torchmetrics.classification import MulticlassJaccardIndex
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.classifier import LabelledLoss, MeanIoU, TerrainClassifier
 from benchnav.models.training.classifiers import fit_classifier, measure_classifier
 from benchnav.models.training.fit import FitOptions, KeepBest
 
@@ -264,6 +266,32 @@ def test_cells_without_a_class_are_no_part_of_the_loss_and_the_measures(dice: fl
     assert found == wanted
 
 
+@pytest.mark.parametrize("dice", [0.0, 0.7])
+def test_a_batch_without_labels_has_no_loss_and_no_gradient(dice: float) -> None:
+    model = build(dice=dice)
+    logits = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(2), requires_grad=True)
+    loss = model.loss(logits, torch.full((2, 8, 8), UNLABELLED))
+    assert loss.item() == 0
+    (gradient,) = torch.autograd.grad(loss, logits)
+    assert bool((gradient == 0).all())
+
+
+def test_mean_iou_is_over_the_classes_that_occur_in_truth() -> None:
+    # Accuracy 0.978 and IoUs of 0.971 and 0.969 must not read 0.32 since four other classes were said once.
+    class_id = torch.tensor([0] * 500 + [1] * 500)
+    found = class_id.clone()
+    found[:4], found[500:502] = torch.tensor([2, 3, 4, 5]), 0
+    ious = (496 / 502, 498 / 500)
+    assert float(MulticlassJaccardIndex(6)(found, class_id)) == pytest.approx(sum(ious) / 6)
+    metric = MeanIoU(6, ignore_index=UNLABELLED)
+    unknown = torch.full((50,), UNLABELLED)
+    for some, true in ((found, class_id), (torch.full((50,), 4), unknown)):
+        metric.update(some, true)
+    assert float(metric.compute()) == pytest.approx(sum(ious) / 2)
+    logged = build().metrics(found.clamp(max=3), class_id)  # as it is logged in training
+    assert float(logged["valid_miou"]) == pytest.approx(sum(ious) / 2)
+
+
 def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
     rgb, class_id = (
         image(8, 8, batch=2),
@@ -289,7 +317,7 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
 
         def __init__(self) -> None:
             super().__init__()
-            self.loss = torch.nn.CrossEntropyLoss(ignore_index=UNLABELLED)
+            self.loss = LabelledLoss(0.0, 0.0)
 
         def forward(self, seen: torch.Tensor) -> torch.Tensor:
             return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
@@ -297,3 +325,30 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
     found, wanted = (measure_classifier(Colour(), maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     assert 0 < found["valid_accuracy"] < 1
+
+
+def test_losses_of_validation_are_weighed_by_labelled_cells() -> None:
+    """Two maps, one with a single labelled cell, one with all: the mean over cells, in training and afterwards."""
+    model, rgb = build(), image(8, 8, batch=3)
+    class_id = torch.randint(0, 4, (3, 8, 8), generator=torch.Generator().manual_seed(1))
+    class_id[0].fill_(UNLABELLED)[0, 0] = 2
+    class_id[2] = UNLABELLED
+    with torch.no_grad():
+        log_p = model(rgb).log_softmax(1).movedim(1, -1)
+    labelled = class_id != UNLABELLED
+    wanted = -log_p[labelled].gather(1, class_id[labelled][:, None]).double().mean()
+    batches = [{"rgb": rgb[i : i + 1], "class_id": class_id[i : i + 1].byte()} for i in range(3)]
+
+    class Maps:
+        def chunks(self, device: torch.device) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
+            return [([place], batch) for place, batch in enumerate(batches)]
+
+    found = measure_classifier(model, Maps())  # type: ignore[arg-type]
+    assert found["valid_loss"] == pytest.approx(float(wanted), rel=1e-5)
+    trainer = lightning.Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False,
+    )  # fmt: skip
+    loader = torch.utils.data.DataLoader(batches, batch_size=None)  # type: ignore[arg-type]
+    (logged,) = trainer.validate(model, loader, verbose=False)
+    assert logged["valid_loss"] == pytest.approx(float(wanted), rel=1e-5)

@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.cli import main
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality import map_sheet
+from benchnav.models.quality import baseline, map_sheet
 from benchnav.models.quality.baseline import nearest_colour_accuracy
 from benchnav.models.quality.measure import evaluate
 from tests.models.stub import ColourModel
@@ -137,6 +138,8 @@ def test_a_ladder_is_drawn_where_there_is_one(
         (["oracle", "--data", "DATA", "--out", "folder/file"], "something else"),
         (["oracle", "--data", "DATA", "--out", "folder/file/deeper/out"], "folder/file"),
         (["oracle", "--data", "DATA", "--out", "x", "--maps", "-1"], "maps"),
+        (["oracle", "--data", "DATA", "--seed", "-1"], "Expected `seed` in 0–9223372036854775807, got -1."),
+        (["oracle", "--data", "DATA", "--splits", "{a: 1}"], """got "{'a': 1}".\n"""),
         (["other", "--data", "DATA", "--out", "x"], "class table"),
         (["other", "--data", "DATA", "--out", "new/x", "--json", "y.json"], "class table"),
     ],
@@ -179,3 +182,45 @@ def test_the_command_is_light_to_import() -> None:
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "[]"
+
+
+def test_maps_that_the_model_was_trained_on_are_named(
+    dataset: TerrainDataset,
+    checkpoint_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    copy = Path(shutil.copy(dataset.path, tmp_path / "renamed.h5"))
+    for splits, named in (
+        ("[train,test/std]", "train (its train of tiny-v1):"),
+        ("[test/std,valid]", "valid (its valid of tiny-v1):"),
+        ("[test/std]", ""),
+    ):
+        report = tmp_path / "report.json"
+        asked = ("--data", copy, "--splits", splits, "--json", report)
+        assert call(monkeypatch, checkpoint_path, *asked) == 0
+        warned = [line for line in capfd.readouterr().out.splitlines() if "was trained" in line]
+        assert warned == [note for note in json.loads(report.read_text())["notes"] if "was trained" in note]
+        assert [line.partition("maps of ")[2][: len(named)] for line in warned] == [named] * bool(named)
+    assert call(monkeypatch, "colours", "--data", copy, "--splits", "[train]") == 0
+    assert "was trained" not in capfd.readouterr().out
+
+
+def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
+    shares = {"test/std": 0.999, "test/hs": 0.0}
+    monkeypatch.setattr(baseline, "nearest_colour_accuracy", lambda _, split: shares[split])
+    line = "warning: the model is right less often than the nearest colour on test/std"
+    out = tmp_path / "quality"
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0
+    assert line in capfd.readouterr().out.splitlines()
+    assert line in (out / "quality.md").read_text().splitlines()
+    shares["test/std"] = 0.0
+    assert call(monkeypatch, "colours", "--data", dataset.path) == 0
+    assert "less often" not in capfd.readouterr().out

@@ -85,7 +85,7 @@ def test_class_metrics_are_those_counted_by_hand() -> None:
         chunk.class_id[:] = terrain.class_id
     (classes,) = measure(Half(), chunks, generator()).classes
     assert classes.accuracy == pytest.approx(0.5)
-    assert classes.miou == pytest.approx((0.5 + 0) / 2)
+    assert classes.miou == classes.miou_predicted == pytest.approx((0.5 + 0) / 2)
     assert classes.ece == pytest.approx(0.3, abs=1e-4)
     left, right = 0.2**2 + 0.15**2 + 0.05**2, 0.8**2 + 0.85**2 + 0.05**2
     assert classes.brier == pytest.approx((left + right) / 2)
@@ -99,6 +99,29 @@ def test_class_metrics_are_those_counted_by_hand() -> None:
     assert classes.entropy_auroc == 0.5
     assert math.isnan(classes.mutual_information)
     assert math.isnan(classes.mutual_information_auroc)
+
+
+def test_a_class_that_is_only_predicted_counts_in_the_measure_named_for_it_alone() -> None:
+    """Colour 0 is of class a, 100 of b and 200 of c, which no cell is; two cells of a look like c."""
+
+    class Colours:
+        class_names = ("a", "b", "c")
+
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            found = torch.nn.functional.one_hot(observation.rgb[:, 0].long() // 100, 3)
+            weights = found.movedim(-1, 1).float()
+            return TraversabilityMixture(weights, weights, torch.full_like(weights, 0.1))
+
+    terrain = make_terrain(batch=1)
+    terrain.class_id[:] = (torch.arange(256) % 2).view(1, 16, 16)
+    terrain.rgb[:, 0] = (100 * terrain.class_id).byte()
+    terrain.rgb[0, 0, 0, :4:2] = 200
+    (classes,) = measure(Colours(), [terrain], generator(), ((0,), (1, 2), (1, 2))).classes
+    assert classes.accuracy == pytest.approx(254 / 256)
+    assert classes.miou == pytest.approx((126 / 128 + 1) / 2)
+    assert classes.miou_predicted == pytest.approx((126 / 128 + 1 + 0) / 3)
+    assert classes.twins
+    assert classes.twins.twin_miou == pytest.approx((126 / 128 + 128 / 130) / 2)
 
 
 def test_uncertainty_is_ranked_over_all_maps(dataset: TerrainDataset) -> None:
@@ -143,7 +166,7 @@ def test_measures_do_not_depend_on_how_maps_are_read(dataset: TerrainDataset) ->
     assert pieces.maps == whole.maps == 4
     one, other = pieces.classes[0], whole.classes[0]
     assert one.confusion == other.confusion
-    assert astuple(one)[:8] == pytest.approx(astuple(other)[:8], rel=1e-6)
+    assert astuple(one)[:9] == pytest.approx(astuple(other)[:9], rel=1e-6)
     named = ("rmse_observed", "rmse_expected", "nll", "crps")
     assert [getattr(pieces.traversability, name) for name in named] == pytest.approx(
         [getattr(whole.traversability, name) for name in named], rel=1e-6

@@ -55,6 +55,7 @@ def test_a_name_too_long_is_folded_rather_than_a_number(qualities: Qualities) ->
     assert max(map(len, printed.splitlines())) <= 124
     for value in numbers(qualities["valid"]).values():
         assert f"{value:.4f}" in printed or value in (
+            qualities["valid"].classes[0].miou_predicted,
             qualities["valid"].classes[0].entropy,
             qualities["valid"].classes[0].mutual_information,
         )

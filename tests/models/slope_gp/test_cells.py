@@ -60,11 +60,31 @@ def test_holding_out_splits_each_class_by_the_share() -> None:
     assert held.class_id.bincount(minlength=3).tolist() == [20, 2, 0]
     for c in range(3):
         assert sorted(rows_of(kept, c) + rows_of(held, c)) == sorted(rows_of(cells, c))
-    # At random: neither the first cells nor the last.
-    assert not set(rows_of(held, 0)) <= {*rows_of(cells, 0)[:20]}
-    assert not set(rows_of(held, 0)) <= {*rows_of(cells, 0)[-20:]}
+    # Those held out follow one another, somewhere among the rest.
+    every = rows_of(cells, 0)
+    first = every.index(rows_of(held, 0)[0])
+    assert rows_of(held, 0) == every[first : first + 20]
+    starts = {every.index(rows_of(hold_out(cells, 0.2, seed)[1], 0)[0]) for seed in range(200)}
+    assert (min(starts), max(starts)) == (0, 80)
     assert rows_of(hold_out(cells, 0.2, seed=3)[1], 0) == rows_of(held, 0)
     assert rows_of(hold_out(cells, 0.2, seed=4)[1], 0) != rows_of(held, 0)
+
+
+def test_neighbours_of_a_drive_do_not_tell_of_each_other() -> None:
+    """λ wanders along the drive: rows drawn singly would be known by their neighbours, a stretch of it is not."""
+    generator = torch.Generator().manual_seed(0)
+    drift = 0.02 * torch.randn(400, generator=generator)
+    cells = Cells(
+        class_id=torch.zeros(400, dtype=torch.int64),
+        slope_deg=torch.full((400,), 5.0),
+        traversability=(0.5 + drift.cumsum(0)).clamp(0, 1),
+    )
+    kept, held = hold_out(cells, 0.25, 1)
+    gaps = (held.traversability[:, None] - kept.traversability).abs().min(1).values
+    single = torch.arange(400) % 4 == 0
+    apart = (cells.traversability[single][:, None] - cells.traversability[~single]).abs().min(1).values
+    assert len(held) == int(single.sum())
+    assert float(gaps.mean()) > float(apart.mean())
 
 
 def test_holding_out_refuses_a_share_that_leaves_nothing() -> None:

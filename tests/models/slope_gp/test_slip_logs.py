@@ -1,3 +1,4 @@
+import gzip
 import hashlib
 from pathlib import Path
 
@@ -103,7 +104,7 @@ def test_a_bad_csv_is_refused_in_one_line(tmp_path: Path, text: str | bytes, why
 def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="not there"):
         read_slip_logs(tmp_path / "none.csv")
-    with pytest.raises(DatasetError, match=r"ends in \.csv or \.parquet"):
+    with pytest.raises(DatasetError, match=r"ends in \.csv, \.tsv, .*\.parquet"):
         read_slip_logs(write(tmp_path, GOOD, "log.txt"))
     with pytest.raises(DatasetError, match="PARQUET table"):
         read_slip_logs(write(tmp_path, GOOD, "log.parquet"))
@@ -126,3 +127,40 @@ def test_gps_learn_from_logs_and_report_a_held_out_nll(tmp_path: Path) -> None:
     nll = cell_nll(fresh, table)
     assert cell_nll(held, table) == pytest.approx(nll, abs=0.1)
     assert nll < cell_nll(fresh, fit_gps(LatentGPConfig(epochs=1, epoch_steps=1), sums).tabulate())
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_ids_that_pandas_wrote_with_a_decimal_are_ids(tmp_path: Path, kind: str) -> None:
+    rows = pd.DataFrame({"class": [0.0, 2.0, np.nan], "slope_deg": [3.0, 9.0, np.nan], "traversability": 0.5})
+    path = tmp_path / f"log.{kind}"
+    rows.to_csv(path, index=False) if kind == "csv" else rows.to_parquet(path)
+    logs = read_slip_logs(path)
+    assert logs.by_id
+    assert logs.class_names == ("0", "1", "2")
+    assert logs.class_id.tolist() == [0, 2]
+    with pytest.raises(DatasetError, match="class ids as whole numbers"):
+        read_slip_logs(write(tmp_path, "class,slope_deg,traversability\n0.5,3,1\n1,3,1\n"))
+
+
+@pytest.mark.parametrize("name", ["log.tsv", "log.csv.gz", "log.tsv.gz"])
+def test_tables_of_tabs_and_packed_ones_are_read(tmp_path: Path, name: str) -> None:
+    text = GOOD.replace(",", "\t") if ".tsv" in name else GOOD
+    content = gzip.compress(text.encode()) if name.endswith(".gz") else text.encode()
+    expected = read_slip_logs(write(tmp_path, GOOD, "plain.csv"))
+    logs = read_slip_logs(write(tmp_path, content, name))
+    assert logs.class_names == expected.class_names
+    assert logs.slope_deg.tolist() == expected.slope_deg.tolist()
+    if name.endswith(".gz"):
+        with pytest.raises(DatasetError, match="cannot be read"):
+            read_slip_logs(write(tmp_path, content[:-9], name))
+
+
+def test_slopes_in_radians_are_refused(tmp_path: Path) -> None:
+    head = "class,slope_deg,traversability\n"
+    for most, count, is_refused in ((0.5, 20, True), (0.5, 19, False), (2.0, 20, False), (0.0, 20, False)):
+        path = write(tmp_path, head + "".join(f"sand,{most * k / count},0.5\n" for k in range(1, count + 1)))
+        if is_refused:
+            with pytest.raises(DatasetError, match="as of radians"):
+                read_slip_logs(path)
+        else:
+            assert len(read_slip_logs(path).slope_deg) == count

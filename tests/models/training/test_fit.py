@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import lightning
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -14,16 +15,18 @@ from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.datagen.schema import UNLABELLED
+from benchnav.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
 from benchnav.files import sole_writer
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.config import ClassifierConfig
+from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training.callbacks import KeepBest
-from benchnav.models.training.classifiers import fit_classifier
+from benchnav.models.training.classifiers import check_classifier, fit_classifier
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, default_precision, fit
+from benchnav.models.training.mdn import check_mdn
 from benchnav.models.training.temperature import fit_temperature, sample_logits
 
 EXACT = {"precision": "32-true"}
@@ -163,15 +166,106 @@ def test_logs_have_a_row_an_epoch_and_events_for_tensorboard(whole: tuple[Path, 
     torch.testing.assert_close(torch.tensor(logged), torch.tensor(table["valid_loss"].to_numpy()).float())
 
 
-@pytest.mark.parametrize("other", [{"max_epochs": 5}, {"jitter": 0.0}, "seed", "precision"])
+@pytest.mark.parametrize("other", [{"max_epochs": 5}, {"jitter": 0.0}, "seed", "half"])
 def test_a_training_of_other_settings_is_not_gone_on_with(
     dataset: TerrainDataset, cut: Path, other: object
 ) -> None:
     config = replace(SMALL, **other) if isinstance(other, dict) else SMALL
-    trainer = {**EXACT, "precision": "bf16-mixed"} if other == "precision" else EXACT
-    options = FitOptions(device="cpu", folder=cut, resume=True, trainer=trainer)
+    options = FitOptions(device="cpu", folder=cut, resume=True, trainer=EXACT)
     with pytest.raises(CheckpointError, match="to resume it"):
-        fit_classifier(config, dataset, 2 if other == "seed" else 1, options)
+        fit_classifier(config, dataset, 2 if other == "seed" else 1, options, half_precision=other == "half")
+
+
+OTHER_TRAINERS = {
+    "precision": "bf16-mixed",
+    "gradient_clip_val": 0.01,
+    "accumulate_grad_batches": 2,
+    "limit_train_batches": 1,
+    "limit_val_batches": 1,
+    "deterministic": True,
+}
+
+
+def test_a_training_is_not_gone_on_with_under_other_settings_of_the_trainer(
+    dataset: TerrainDataset, cut: Path
+) -> None:
+    before = sorted((path, path.read_bytes()) for path in (cut / "classifier").iterdir())
+    for name, value in OTHER_TRAINERS.items():
+        with pytest.raises(CheckpointError, match=rf"got another `trainer\.{name}`\. Repeat"):
+            train(dataset, cut, resume=True, **{name: value})
+    assert sorted((path, path.read_bytes()) for path in (cut / "classifier").iterdir()) == before
+
+
+def test_settings_of_the_trainer_that_change_nothing_are_neither_kept_nor_compared() -> None:
+    plain, same, other = (
+        FitOptions(device="cpu", trainer={**EXACT, **more}).trainer_settings
+        for more in (
+            {},
+            {"log_every_n_steps": 3, "devices": 1, "gradient_clip_val": None, "limit_val_batches": None},
+            {"gradient_clip_val": 0.5},
+        )
+    )
+    assert plain == same == {"devices": 1, "precision": "32-true"}
+    assert other == {**plain, "gradient_clip_val": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("trainer", "why"),
+    [
+        ({"limit_val_batches": 0}, "trainer.limit_val_batches"),
+        ({"limit_val_batches": 0.5}, "trainer.limit_val_batches"),
+        ({"limit_train_batches": 0}, "trainer.limit_train_batches"),
+        ({"check_val_every_n_epoch": 9}, "trainer.check_val_every_n_epoch"),
+        ({"gradient_clip_val": "many"}, "Lightning takes"),
+    ],
+)
+def test_a_trainer_that_would_learn_or_measure_nothing_is_refused_first(
+    trainer: dict[str, object], why: str, dataset: TerrainDataset
+) -> None:
+    check_classifier(SMALL, dataset, FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 0.5}))
+    with pytest.raises(ConfigError, match=why):
+        check_classifier(SMALL, dataset, FitOptions(device="cpu", trainer={**EXACT, **trainer}))
+
+
+def test_a_training_that_ends_before_it_was_measured_does_not_blame_the_learning_rate(
+    dataset: TerrainDataset,
+) -> None:
+    options = FitOptions(device="cpu", trainer={**EXACT, "max_time": {"seconds": 0}})
+    with pytest.raises(ConfigError, match="before it ever was") as caught:
+        fit_classifier(SMALL, dataset, 1, options)
+    assert "learning_rate" not in str(caught.value)
+
+
+def test_maps_on_which_nothing_is_known_are_refused_first(
+    dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options, read = FitOptions(device="cpu", trainer=EXACT), TerrainDataset.read
+
+    def lacking(field: str, split: str) -> None:
+        def hide(self: TerrainDataset, name: str, *rest: object) -> dict[str, np.ndarray]:
+            maps = read(self, name, *rest)  # type: ignore[arg-type]
+            gone = {"class_id": UNLABELLED, "traversability": np.nan}[field]
+            return (
+                {**maps, field: np.full_like(maps[field], gone)} if name == split and field in maps else maps
+            )
+
+        monkeypatch.setattr(TerrainDataset, "read", hide)
+
+    for split in ("train", "valid"):
+        lacking("class_id", split)
+        with pytest.raises(DatasetError, match=f"cells with a class in split {split}"):
+            check_classifier(SMALL, dataset, options)
+        check_mdn(MDNConfig(encoder="mobilenet_v2"), dataset, options)
+        lacking("traversability", split)
+        with pytest.raises(DatasetError, match=f"observed traversability in split {split}"):
+            check_mdn(MDNConfig(encoder="mobilenet_v2"), dataset, options)
+        check_classifier(SMALL, dataset, options)
+
+
+def test_a_network_that_does_not_take_the_maps_is_refused_first(dataset: TerrainDataset) -> None:
+    config = ClassifierConfig(architecture="dpt", encoder="tu-vit_tiny_patch16_224", batch_size=4)
+    with pytest.raises(ConfigError, match=r"batches of 3 maps of 32×32 cells, got dpt"):
+        check_classifier(config, dataset, FitOptions(device="cpu", trainer=EXACT))
 
 
 def test_a_damaged_state_is_refused(dataset: TerrainDataset, cut: Path) -> None:

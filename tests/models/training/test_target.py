@@ -92,6 +92,30 @@ def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(tmp_path: Path)
         target.holds("gp", {"width": 3}, 0)
 
 
+def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(tmp_path: Path) -> None:
+    trainer = {"precision": "32-true", "gradient_clip_val": 0.5}
+    asked = FitOptions(device="cpu", trainer=trainer)
+    kept = replace(PART, trainer={**trainer, "devices": 1}, half_precision=True)
+
+    def holds(part: Part, half_precision: bool | None = True, **changed: object) -> bool:
+        checkpoint = replace(FRESH, parts={"classifier": part})
+        options = replace(asked, trainer={**trainer, **changed})
+        return Target(tmp_path / "m", checkpoint, "d", options).holds(
+            "classifier", {"width": 3}, 0, half_precision=half_precision
+        )
+
+    assert holds(kept)
+    assert holds(kept, log_every_n_steps=7)
+    assert holds(replace(kept, trainer=None), gradient_clip_val=3)  # of an earlier version
+    with pytest.raises(CheckpointError, match=r"another `trainer\.gradient_clip_val`\. Repeat"):
+        holds(kept, gradient_clip_val=0.6)
+    with pytest.raises(CheckpointError, match=r"another `trainer\.limit_train_batches`\. Repeat"):
+        holds(kept, limit_train_batches=2)
+    with pytest.raises(CheckpointError, match=r"another `half_precision`\. Repeat"):
+        holds(kept, half_precision=False)
+    assert holds(kept, None, gradient_clip_val=0.6)  # processes, which no such trainer trains
+
+
 def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(tmp_path: Path) -> None:
     folder = there(tmp_path / "m", "classifier")
     with pytest.raises(CheckpointError, match=r"pass --overwrite instead of --resume\."):

@@ -160,7 +160,7 @@ def test_no_setting_of_pytorch_is_left_changed() -> None:
 
 # --- In MPPI.
 
-SMALL = MPPIConfig(samples=64, horizon=4)
+SMALL = MPPIConfig(samples=64, horizon_s=0.4)
 
 
 class Doubtful:
@@ -195,7 +195,7 @@ def test_compiled_and_eager_planners_agree(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_unit_of_three_episodes_and_one_of_twenty_agree_on_compiling() -> None:
-    planner = MPPI(MPPIConfig(samples=1000, horizon=2))
+    planner = MPPI(MPPIConfig(samples=1000, horizon_s=0.2))
     for batch in (3, 20, 200):
         problem = factories.problem(torch.full((batch, 16, 16), 0.8))
         planner.plan(first(problem), planner.init(problem, generator()))
@@ -222,7 +222,7 @@ def test_a_solve_is_the_same_compiled_and_eager_alone_and_in_a_batch_on_one_thre
     maps = 0.35 + 0.6 * torch.rand(3, 24, 20, generator=generator())
     problem = factories.problem(maps, start=(1.25, 1.25), goal=(8.25, 9.25))
     monkeypatch.setattr(compilation, "worth_compiling", lambda *_: compiled)
-    few, short = MPPIConfig(samples=300, horizon=10), AStarDWAConfig(dwa=DWAConfig(horizon=10))
+    few, short = MPPIConfig(samples=300, horizon_s=1), AStarDWAConfig(dwa=DWAConfig(horizon=10))
     found: dict[tuple[bool, int, int], torch.Tensor] = {}
     threads = torch.get_num_threads()
     for compiled in (False, True):
@@ -258,7 +258,7 @@ def test_indices_of_users_parts_stay_checked(monkeypatch: pytest.MonkeyPatch) ->
     problem = factories.problem(torch.full((2, 16, 20), 0.8))
     for robot in (problem.robot, type("Mine", (type(problem.robot),), {"__module__": "mine"})()):
         posed = replace(problem, task=replace(problem.task, robot=robot))
-        planner = MPPI(MPPIConfig(samples=2000, horizon=2))
+        planner = MPPI(MPPIConfig(samples=2000, horizon_s=0.2))
         planner.plan(first(posed), planner.init(posed, generator()))
     # The rollouts, whose arguments the robot is one of, and what weighs them.
     assert told == [False, False, True, False]
@@ -271,7 +271,7 @@ def test_a_robot_without_a_hash_is_compiled_for(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
     problem = factories.problem(torch.full((2, 16, 20), 0.8), robot=Listed())
-    planner = MPPI(MPPIConfig(samples=2000, horizon=2))
+    planner = MPPI(MPPIConfig(samples=2000, horizon_s=0.2))
     state = planner.init(problem, generator())
     for _ in range(2):
         _, state, _ = planner.plan(first(problem), state)

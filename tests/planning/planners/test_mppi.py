@@ -1,20 +1,23 @@
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
+from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners import mppi
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.noise import NoiseBank
+from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda
 
-SMALL = MPPIConfig(samples=256, horizon=20)
+SMALL = MPPIConfig(samples=256, horizon_s=2)
 
 
 def test_rollout_cost_equals_a_loop_over_samples() -> None:
@@ -48,8 +51,13 @@ def test_rollout_cost_equals_a_loop_over_samples() -> None:
 
 
 @pytest.mark.parametrize("control_cost", [0.0, 0.4])
-def test_the_mean_is_the_softmax_average_of_the_samples(control_cost: float) -> None:
-    config = replace(SMALL, control_cost=control_cost, noise=(0.3, 0.6))
+@pytest.mark.parametrize("temperature", [0.5, None])
+def test_the_mean_is_moved_by_the_softmax_average_of_the_noise(
+    control_cost: float, temperature: float | None
+) -> None:
+    config = replace(
+        SMALL, control_cost=control_cost, noise=(0.3, 0.6), temperature=temperature, temperature_share=0.3
+    )
     problem = factories.problem(torch.full((1, 16, 16), 0.8))
     planner = MPPI(config)
     state = planner.init(problem, generator(3))
@@ -60,13 +68,138 @@ def test_the_mean_is_the_softmax_average_of_the_samples(control_cost: float) -> 
     for step in range(20):
         for axis, scale in enumerate(config.noise):
             cost += control_cost * state.mean[0, step, axis] * noise[step, axis] / scale**2
-    weights = torch.exp(-(cost - cost.min()) / config.temperature)
-    low, high = torch.tensor([0.0, -1.0])[:, None], torch.tensor([1.0, 1.0])[:, None]
-    samples = (state.mean[0, :, :, None] + noise).clamp(low, high)
-    mean = (samples * (weights / weights.sum())).sum(-1)
+    weights = torch.exp(-(cost - cost.min()) / (temperature or 0.3 * (cost - cost.min()).mean()))
+    low, high = torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0])
+    moved = state.mean[0] + (noise * (weights / weights.sum())).sum(-1)
+    mean = moved.clamp(low, high)
+    assert bool((mean != moved).any())
     torch.testing.assert_close(action[0].double(), mean[0], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(following.mean[0, :-1].double(), mean[1:], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(following.mean[0, -1].double(), mean[-1], atol=1e-5, rtol=1e-4)
+
+
+def test_where_costs_are_flat_the_mean_stays_at_its_bound() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), objective=Free())
+    planner = MPPI(MPPIConfig(horizon_s=1.0, samples=4000))
+    planner._advance.compiled = planner._weigh.compiled = False
+    state = planner.init(problem, generator())
+    state = replace(state, mean=torch.tensor([1.0, -1.0]).expand_as(state.mean))
+    for _ in range(5):
+        _, state, _ = planner.plan(first(problem), state)
+    # Averages of clipped samples would lie at 0.8 and −0.6 after the first step.
+    assert state.mean[..., 0].mean() > 0.95
+    assert state.mean[..., 1].mean() < -0.9
+
+
+def test_the_average_reaches_the_bounds_and_no_further() -> None:
+    mean, noise = torch.tensor([[[3.0, 0.0]]]), torch.tensor([[[-1.0, 1.0], [0.5, 1.5]]])
+    weights, low, high = torch.full((1, 2), 0.5), torch.tensor([0.0, -1.0]), torch.tensor([3.0, 1.0])
+    assert mppi.average(mean, noise, weights, low, high)[0, 0].tolist() == [3.0, 1.0]
+    first_only = torch.tensor([[1.0, 0.0]])
+    assert mppi.average(mean, noise, first_only, low, high)[0, 0].tolist() == [2.0, 0.5]
+
+
+def test_the_spread_is_the_mean_excess_of_samples_that_pay_no_more_steps_off_free_ground() -> None:
+    cost = torch.tensor([[3.0, 1.0, 2.0, 1e4 + 2.0], [2e4 + 5.0, 3e4, 2e4 + 6.0, 2e4 + 7.0], [4.0] * 4])
+    assert mppi.cost_spread(cost)[:2, 0].tolist() == pytest.approx([1.0, 1.0])
+    assert 0 < mppi.cost_spread(cost)[2, 0] < 1e-20
+
+
+class Scaled(GoalDistance):
+    """The distance in millimetres."""
+
+    def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+        return 1000 * super().stage(state, action, traversability, target)
+
+    def terminal(self, state, traversability, target):  # type: ignore[no-untyped-def]
+        return 1000 * super().terminal(state, traversability, target)
+
+
+@pytest.mark.parametrize(("temperature", "same"), [(None, True), (0.5, False)])
+def test_by_default_the_unit_of_the_objective_changes_nothing(temperature: float | None, same: bool) -> None:
+    actions = []
+    for objective in (GoalDistance(), Scaled()):
+        # A short horizon: 1000 times what it costs stays below the price of ground that is not free.
+        problem = factories.problem(torch.full((1, 16, 16), 0.8), (5.75, 5.75), objective=objective)
+        planner = MPPI(replace(SMALL, horizon_s=0.5, temperature=temperature))
+        actions.append(planner.plan(first(problem), planner.init(problem, generator()))[0])
+    assert torch.allclose(*actions, atol=1e-3) is same
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pushed(Unicycle):
+    """Driven by a force along its heading, in newtons, and a turn rate; drag holds it at 1 m/s."""
+
+    mass_kg: float = 1.0
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        return ("force_n", "turn_rate_radps")
+
+    @property
+    def action_low(self) -> tuple[float, ...]:
+        return (-self.mass_kg, -1.0)
+
+    @property
+    def action_high(self) -> tuple[float, ...]:
+        return (self.mass_kg, 1.0)
+
+    def initial_state(self, pose: torch.Tensor) -> torch.Tensor:
+        return torch.cat((pose, torch.zeros_like(pose[..., :1])), dim=-1)
+
+    def __call__(
+        self, state: torch.Tensor, action: torch.Tensor, traversability: torch.Tensor
+    ) -> torch.Tensor:
+        speed = (state[..., 3] + self.dt_s * (action[..., 0] / self.mass_kg)).clamp(-1.0, 1.0)
+        moved = torch.stack((speed, action[..., 1]), dim=-1)
+        return torch.cat((super().__call__(state[..., :3], moved, traversability), speed[..., None]), dim=-1)
+
+
+def test_a_robot_driven_by_newtons_does_as_one_driven_by_accelerations() -> None:
+    ground = torch.full((1, 16, 16), 0.9)
+    steps = []
+    for mass_kg in (1.0, 150.0):
+        problem = factories.problem(ground, goal=(5.25, 4.25), robot=Pushed(mass_kg=mass_kg))
+        driven = drive(MPPI(replace(SMALL, horizon_s=3.0)), problem, time_budget_s=40)
+        assert driven.outcome.tolist() == [Outcome.SUCCESS]
+        steps.append(driven.steps[0].item())
+    assert steps[1] == pytest.approx(steps[0], rel=0.05)
+    assert steps[0] < 1.5 * (5.0 - 1.0) / 0.9 / 0.1
+
+
+@pytest.mark.parametrize("name", registry.names("objective"))
+def test_on_open_ground_the_defaults_take_hardly_longer_than_a_straight_line(name: str) -> None:
+    robot = Unicycle()
+    objective = registry.make("objective", name, robot=robot, goal_radius_m=1.0)
+    ground = torch.full((1, 32, 32), 0.9)
+    problem = factories.problem(ground, (3.0, 4.0), (13.0, 10.0), robot, objective)
+    times = [
+        drive(planner, problem, time_budget_s=40).steps.item()
+        for planner in (Straight(), MPPI(MPPIConfig(samples=500)))
+    ]
+    assert times[1] <= 1.08 * times[0]
+
+
+def test_noise_is_a_share_of_the_range_of_each_action_unless_it_is_given() -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=Pushed(mass_kg=150.0))
+    scale = MPPI(replace(SMALL, noise_share=0.25)).init(problem, generator()).scale
+    assert scale.tolist() == pytest.approx([75.0, 0.5])
+    given = replace(SMALL, noise=(3.0, 0.2), noise_share=0.25)
+    assert MPPI(given).init(problem, generator()).scale.tolist() == pytest.approx([3.0, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("horizon_s", "dt_s", "steps"), [(5.0, 0.1, 50), (1.0, 0.3, 3), (2.0, 0.3, 7), (0.1, 1.0, 1)]
+)
+def test_the_horizon_is_in_seconds(horizon_s: float, dt_s: float, steps: int) -> None:
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=Unicycle(dt_s=dt_s))
+    state = MPPI(replace(SMALL, horizon_s=horizon_s)).init(problem, generator())
+    assert (state.mean.shape[1], state.noise.at(0).shape[0]) == (steps, steps)
+
+
+def test_a_horizon_in_steps_is_answered_with_its_new_name() -> None:
+    with pytest.raises(ConfigError, match=r"got 'horizon'\. Did you mean 'horizon_s'\?"):
+        registry.make("planner", {"part": "mppi", "options": {"horizon": 50}})
 
 
 class Free:
@@ -85,7 +218,7 @@ def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
     robot = Unicycle(speed_mps=(-9, 9), turn_rate_radps=(-9, 9))
     ground = torch.full((1, 99, 99), 0.5)
     problem = factories.problem(ground, (24, 24), (30, 30), robot, Free())
-    config = MPPIConfig(horizon=2, samples=200_000, temperature=0.7)
+    config = MPPIConfig(horizon_s=0.2, samples=200_000, noise=(0.5, 0.5), temperature=0.7)
     mean = torch.tensor([[[0.4, -0.3], [-0.2, 0.5]]])
     for share in (1.0, 0.5):
         planner = MPPI(replace(config, control_cost=share * 0.7))
@@ -100,7 +233,7 @@ def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
 
 def test_noise_has_the_scale_that_is_set_and_is_another_for_each_seed() -> None:
     problem = factories.problem(torch.full((3, 16, 16), 0.8))
-    planner = MPPI(MPPIConfig(horizon=30, noise=(0.2, 0.7)))
+    planner = MPPI(MPPIConfig(horizon_s=3, noise=(0.2, 0.7)))
     state = planner.init(problem, generator())
     noise = state.noise.at(0)
     assert noise.shape == (30, 2, 5000)
@@ -140,7 +273,7 @@ def test_an_episode_alone_does_as_it_does_in_a_batch() -> None:
 
 def test_it_drives_at_the_target_that_it_is_given() -> None:
     problem = factories.problem(torch.full((1, 16, 16), 0.8), start=(4.0, 4.0), goal=(7.0, 4.0))
-    planner = MPPI(replace(SMALL, samples=1900, horizon=40, temperature=0.1))
+    planner = MPPI(replace(SMALL, samples=1900, horizon_s=4, temperature=0.1))
     state = planner.init(problem, generator())
     aside = torch.tensor([[4.0, 7.0]])
     turns = [
@@ -155,7 +288,7 @@ def test_it_drives_at_the_target_that_it_is_given() -> None:
 @pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])
 def test_it_drives_robots_of_two_actions(robot) -> None:  # type: ignore[no-untyped-def]
     problem = factories.problem(torch.full((2, 16, 16), 0.85), robot=robot)
-    driven = drive(MPPI(replace(SMALL, horizon=30)), problem, time_budget_s=25)
+    driven = drive(MPPI(replace(SMALL, horizon_s=3)), problem, time_budget_s=25)
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
 
 
@@ -167,16 +300,18 @@ def test_noise_for_another_number_of_actions_is_asked_for_by_name() -> None:
 
     problem = factories.problem(torch.full((1, 16, 16), 0.85), robot=Three())
     with pytest.raises(ConfigError, match=r"`noise` of MPPI with 3 values, for .*crab_mps"):
-        MPPI(SMALL).init(problem, generator())
+        MPPI(replace(SMALL, noise=(0.5, 0.5))).init(problem, generator())
     MPPI(replace(SMALL, noise=(0.5, 0.5, 0.2))).init(problem, generator())
 
 
 @pytest.mark.parametrize(
     "settings",
     [
-        {"horizon": 0},
+        {"horizon_s": 0},
         {"samples": 0},
         {"temperature": 0.0},
+        {"temperature_share": 0.0},
+        {"noise_share": math.nan},
         {"noise": ()},
         {"noise": (0.5, 0.0)},
         {"control_cost": -1},

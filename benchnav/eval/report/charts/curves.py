@@ -18,7 +18,7 @@ _MEASURES = {
     "T_total [s]": ("total_time_mean_s", "total_time_low_s", "total_time_high_s", 1.0),
 }
 _MARKERS = "osD^vP*X"
-_STYLES: tuple[Any, ...] = ("--", ":", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
+_STYLES: tuple[Any, ...] = ("--", ":", "-.", (0, (7, 2, 1, 2, 1, 2)), (0, (1, 3)), (0, (9, 2)))
 _MOST_LINES, _MOST_ACROSS = 7, 4
 _LEVEL = "risk.options.level"
 _NAMES = {_LEVEL: "level α", SEVERITY: "severity of the scenario"}
@@ -199,13 +199,18 @@ def _draw_references(
                 continue
             colour = "0.5" if blind else colours[_name(sweep, line, rows)][0]
             label = display_name(row["planner"]) if blind else row["risk"]
-            style = "-" if blind else _STYLES[len(handles) % len(_STYLES)]
-            handle = handles.setdefault(
-                label, Line2D([], [], color="0.5" if blind else "0.2", ls=style, lw=1, label=label)
-            )
-            panel.axhline(
-                columns[3] * row[columns[0]], color=colour, ls=handle.get_linestyle(), lw=1, zorder=1
-            )
+            if label not in handles:
+                handles[label] = Line2D([], [], color="0.5" if blind else "0.2", lw=1, label=label)
+            # Matplotlib names every pattern of dashes "--", so that a style cannot be read back from a line.
+            style = _style(list(handles).index(label))
+            handles[label].set_linestyle(style)
+            panel.axhline(columns[3] * row[columns[0]], color=colour, ls=style, lw=1, zorder=1)
+
+
+def _style(place: int) -> Any:
+    """A pattern of dashes for each setting: those of `_STYLES`, then dashes with more and more dots between."""
+    more = place - len(_STYLES) + 3
+    return _STYLES[place] if place < len(_STYLES) else (0, (8, 2, *(1, 1.5) * more))
 
 
 def _places(number: str, values: Sequence[float]) -> np.ndarray:

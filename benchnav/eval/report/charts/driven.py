@@ -85,11 +85,12 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def write_driven(folder: Path) -> dict[str, str]:
+def write_driven(folder: Path, out: Path) -> dict[str, str]:
     """Writes the figure of a run that stored the steps it shows; a caption by name, or none.
 
     Args:
         folder: a finished run.
+        out: where `figures/` is.
     """
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
@@ -108,7 +109,7 @@ def write_driven(folder: Path) -> dict[str, str]:
         return {}
     save(
         driven_figure(ground, shown, [tracks[trial] for trial in shown["trial"]]),
-        folder / "figures" / "driven.png",
+        out / "figures" / "driven.png",
     )
     about = ground.about
     words = [f"Whole driven paths on {about['scenario']} {about['instance']}, seed {about['seed']},"]

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from benchnav import gridgraph
+from benchnav.errors import ConfigError
 from benchnav.planning.free_space import PRICE
-from benchnav.planning.objective import distance
+from benchnav.planning.objective import distance, path_cost_of
 from benchnav.planning.problem import Problem
 
 
@@ -25,7 +26,7 @@ class CostToGo:
     """Cheapest paths from every cell to the goal.
 
     Args:
-        cost: metres or seconds to the goal region, prices included, shape [B, H, W].
+        cost: of the path to the goal region, by the objective's `path_cost`, prices included, shape [B, H, W].
         following: flat index of the next cell, itself where the path ends, int64, shape [B, H·W].
     """
 
@@ -33,35 +34,46 @@ class CostToGo:
     following: Tensor
 
 
-def edge_costs(problem: Problem, by_time: bool = False) -> np.ndarray:
-    """Costs of moving between neighbouring cells; works on the host.
+def edge_costs(problem: Problem) -> Tensor:
+    """Costs of moving between neighbouring cells, each half of an edge at its own cell's λ̂.
 
     Args:
         problem: B problems.
-        by_time: seconds at top speed under λ̂ rather than the 3D length.
 
     Returns:
-        Cost of each edge of `gridgraph.neighbour_pairs`, shape [B, E].
+        Cost of each edge of `gridgraph.neighbour_pairs`, float64, shape [B, E].
+
+    Raises:
+        ConfigError: the objective's `path_cost` is not finite and above 0.
     """
-    resolution = problem.grid.resolution_m
-    source, target, length = gridgraph.neighbour_pairs(*problem.grid.shape)
-    if by_time:
-        pace = 1 / (problem.traversability.double() * problem.robot.top_speed_mps)
-        costs = 0.5 * length * resolution * _sum_of_ends(pace, source, target)
-    else:
-        elevation = problem.elevation_m.double().flatten(1).cpu().numpy()
-        costs = np.hypot(length * resolution, elevation[:, target] - elevation[:, source])
-    return costs + 0.5 * length * resolution * _sum_of_ends(PRICE * ~problem.free, source, target)
+    device = problem.start.device
+    source, target, cells = (
+        torch.from_numpy(part).to(device) for part in gridgraph.neighbour_pairs(*problem.grid.shape)
+    )
+    traversability, elevation, not_free = (
+        values.double().flatten(1) for values in (problem.traversability, problem.elevation_m, ~problem.free)
+    )
+    length_m = cells * problem.grid.resolution_m
+    grade = (elevation[:, target] - elevation[:, source]) / length_m
+    metre = path_cost_of(problem.objective)
+    at_source, at_target = metre(traversability[:, source], grade), metre(traversability[:, target], grade)
+    least, most = torch.stack((at_source, at_target)).aminmax()
+    if not 0 < least <= most < torch.inf:
+        raise ConfigError(
+            f"Expected `path_cost` of {type(problem.objective).__name__} as finite numbers > 0, got {least:g} "
+            f"to {most:g}. Let no metre of a path be free."
+        )
+    price = PRICE * (not_free[:, source] + not_free[:, target])
+    return 0.5 * length_m * (at_source + at_target) + 0.5 * length_m * price
 
 
-def search(problem: Problem, by_time: bool = False) -> CostToGo:
+def search(problem: Problem) -> CostToGo:
     """Finds cheapest paths to the goal's own cell and to those centred within its radius.
 
     Works on the host: on another device this copies the maps there and the answer back, once.
 
     Args:
         problem: B problems.
-        by_time: minimise time under λ̂ rather than 3D length.
 
     Returns:
         Cost to go, of the problem's dtype and device.
@@ -73,7 +85,7 @@ def search(problem: Problem, by_time: bool = False) -> CostToGo:
     # On coarse grids no centre may be that near; the goal's own cell always counts.
     row, column = grid.cell_of(goal_m[:, 0], goal_m[:, 1])
     goals[torch.arange(len(problem)), row, column] = True
-    cost, following = gridgraph.cost_to_go(edge_costs(problem, by_time), goals.numpy(), grid.shape)
+    cost, following = gridgraph.cost_to_go(edge_costs(problem).cpu().numpy(), goals.numpy(), grid.shape)
     stay = np.arange(following.shape[1])
     following = np.where(following == gridgraph.NO_CELL, stay, following)
     start = problem.start
@@ -117,9 +129,3 @@ def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) ->
     ended = field.following.gather(1, cells) == cells
     points = torch.where(ended[..., None], problem.goal_m[:, None], centres)
     return torch.cat((state[:, None, :2], points[:, 1:]), dim=1)
-
-
-def _sum_of_ends(maps: Tensor, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Adds the values of maps [B, H, W] in the two cells of each edge, shape [B, E]."""
-    values = maps.flatten(1).cpu().numpy()
-    return np.take(values, source, axis=1) + np.take(values, target, axis=1)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
-from benchnav.planning.problem import Task
 from benchnav.planning.robots import SPEED, TURN_RATE
 
 
@@ -41,7 +40,3 @@ class AStarDWA(Guided[DWAState]):
     def compiled(self) -> bool | None:
         """Whether rollouts are compiled; None before the first."""
         return self._dwa.compiled
-
-    def remarks(self, task: Task) -> tuple[str, ...]:
-        """Names the accelerations that are not the robot's, and paths that no setting moves; see `Planner`."""
-        return (*self._dwa.remarks(task.robot), *super().remarks(task))

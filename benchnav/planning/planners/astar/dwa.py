@@ -2,16 +2,18 @@
 
 From Fox, Burgard and Thrun (1997), "The dynamic window approach to collision avoidance", come the window,
 the velocity pairs that the robot can reach within one step, and the search for the one whose arc is best.
-How arcs are judged is not theirs: each pair is held for the whole horizon, rolled out through F under λ̂, and
-judged by J toward a way-point and by the heading that it ends with. There are no admissible velocities by
-braking distance, no terms for clearance and speed; a pair that leaves free ground before it arrives pays the
-price of each step off it, which is why DWA creeps in narrow places and needs a recovery where it stands.
+A robot without limits reaches all that its bounds allow. How arcs are judged is not theirs: each pair is held
+for the whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by the heading that
+it ends with. There are no admissible velocities by braking distance, no terms for clearance and speed; a pair
+that leaves free ground before it arrives pays the price of each step off it, which is why DWA creeps in narrow
+places and needs a recovery where it stands.
 Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -37,29 +39,41 @@ class DWAConfig:
 
     Args:
         speeds: linear velocities in the window.
-        turn_rates: angular velocities in the window.
-        horizon: steps T.
-        acceleration: greatest change of linear velocity, m/s², of a robot without limits of its own.
-        turn_acceleration: greatest change of angular velocity, rad/s², of a robot without limits of its own.
-        heading_weight: cost of a radian between the last heading and the direction of the way-point; it lets
-            a robot turn on the spot, which changes no distance.
+        turn_rates: angular velocities in the window; an odd number has that of straight driving among them.
+        horizon_s: how long a pair is held; to the nearest number of steps T, one at least.
+        heading_weight: cost of a radian between the last heading and the direction of the way-point, as a
+            share of what J costs a robot that stands for the horizon; it lets a robot turn on the spot,
+            which changes no distance.
         arrival_m: a trajectory this near to the way-point has arrived and costs no more, so that a
             near way-point does not slow the robot.
     """
 
+    gone: ClassVar = {
+        "horizon": "It is now `horizon_s`, in seconds.",
+        **dict.fromkeys(
+            ("acceleration", "turn_acceleration"),
+            "DWA keeps to the limits of a robot that has some, and to no others.",
+        ),
+    }
+
     speeds: int = 10
-    turn_rates: int = 10
-    horizon: int = 50
-    acceleration: float = 0.5
-    turn_acceleration: float = 0.5
-    heading_weight: float = 2.0
+    turn_rates: int = 21
+    horizon_s: float = 5.0
+    heading_weight: float = 0.05
     arrival_m: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuses an empty window."""
-        for name in ("speeds", "turn_rates", "horizon", "acceleration", "turn_acceleration"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"Expected `{name}` > 0 for DWA, got {getattr(self, name)}.")
+        """Refuses an empty window, and weights that mean nothing."""
+        for name in ("speeds", "turn_rates", "horizon_s"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"Expected `{name}` > 0 and finite for DWA, got {getattr(self, name)}.")
+        for name in ("heading_weight", "arrival_m"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"Expected `{name}` ≥ 0 and finite for DWA, got {getattr(self, name)}.")
+
+    def steps(self, dt_s: float) -> int:
+        """The horizon in steps T of so many seconds."""
+        return max(1, round(self.horizon_s / dt_s))
 
 
 @dataclass(frozen=True)
@@ -111,36 +125,34 @@ class DWA:
         action = window.gather(1, best.expand(-1, 1, 2))[:, 0]
         plan = Plan.empty(len(problem), step.state.device)
         if step.draw:
-            drawn = held_paths(problem, step.state, window, self.config.horizon)
+            drawn = held_paths(problem, step.state, window, self.config.steps(problem.dt_s))
             path = drawn.gather(1, best[..., None].expand(-1, 1, *drawn.shape[2:]))[:, 0]
             plan = Plan.empty(len(problem), step.state.device, path=path, samples=drawn[:, :, ::_DRAW_EVERY])
         return action, plan_state, plan
 
     def took(self, plan_state: DWAState, action: Tensor) -> DWAState:
         """Notes the velocities that the robots now have; see `LocalPlanner`."""
-        problem, velocity = plan_state.problem, action
-        limits = action_limits(problem.robot)
-        if limits is not None:
-            changes = (action - plan_state.velocity).unbind(dim=1)
-            reached = [
-                c.clamp(-r * problem.dt_s, r * problem.dt_s) for c, r in zip(changes, limits, strict=True)
-            ]
-            velocity = plan_state.velocity + torch.stack(reached, dim=1)
-        return DWAState(problem, velocity)
+        least, most = reachable(plan_state.problem, plan_state.velocity)
+        return DWAState(plan_state.problem, torch.clamp(action, least, most))
 
     def select(self, plan_state: DWAState, members: Tensor) -> DWAState:
         """Keeps some episodes; see `Planner`."""
         return with_tensors(plan_state, lambda value: value[members])
 
-    def remarks(self, robot: Robot) -> tuple[str, ...]:
-        """Names the accelerations of the window where they are not the robot's."""
-        if action_limits(robot) is not None:
-            return ()
-        config = self.config
-        return (
-            f"DWA keeps to {config.acceleration:g} m/s² and {config.turn_acceleration:g} rad/s² of its own, "
-            "since the robot has no limits",
-        )
+
+def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and greatest velocities within one step's reach: the bounds where the robot has no limits.
+
+    Args:
+        problem: for its robot's bounds, limits and time step.
+        velocity: current (v, ω), shape [B, 2].
+
+    Returns:
+        Two of shape [B, 2].
+    """
+    rates = action_limits(problem.robot) or (math.inf, math.inf)
+    reach = velocity.new_tensor(rates) * problem.dt_s
+    return (velocity - reach).clamp(*problem.action_bounds), (velocity + reach).clamp(*problem.action_bounds)
 
 
 def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
@@ -154,15 +166,11 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
     Returns:
         Pairs (v, ω) within the bounds, shape [B, M, 2].
     """
-    robot = problem.robot
-    rates = action_limits(robot) or (config.acceleration, config.turn_acceleration)
+    least, most = reachable(problem, velocity)
 
     def spread(axis: int, count: int) -> Tensor:
-        reach, low, high = rates[axis] * robot.dt_s, robot.action_low[axis], robot.action_high[axis]
-        least = (velocity[:, axis, None] - reach).clamp(low, high)
-        most = (velocity[:, axis, None] + reach).clamp(low, high)
         share = torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
-        return least + (most - least) * share
+        return least[:, axis, None] + (most - least)[:, axis, None] * share
 
     speeds, turn_rates = spread(0, config.speeds), spread(1, config.turn_rates)
     pairs = torch.stack(torch.broadcast_tensors(speeds[:, :, None], turn_rates[:, None, :]), dim=-1)
@@ -195,15 +203,33 @@ def judge(
     pairs = component_wise(window)
     cost = torch.zeros_like(window[..., 0])
     under_way = torch.ones_like(cost, dtype=torch.bool)
-    for first in range(0, config.horizon, _CHUNK_STEPS):
+    steps = config.steps(problem.dt_s)
+    for first in range(0, steps, _CHUNK_STEPS):
         states, cost, under_way = advance(
             states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
-            problem.objective, problem.task.rules.slowest, config.arrival_m,
-            min(_CHUNK_STEPS, config.horizon - first),
+            problem.objective, problem.task.rules.slowest, config.arrival_m, min(_CHUNK_STEPS, steps - first),
         )  # fmt: skip
     terminal = problem.terminal_cost(states, target)
-    heading = config.heading_weight * _heading_error(state, states, target)
-    return cost + (terminal + heading) * under_way
+    weight = config.heading_weight * standing_cost(problem, state, target_m, steps)
+    return cost + (terminal + weight[:, None] * _heading_error(state, states, target)) * under_way
+
+
+def standing_cost(problem: Problem, state: Tensor, target_m: Tensor, steps: int) -> Tensor:
+    """What J costs robots that stand for the horizon, without prices; the unit of the heading's weight.
+
+    Args:
+        problem: B problems.
+        state: shape [B, S].
+        target_m: (x, y), shape [B, 2].
+        steps: T.
+
+    Returns:
+        Its size, for a J may be negative, shape [B].
+    """
+    standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
+    traversability = problem.ground_at(state).abs()
+    stage = problem.objective.stage(state, standing, traversability, target_m)
+    return (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
 
 
 def hold(

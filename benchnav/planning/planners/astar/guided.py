@@ -6,12 +6,13 @@ robot that its local planner holds in place is steered along the path. Source: p
 """
 
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.planning.objective import path_cost_of, path_length, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
@@ -54,11 +55,11 @@ class GuideConfig:
 
     Args:
         lookahead_m: how far along the path the way-point lies at most.
-        by_time: A* minimises time under λ̂ rather than 3D length.
     """
 
+    gone: ClassVar = {"by_time": "A* now minimises the path cost of the objective: give it `travel_time`."}
+
     lookahead_m: float = 4.0
-    by_time: bool = False
 
     def __post_init__(self) -> None:
         """Refuses a look-ahead that looks nowhere."""
@@ -100,26 +101,29 @@ class Guided(Generic[Local]):
     @property
     def follows(self) -> str:
         """Whose objectives it follows."""
-        cost = "travel time" if self.guide.by_time else "path length"
-        return f"{cost} (A*), J ({self.local.name})"
+        return f"path cost of J (A*), J ({self.local.name})"
 
     def remarks(self, task: Task) -> tuple[str, ...]:
-        """Says where no risk setting moves the path; see `Planner`."""
-        if self.guide.by_time or task.rules.free_space.by != "mean":
-            return ()
-        return (
-            "A* takes the shortest way over free ground, and ground is free by the mean: its path is the same under "
-            f"every risk setting, which moves {self.local.name} alone (by_time: true lets it choose the path)",
-        )
+        """Says what a path costs where J does not, and where no risk setting moves the path; see `Planner`."""
+        found, metre = [], path_cost_of(task.objective)
+        if metre is path_length:
+            found.append(f"A* takes the shortest path: {type(task.objective).__name__} has no `path_cost`")
+        slow, fast = metre(torch.tensor([task.rules.slowest, 1.0]), torch.zeros(2)).tolist()
+        if slow == fast and task.rules.free_space.by == "mean":
+            found.append(
+                "ground is free by the mean, and λ̂ is no part of what A* minimises: its path is the same under "
+                f"every risk setting, which moves {self.local.name} alone (objective travel_time moves the path)"
+            )
+        return tuple(found)
 
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
-        by_time = self.guide.by_time
+        task = replace(problem.task, objective=toward_waypoints(problem.objective))
         return GuidedState(
             problem=problem,
-            field=astar.search(problem, by_time),
-            ground=ground_costs(problem, by_time),
-            local=self.local.init(problem, generator),
+            field=astar.search(problem),
+            ground=ground_costs(problem),
+            local=self.local.init(replace(problem, task=task), generator),
             recovery=Recovery.none(problem.start),
         )
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from benchnav.grid import Grid
 from benchnav.planning.free_space import PRICE
+from benchnav.planning.objective import PathCost, path_cost_of
 from benchnav.planning.problem import Problem
 
 # A straight line may cost this much more than the path that it shortens.
@@ -23,37 +24,34 @@ _SHORT_CUT = 1.1
 class GroundCosts:
     """What a metre of straight line costs in each cell; maps framed by `Grid.pad` for lookups.
 
-    A metre costs per_m · √(1 + (gradient · direction)²) + price_per_m.
+    A metre costs path_cost(λ̂, gradient · direction) + price_per_m.
 
     Args:
         grid: size and resolution of the maps.
-        per_m: seconds, or 1 for the length, shape [B, (H + 2)·(W + 2)].
+        path_cost: cost of a metre, from λ̂ and grade.
+        traversability: λ̂, shape [B, (H + 2)·(W + 2)].
         price_per_m: of ground that is not free, shape [B, (H + 2)·(W + 2)].
-        gradient: rise of a metre along x and along y, which the 3D length needs, each of shape
-            [B, (H + 2)·(W + 2)]; None on flat ground.
+        gradient: rise of a metre along x and along y, each of shape [B, (H + 2)·(W + 2)].
     """
 
     grid: Grid
-    per_m: Tensor
+    path_cost: PathCost
+    traversability: Tensor
     price_per_m: Tensor
-    gradient: tuple[Tensor, Tensor] | None = None
+    gradient: tuple[Tensor, Tensor]
 
 
-def ground_costs(problem: Problem, by_time: bool = False) -> GroundCosts:
-    """A*'s own costs a metre.
-
-    Args:
-        problem: B problems.
-        by_time: seconds at top speed under λ̂ rather than 3D length.
-    """
+def ground_costs(problem: Problem) -> GroundCosts:
+    """A*'s own costs a metre, of B problems."""
     grid = problem.grid
-    price = grid.pad(PRICE * (~problem.free).to(problem.risk_map), outside=PRICE)
-    if by_time:
-        pace = 1 / (problem.traversability * problem.robot.top_speed_mps)
-        return GroundCosts(grid, grid.pad(pace, outside=0.0), price)
     along_y, along_x = torch.gradient(problem.elevation_m, spacing=grid.resolution_m, dim=(1, 2))
-    gradient = grid.pad(along_x, outside=0.0), grid.pad(along_y, outside=0.0)
-    return GroundCosts(grid, torch.ones_like(price), price, gradient)
+    return GroundCosts(
+        grid,
+        path_cost_of(problem.objective),
+        grid.pad(problem.traversability, outside=1.0),
+        grid.pad(PRICE * (~problem.free).to(problem.risk_map), outside=PRICE),
+        (grid.pad(along_x, outside=0.0), grid.pad(along_y, outside=0.0)),
+    )
 
 
 def line_costs(ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: int) -> Tensor:
@@ -77,12 +75,10 @@ def line_costs(ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: i
     def at_pieces(padded: Tensor) -> Tensor:
         return ground.grid.lookup(padded, middle[..., 0], middle[..., 1])
 
-    per_m = at_pieces(ground.per_m)
-    if ground.gradient is not None:
-        rises = [at_pieces(along) * offset[..., axis, None] for axis, along in enumerate(ground.gradient)]
-        # Of a line without length any slope will do: it costs nothing.
-        slope = sum(rises) / length.clamp(min=1e-9)
-        per_m = per_m * torch.sqrt(1 + slope * slope)
+    rises = [at_pieces(along) * offset[..., axis, None] for axis, along in enumerate(ground.gradient)]
+    # Of a line without length any grade will do: it costs nothing.
+    grade = sum(rises) / length.clamp(min=1e-9)
+    per_m = ground.path_cost(at_pieces(ground.traversability), grade)
     return ((per_m + at_pieces(ground.price_per_m)) * share * length).sum(dim=-1)
 
 

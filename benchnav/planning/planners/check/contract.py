@@ -16,6 +16,7 @@ from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
+from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.check.boundary import NOT_FINITE, find_fault, find_layer_faults
 from benchnav.planning.planners.check.side_effects import NOTHING, same, watch
@@ -76,7 +77,10 @@ def check_planner(
             continue
         steered += 1
         name = given if isinstance(given, str) else type(robot).__name__
-        task = Task(robot=robot, objective=_part("objective", objective or GoalDistance(), robot=robot))
+        rules = Rules()
+        made_for = {"robot": robot, "goal_radius_m": rules.goal_radius_m}
+        goal = _part("objective", objective or GoalDistance(), **made_for)
+        task = Task(robot=robot, objective=goal, rules=rules)
         for height, width in shapes:
             problem = _make_problem(task, height, width, torch.device(device))
             for breach in dict.fromkeys(_breaches(made, problem, tolerance)):

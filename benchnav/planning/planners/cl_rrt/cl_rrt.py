@@ -148,13 +148,19 @@ class CLRRT:
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Notes for tables; see `Planner`."""
-        asked_m, used_m = (
-            self.config.follower.lookahead_m,
-            PathFollower(self.config.follower, task.robot).lookahead_m,
-        )
-        if used_m <= asked_m:
-            return ()
-        return (f"looks {used_m:g} m ahead, as far as the robot drives while its turn rate builds up",)
+        config, robot = self.config.follower, task.robot
+        follower = PathFollower(config, robot)
+        remarks = []
+        if follower.wanted_mps < robot.top_speed_mps:
+            remarks.append(
+                f"CL-RRT drives at {follower.wanted_mps:g} m/s at most, where the robot's top speed is "
+                f"{robot.top_speed_mps:g} m/s"
+            )
+        if follower.lookahead_m > max(config.lookahead_m, config.lookahead_s * follower.wanted_mps):
+            remarks.append(
+                f"looks {follower.lookahead_m:g} m ahead, as far as the robot drives while its turn rate builds up"
+            )
+        return tuple(remarks)
 
     def init(self, problem: Problem, generator: torch.Generator) -> CLRRTState:
         """Starts with no path, so that the first step plans; see `Planner`.
@@ -205,6 +211,23 @@ class CLRRT:
         layers = {"path": route.path, "reference": route.line, "tree": route.tree} if step.draw else {}
         plan = Plan.empty(len(state), state.device, status=route.status, **layers)
         return action, replace(now, tracking=tracking, step=now.step + 1), plan
+
+    def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
+        """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
+
+        def keep(values: Tensor) -> Tensor:
+            return values[members]
+
+        return replace(
+            plan_state,
+            problem=plan_state.problem.select(members),
+            route=map_tensors(keep, plan_state.route),
+            tracking=map_tensors(keep, plan_state.tracking),
+            edge=keep(plan_state.edge),
+            failures=keep(plan_state.failures),
+            mark_m=keep(plan_state.mark_m),
+            mark_step=keep(plan_state.mark_step),
+        )
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
         """Moves the progress to where the robots are, on to the next edge where one is done."""

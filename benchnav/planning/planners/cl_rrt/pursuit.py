@@ -33,14 +33,16 @@ class FollowerConfig:
 
     Args:
         lookahead_m: distance along the path from the robot to the point that it steers for, at least.
-        speed_mps: speed over ground that is wanted.
+        lookahead_s: the same as what the robot drives in so many seconds at the wanted speed, where that is more.
+        speed_mps: speed over ground that is wanted; without it the robot's top speed forward.
         speed_kp: proportional gain of the speed, on top of the wanted speed itself.
         speed_ki: integral gain in 1/s.
         speed_kd: derivative gain in s.
     """
 
     lookahead_m: float = 0.6
-    speed_mps: float = 1.0
+    lookahead_s: float = 0.6
+    speed_mps: float | None = None
     speed_kp: float = 0.5
     speed_ki: float = 0.5
     speed_kd: float = 0.0
@@ -48,9 +50,10 @@ class FollowerConfig:
     def __post_init__(self) -> None:
         """Refuses settings that lead nowhere."""
         for name in ("lookahead_m", "speed_mps"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0 for a path follower, got {getattr(self, name)}.")
-        for name in ("speed_kp", "speed_ki", "speed_kd"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ConfigError(f"Expected `{name}` > 0 for a path follower, got {value}.")
+        for name in ("lookahead_s", "speed_kp", "speed_ki", "speed_kd"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"Expected `{name}` ≥ 0 for a path follower, got {getattr(self, name)}.")
 
@@ -144,10 +147,11 @@ class PathFollower:
         self.config = config
         self.dt_s = robot.dt_s
         self.speed_mps = low[0], high[0]
+        self.wanted_mps = high[0] if config.speed_mps is None else min(config.speed_mps, high[0])
         self.turn_rate_radps = min(-low[1], high[1])
         limits = action_limits(robot)
         build_up_s = self.turn_rate_radps / limits[1] if limits else 0.0
-        self.lookahead_m = max(config.lookahead_m, min(config.speed_mps, high[0]) * build_up_s)
+        self.lookahead_m = max(config.lookahead_m, max(config.lookahead_s, build_up_s) * self.wanted_mps)
 
     def advance(self, reference: Reference, state: Tensor, progress_m: Tensor) -> Tensor:
         """Moves the progress forward to where the robot is now.
@@ -190,11 +194,11 @@ class PathFollower:
 
         # PID: the wanted speed, corrected by the error of the speed over ground.
         moved = state[..., :2] - tracking.position_m
-        error = config.speed_mps - torch.hypot(moved[..., 0], moved[..., 1]) * (1 / self.dt_s)
+        error = self.wanted_mps - torch.hypot(moved[..., 0], moved[..., 1]) * (1 / self.dt_s)
         low, high = self.speed_mps
         reach = high - low
         integral = (tracking.integral + error * (config.speed_ki * self.dt_s)).clamp(-reach, reach)
-        speed = config.speed_mps + config.speed_kp * error + integral
+        speed = self.wanted_mps + config.speed_kp * error + integral
         if config.speed_kd:
             speed = speed + (error - tracking.error_mps) * (config.speed_kd / self.dt_s)
         speed = torch.minimum(speed, self.turn_rate_radps / curvature.abs().clamp(min=_LEAST_CURVATURE))

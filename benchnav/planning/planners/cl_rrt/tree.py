@@ -180,14 +180,13 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
     """
     best = tree.best_cost[:, None]
     found = best < math.inf
-    top_mps = loop.follower.speed_mps[1]
     straight_m = (distance(tree.at.state, loop.problem.goal_m[:, None]) - loop.problem.goal_radius_m).clamp(
         min=0
     )
-    closed = tree.cost + straight_m / top_mps >= best  # cannot improve on the best way
+    closed = tree.cost + straight_m / loop.follower.speed_mps[1] >= best  # cannot improve on the best way
     closed_m = torch.where(closed, math.inf, 0.0)
     # The time of the way to each node, as the length driven in it at the wanted speed.
-    spent_m = torch.where(closed, 0, min(loop.follower.config.speed_mps, top_mps) * tree.time_s)
+    spent_m = torch.where(closed, 0, loop.follower.wanted_mps * tree.time_s)
 
     # Line 2 of algorithm 1: the first node by length alone (explore), or by the whole way (optimise).
     explore = chance < torch.where(found, _EXPLORE[1], _EXPLORE[0])  # [B, R]

@@ -76,6 +76,26 @@ def test_other_settings_of_the_same_planner_are_lines_across_and_blind_ones_grey
     assert names == ["MPPI, cvar", "mean", "straight"]
 
 
+def test_each_setting_is_drawn_in_the_style_that_the_legend_gives_it() -> None:
+    settings = ["mean", "var", "entropic", "chance", "worst", "own", "other", "last"]
+    figure = drawn(
+        *((made.trial(risk=f"cvar:{level}"), 9) for level in LEVELS),
+        *((made.trial(risk=setting), n) for n, setting in enumerate(settings)),
+        (made.trial("straight", "–", model="–"), 8),
+    )
+    names = {10.0 * n: name for n, name in enumerate([*settings, "straight"])}
+    # Matplotlib tells a pattern of dashes by a private name alone: `get_linestyle` gives "--" for each.
+    legend = {line.get_label(): line._dash_pattern for line in figure.legends[0].get_lines()}
+    above, _ = shown(figure)
+    lines = {
+        names[float(np.asarray(line.get_ydata())[0])]: line._dash_pattern
+        for line in above.lines
+        if line.get_marker() == "None"
+    }
+    assert lines == {name: legend[name] for name in names.values()}
+    assert len(set(map(repr, lines.values()))) == len(names)
+
+
 def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:
     places: tuple[dict[str, str], ...] = ({"scenario": "hg"}, {"world": "stakes"}, {"model": "mdn"})
     for other in places:

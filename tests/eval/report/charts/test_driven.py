@@ -133,10 +133,10 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = episodes({0: [True] * 3, 1: [True, False, True]})
-    folder = run_folder(tmp_path / "run", rows, format_version=3)
-    assert write_driven(folder) == {}
+    folder = run_folder(tmp_path / "run", rows)
+    assert write_driven(folder, folder) == {}
     with_steps(folder, rows)
-    assert write_driven(folder) == {}
+    assert write_driven(folder, folder) == {}
     ground().save(folder / GROUND)
     shown: list[Any] = []
 
@@ -145,7 +145,7 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
         return driven_figure(*given)
 
     monkeypatch.setattr("benchnav.eval.report.charts.driven.driven_figure", draw)
-    caption = write_driven(folder)
+    caption = write_driven(folder, folder)
     assert "std 1, seed 0, realisation 0: of all maps" in caption["driven"]
     assert (folder / "figures" / "driven.png").stat().st_size > 5000
     ((_, own, tracks),) = shown
@@ -162,7 +162,7 @@ def test_the_paths_are_those_of_the_maps_own_luck(
         made.row(made.trial(risk=risk, world="stakes"), instance, seed=one, realisation=draw)
         for risk in RISKS for one in (0, 7) for draw in (0, 1) for instance in (0, 1)
     )  # fmt: skip
-    folder = run_folder(tmp_path / "run", rows, format_version=3)
+    folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
     shown: list[Any] = []
@@ -170,7 +170,7 @@ def test_the_paths_are_those_of_the_maps_own_luck(
         "benchnav.eval.report.charts.driven.driven_figure", lambda *given: shown.append(given)
     )
     monkeypatch.setattr("benchnav.eval.report.charts.driven.save", lambda *given: None)
-    caption = write_driven(folder)["driven"]
+    caption = write_driven(folder, folder)["driven"]
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
     ((_, own, tracks),) = shown
     assert own["risk"].tolist() == list(RISKS)
@@ -181,12 +181,14 @@ def test_the_paths_are_those_of_the_maps_own_luck(
 
 def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.trial(risk=f"cvar:0.{i:02}", world="stakes"), 1) for i in range(MOST_PATHS + 2)
+        made.row(made.trial(risk=f"cvar:0.{i:02}", world="stakes"), instance)
+        for instance in range(2)
+        for i in range(MOST_PATHS + 2)
     )
-    folder = run_folder(tmp_path / "run", rows, format_version=3)
+    folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    caption = write_driven(folder)["driven"]
+    caption = write_driven(folder, folder)["driven"]
     assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} trials." in caption
 
 

@@ -6,19 +6,22 @@ import pytest
 import torch
 
 from benchnav import gridgraph
+from benchnav.errors import ConfigError
 from benchnav.grid import Grid
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PRICE, Rules
+from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.robots import Unicycle
 from tests import factories
 
 
-def random_problem(seed: int, robot: Unicycle | None = None) -> Problem:
+def random_problem(seed: int, robot: Unicycle, by_time: bool = False) -> Problem:
     generator = torch.Generator().manual_seed(seed)
     maps = 0.15 + torch.rand(3, 16, 12, generator=generator)
     elevation = 2 * torch.rand(3, 16, 12, generator=generator)
-    return factories.problem(maps.clamp(max=1), goal=(4.25, 6.75), elevation_m=elevation, robot=robot)
+    objective = TravelTime(robot, 1.0) if by_time else GoalDistance()
+    return factories.problem(maps.clamp(max=1), (1.25, 1.25), (4.25, 6.75), robot, objective, None, elevation)
 
 
 def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Graph:
@@ -43,9 +46,9 @@ def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Gra
 @pytest.mark.parametrize("by_time", [False, True])
 @pytest.mark.parametrize("seed", range(2))
 def test_costs_to_go_equal_networkx_on_every_cell(seed: int, by_time: bool) -> None:
-    problem = random_problem(seed, Unicycle(speed_mps=(0, 2)))
+    problem = random_problem(seed, Unicycle(speed_mps=(0, 2)), by_time)
     assert not problem.free.all()
-    field = astar.search(problem, by_time)
+    field = astar.search(problem)
     centres = [(i, j) for i in range(16) for j in range(12)]
     goals = {(i, j) for i, j in centres if np.hypot(j / 2 + 0.25 - 4.25, i / 2 + 0.25 - 6.75) < 1}
     for b in range(3):
@@ -64,13 +67,48 @@ def test_costs_to_go_equal_networkx_on_every_cell(seed: int, by_time: bool) -> N
 def test_time_cost_prefers_the_quick_way_round() -> None:
     slow = torch.full((1, 16, 20), 1.0)
     slow[0, 6:14, 5:11] = 0.31
-    problem = factories.problem(slow, start=(1.25, 4.0), goal=(6.75, 4.0))
-    crossing = {}
-    for by_time in (False, True):
-        field = astar.search(problem, by_time)
-        cells = astar.path_cells(field, torch.tensor([8 * 20 + 2]), 40)[0]
-        crossing[by_time] = bool((problem.traversability[0].flatten()[cells] < 0.5).any())
-    assert crossing == {False: True, True: False}
+    crossing = []
+    for objective in (GoalDistance(), TravelTime(Unicycle(), 1.0)):
+        problem = factories.problem(slow, start=(1.25, 4.0), goal=(6.75, 4.0), objective=objective)
+        cells = astar.path_cells(astar.search(problem), torch.tensor([8 * 20 + 2]), 40)[0]
+        crossing.append(bool((problem.traversability[0].flatten()[cells] < 0.5).any()))
+    assert crossing == [True, False]
+
+
+class Climbing(GoalDistance):
+    """An objective to which only going up costs much; it is asked for λ̂ and grade by name."""
+
+    def path_cost(self, traversability: torch.Tensor, grade: torch.Tensor) -> torch.Tensor:
+        return 1 + 100 * grade.clamp(min=0) / traversability
+
+
+def test_a_users_path_cost_is_given_the_ground_and_the_rise_of_each_edge() -> None:
+    # A ramp along x, at 0.4 m a cell, ends in a plateau; λ̂ is 0.5 on it and 0.8 on the ground above.
+    elevation = 0.4 * torch.arange(12).clamp(max=6).expand(1, 16, 12).float()
+    ground = torch.where(torch.arange(12) < 6, 0.5, 0.8).expand(1, 16, 12)
+    problem = factories.problem(
+        ground, goal=(5.75, 4.25), objective=Climbing(), rules=Rules(goal_radius_m=0.1), elevation_m=elevation
+    )
+    up = astar.search(problem).cost[0, 8]
+    # From column 3 to 6 each half metre rises 0.8 m a metre, on the half edges of its own cell.
+    steps = [0.5 * (1 + 80 / 0.5)] * 2 + [0.25 * (1 + 80 / 0.5) + 0.25 * (1 + 80 / 0.8)]
+    assert up[3].item() == pytest.approx(sum(steps) + 5 * 0.5, rel=1e-5)
+    # Downhill it costs its length alone.
+    problem = replace(problem, goal_m=torch.tensor([[0.25, 4.25]]))
+    assert astar.search(problem).cost[0, 8, 11].item() == pytest.approx(11 * 0.5, rel=1e-5)
+
+
+@pytest.mark.parametrize("cost", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_path_cost_that_no_search_can_use_is_refused(cost: float) -> None:
+    class Bad(GoalDistance):
+        def path_cost(self, traversability: torch.Tensor, grade: torch.Tensor) -> torch.Tensor:
+            return torch.where(traversability < 0.5, cost, 1.0)
+
+    ground = torch.full((1, 8, 8), 0.9)
+    astar.search(factories.problem(ground, objective=Bad()))
+    ground[0, 3, 3] = 0.4
+    with pytest.raises(ConfigError, match=r"path_cost.*Bad"):
+        astar.search(factories.problem(ground, objective=Bad()))
 
 
 def test_a_path_leaves_ground_that_is_not_free_by_the_shortest_way_and_enters_none() -> None:

@@ -9,6 +9,7 @@ import torch
 from benchnav import registry
 from benchnav.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
 from benchnav.planning.planners.planner import check_steers
@@ -33,18 +34,21 @@ def longest_stand_s(driven: Drive) -> float:
     return longest / 10
 
 
-@pytest.mark.parametrize(("robot", "by_time"), [(Unicycle(), False), (DifferentialDrive(), True)])
-def test_it_finds_the_gap_in_a_wall(robot: Unicycle, by_time: bool) -> None:
+@pytest.mark.parametrize(
+    ("robot", "objective"),
+    [(Unicycle(), GoalDistance()), (DifferentialDrive(), TravelTime(DifferentialDrive(), 1.0))],
+)
+def test_it_finds_the_gap_in_a_wall(robot: Unicycle, objective: Objective) -> None:
     ground = torch.full((2, 24, 30), 0.85)
     ground[:, 11:13, :] = 0.1
     ground[:, 11:13, 20:24] = 0.85
-    problem = factories.problem(ground, start=(3.0, 2.5), goal=(6.0, 10.0), robot=robot)
-    driven = drive(AStarDWA(AStarDWAConfig(by_time=by_time)), problem)
+    problem = factories.problem(ground, (3.0, 2.5), (6.0, 10.0), robot, objective)
+    driven = drive(AStarDWA(), problem)
     assert driven.outcome.tolist() == [SUCCESS] * 2
     assert problem.free_at(driven.states).float().mean() > 0.98
 
 
-def cornered() -> Problem:
+def cornered(objective: Objective) -> Problem:
     """Four corners of ground that is not free, to be passed closely on either side and both axes."""
     ground = torch.full((4, 20, 26), 0.8)
     ground[0, 6:, 8:12] = 0.0
@@ -53,12 +57,12 @@ def cornered() -> Problem:
     # A way that leads through corners alone.
     ground[3, :, 12] = 0.0
     ground[3, 8, 12], ground[3, 7:10, 11], ground[3, 8, 11] = 0.8, 0.0, 0.8
-    return factories.problem(ground, start=(2.0, 4.0), goal=(11.5, 4.2))
+    return factories.problem(ground, start=(2.0, 4.0), goal=(11.5, 4.2), objective=objective)
 
 
-@pytest.mark.parametrize("by_time", [False, True])
-def test_it_does_not_stand_beside_a_corner(by_time: bool) -> None:
-    driven = drive(AStarDWA(AStarDWAConfig(by_time=by_time)), cornered())
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
+def test_it_does_not_stand_beside_a_corner(objective: Objective) -> None:
+    driven = drive(AStarDWA(), cornered(objective))
     assert driven.outcome.tolist() == [SUCCESS] * 4
     assert longest_stand_s(driven) < 5
 
@@ -87,13 +91,16 @@ def test_it_leaves_ground_that_is_predicted_to_hold_it() -> None:
     assert driven.steps.max() < 350
 
 
-def test_it_drives_across_where_no_way_is_free() -> None:
-    ground = torch.full((2, 16, 20), 0.85)
-    ground[0, 7:9] = 0.2
-    ground[1, 9:, 12:] = 0.2
-    problem = factories.problem(ground, goal=(8.5, 6.5))
-    driven = drive(AStarDWA(), problem)
-    assert driven.outcome.tolist() == [SUCCESS] * 2
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
+def test_it_drives_across_where_no_way_is_free(objective: Objective) -> None:
+    # A wall of 1.5 m across the map, either way, and a goal in a closed corner.
+    ground = torch.full((3, 16, 20), 0.85)
+    ground[0, 7:10] = 0.1
+    ground[1, :, 9:12] = 0.1
+    ground[2, 9:, 12:] = 0.2
+    problem = factories.problem(ground, goal=(8.5, 6.5), objective=objective)
+    driven = drive(AStarDWA(), problem, ground.clamp(min=0.4))
+    assert driven.outcome.tolist() == [SUCCESS] * 3
 
 
 def test_a_robot_turned_away_turns_round() -> None:
@@ -125,29 +132,70 @@ def test_a_robot_that_spins_stops_it(rate: float) -> None:
 
 
 def test_its_settings_are_its_own_and_those_of_dwa() -> None:
-    part = {"part": "astar_dwa", "options": {"by_time": True, "lookahead_m": 3, "dwa": {"horizon": 40}}}
+    part = {"part": "astar_dwa", "options": {"lookahead_m": 3, "dwa": {"horizon_s": 4}}}
     made = registry.make("planner", part)
-    assert made.config == AStarDWAConfig(by_time=True, lookahead_m=3.0, dwa=DWAConfig(horizon=40))
-    assert made.local.config == DWAConfig(horizon=40)
-    assert made.follows == "travel time (A*), J (DWA)"
+    assert made.config == AStarDWAConfig(lookahead_m=3.0, dwa=DWAConfig(horizon_s=4.0))
+    assert made.local.config == DWAConfig(horizon_s=4.0)
+    assert made.follows == "path cost of J (A*), J (DWA)"
     with pytest.raises(ConfigError, match="dwa"):
         registry.make("planner", {"part": "astar_dwa", "options": {"dwa": {"horizons": 40}}})
-    with pytest.raises(ConfigError, match="horizon"):
-        registry.make("planner", {"part": "astar_dwa", "options": {"dwa": {"horizon": 0}}})
 
 
-def test_it_tells_of_accelerations_that_the_robot_does_not_have() -> None:
-    assert AStarDWA().remarks(factories.task(DifferentialDrive())) == ()
-    assert "0.5 m/s²" in AStarDWA().remarks(factories.task(Unicycle()))[0]
+@pytest.mark.parametrize(
+    ("options", "remedy"),
+    [
+        ({"by_time": True}, "travel_time"),
+        ({"by_time": False}, "travel_time"),
+        ({"dwa": {"horizon": 50}}, "horizon_s"),
+        ({"dwa": {"acceleration": 0.5}}, "limits of a robot"),
+        ({"dwa": {"turn_acceleration": 0.5}}, "limits of a robot"),
+    ],
+)
+def test_options_that_are_gone_are_refused_with_what_does_their_work(
+    options: dict[str, object], remedy: str
+) -> None:
+    with pytest.raises(ConfigError, match=remedy) as refused:
+        registry.make("planner", {"part": "astar_dwa", "options": options})
+    assert "\n" not in str(refused.value)
 
 
-def test_it_tells_where_no_risk_setting_moves_its_path() -> None:
-    by_mean, by_risk = (Rules(free_space=FreeSpace(by=by)) for by in ("mean", "risk"))
-    (remark,) = AStarDWA().remarks(factories.task(DifferentialDrive(), rules=by_mean))
-    assert "by_time" in remark
-    assert AStarDWA().remarks(factories.task(DifferentialDrive(), rules=by_risk)) == ()
-    quick = AStarDWA(AStarDWAConfig(by_time=True))
-    assert quick.remarks(factories.task(DifferentialDrive(), rules=by_mean)) == ()
+class Own(GoalDistance):
+    """An objective whose path cost is its own."""
+
+    def __init__(self, power: float) -> None:
+        self.power = power
+
+    def path_cost(self, traversability: torch.Tensor, grade: torch.Tensor) -> torch.Tensor:
+        return 2 * traversability**-self.power
+
+
+class Bare:
+    """An objective without a path cost."""
+
+    stage, terminal = GoalDistance.stage, GoalDistance.terminal
+
+
+@pytest.mark.parametrize("by", ["mean", "risk"])
+def test_it_tells_where_no_risk_setting_moves_its_path(by: str) -> None:
+    rules = Rules(free_space=FreeSpace(by=by))
+    for objective, moves in (
+        (GoalDistance(), False), (TravelTime(Unicycle(), 1.0), True), (Own(0.0), False), (Own(0.5), True)
+    ):  # fmt: skip
+        remarks = AStarDWA().remarks(factories.task(objective=objective, rules=rules))
+        if moves or by == "risk":
+            assert remarks == ()
+        else:
+            (remark,) = remarks
+            assert "travel_time" in remark
+            assert "moves DWA alone" in remark
+
+
+def test_it_tells_that_it_takes_the_shortest_path_of_an_objective_without_its_own_cost() -> None:
+    (remark,) = AStarDWA().remarks(factories.task(objective=Bare()))
+    assert "shortest" in remark
+    assert "Bare" in remark
+    by_mean = Rules(free_space=FreeSpace(by="mean"))
+    assert len(AStarDWA().remarks(factories.task(objective=Bare(), rules=by_mean))) == 2
 
 
 def test_it_refuses_a_robot_that_steers() -> None:

@@ -3,6 +3,7 @@ import torch
 
 from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
@@ -13,7 +14,7 @@ from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, first, generator
 
-SMALL = MPPIConfig(samples=256, horizon=30)
+SMALL = MPPIConfig(samples=256, horizon_s=3)
 
 
 def trap(robot: Unicycle | Bicycle) -> Problem:
@@ -30,6 +31,17 @@ def test_the_global_path_leads_it_round_a_pocket(robot: Unicycle | Bicycle) -> N
     driven = drive(AStarMPPI(AStarMPPIConfig(mppi=SMALL)), problem, time_budget_s=50)
     assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
     assert problem.free_at(driven.states).float().mean() > 0.98
+
+
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Unicycle(), 1.0)])
+def test_it_drives_across_a_wall_that_closes_the_map(objective: Objective) -> None:
+    # Ground 1.5 m thick that is not free, from one edge of the map to the other; it carries the robot slowly.
+    ground = torch.full((2, 20, 20), 0.85)
+    ground[0, :, 9:12] = 0.1
+    ground[1, 9:12] = 0.1
+    problem = factories.problem(ground, (2.75, 3.0), (8.5, 8.0), objective=objective)
+    driven = drive(AStarMPPI(AStarMPPIConfig(mppi=SMALL)), problem, ground.clamp(min=0.4), 60)
+    assert driven.outcome.tolist() == [Outcome.SUCCESS] * 2
 
 
 def test_mppi_alone_stays_in_the_pocket() -> None:
@@ -55,11 +67,14 @@ def test_it_is_given_the_way_points_that_dwa_is_given(monkeypatch: pytest.Monkey
 
 
 def test_its_settings_are_its_own_and_those_of_mppi() -> None:
-    part = {"part": "astar_mppi", "options": {"by_time": True, "mppi": {"samples": 300, "noise": [0.4, 0.3]}}}
+    part = {
+        "part": "astar_mppi",
+        "options": {"lookahead_m": 3, "mppi": {"samples": 300, "noise": [0.4, 0.3]}},
+    }
     made = registry.make("planner", part)
-    assert made.config == AStarMPPIConfig(by_time=True, mppi=MPPIConfig(samples=300, noise=(0.4, 0.3)))
+    assert made.config == AStarMPPIConfig(lookahead_m=3.0, mppi=MPPIConfig(samples=300, noise=(0.4, 0.3)))
     assert made.local.config.samples == 300
-    assert made.follows == "travel time (A*), J (MPPI)"
+    assert made.follows == "path cost of J (A*), J (MPPI)"
     with pytest.raises(ConfigError, match="lookahead_m"):
         registry.make("planner", {"part": "astar_mppi", "options": {"lookahead_m": 0.0}})
 

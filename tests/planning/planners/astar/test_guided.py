@@ -1,18 +1,19 @@
 """The guide and the recovery, with local planners that do as little as can be."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from benchnav.errors import ConfigError
+from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
 from benchnav.planning.planners.astar.waypoint import choose_waypoint, ground_costs
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
-from benchnav.planning.robots import Bicycle
+from benchnav.planning.robots import Bicycle, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, step_at, with_start
@@ -38,6 +39,31 @@ class Constant:
 
     def took(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
         return (*plan_state, action)
+
+
+def test_under_travel_time_a_way_point_within_the_goals_radius_still_draws_the_local_planner() -> None:
+    seen: list[Problem] = []
+
+    class Noting(Constant):
+        def init(self, problem: Problem, generator: torch.Generator) -> tuple[Tensor, ...]:
+            seen.append(problem)
+            return ()
+
+    problem = factories.problem(torch.full((1, 16, 16), 0.8), objective=TravelTime(Unicycle(), 1.0))
+    Guided(GuideConfig(), Noting((0.0, 0.0))).init(problem, generator())
+    near = torch.tensor([[2.0, 2.0, 0.0]])
+    cost = seen[0].objective.stage(near, torch.zeros(1, 2), torch.ones(1), torch.tensor([[2.5, 2.0]]))
+    assert cost.item() == pytest.approx(0.1)
+
+
+class Standing(Constant):
+    """Stands; some of its episodes may leave."""
+
+    def __init__(self) -> None:
+        super().__init__((0.0, 0.0))
+
+    def select(self, plan_state: tuple[Tensor, ...], members: Tensor) -> tuple[Tensor, ...]:
+        return tuple(action[members] for action in plan_state)
 
 
 # --- With the recovery.
@@ -98,6 +124,33 @@ def test_the_local_planner_is_told_what_was_taken_instead() -> None:
     assert actions[10][0, 0] > 0.5
 
 
+def test_the_recovery_of_an_episode_stays_its_own_when_others_leave_the_batch() -> None:
+    """Of four robots two are being led away, to two places; those that stay are led as they were among all."""
+    ground = torch.full((4, 16, 20), 0.8)
+    problem = factories.problem(ground, goal=(8.25, 6.75))
+    starts = torch.tensor([[1.6, 1.2, 0.0], [6.1, 2.3, 1.0], [2.2, 6.4, -1.0], [4.1, 4.4, 0.5]])
+    problem = replace(problem, start=starts)
+    planner = Guided(GuideConfig(), Standing())
+    plan_state, state = planner.init(problem, generator()), problem.start
+    for _ in range(14):
+        action, plan_state, _ = planner.plan(step_at(state), plan_state)
+        # The first and third are carried on by the ground, so that they are not held.
+        state = problem.robot(state, action, torch.full((4,), 0.5)) + 0.1 * torch.tensor(
+            [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]]
+        )
+    assert plan_state.recovery.active.tolist() == [False, True, False, True]
+    whole, _, _ = planner.plan(step_at(state), plan_state)
+    for kept in ([3], [2, 3], [3, 1], [0, 1, 3], [1, 0, 2]):
+        members = torch.tensor(kept)
+        some = planner.select(plan_state, members)
+        action, following, _ = planner.plan(step_at(state[members]), some)
+        torch.testing.assert_close(action, whole[members], rtol=0, atol=1e-6)
+        assert following.recovery.active.tolist() == plan_state.recovery.active[members].tolist()
+        for name in ("place_m", "steps", "driven_m", "target_m", "cell"):
+            expected = getattr(plan_state.recovery, name)[members]
+            torch.testing.assert_close(getattr(some.recovery, name), expected, rtol=0, atol=0)
+
+
 # --- The guide.
 
 
@@ -105,14 +158,18 @@ def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
     slow = torch.full((2, 12, 24), 1.0)
     slow[0, 3:9, 5:8] = 0.31
     slow[1, :9, 6] = 0.1
-    problem = factories.problem(slow, start=(1.75, 3.25), goal=(10.25, 3.25))
     given = []
-    for config in (GuideConfig(), GuideConfig(lookahead_m=2.0), GuideConfig(by_time=True)):
+    for config, objective in (
+        (GuideConfig(), GoalDistance()),
+        (GuideConfig(lookahead_m=2.0), GoalDistance()),
+        (GuideConfig(), TravelTime(Unicycle(), 1.0)),
+    ):
+        problem = factories.problem(slow, (1.75, 3.25), (10.25, 3.25), objective=objective)
         local = Constant((0.5, 0.0))
         planner = Guided(config, local)
         planner.plan(first(problem), planner.init(problem, generator()))
-        points = astar.path_points(problem, astar.search(problem, config.by_time), problem.start, 30)
-        expected, _ = choose_waypoint(ground_costs(problem, config.by_time), points, config.lookahead_m)
+        points = astar.path_points(problem, astar.search(problem), problem.start, 30)
+        expected, _ = choose_waypoint(ground_costs(problem), points, config.lookahead_m)
         torch.testing.assert_close(local.targets[0], expected)
         given.append(expected[0])
     assert not any(torch.equal(given[0], other) for other in given[1:])
@@ -131,22 +188,21 @@ def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
 
 
 def test_it_says_whose_objectives_it_follows() -> None:
-    assert Guided(GuideConfig(), Constant((0, 0))).follows == "path length (A*), J (constant)"
-    assert Guided(GuideConfig(by_time=True), Constant((0, 0))).follows == "travel time (A*), J (constant)"
+    assert Guided(GuideConfig(), Constant((0, 0))).follows == "path cost of J (A*), J (constant)"
     with pytest.raises(ConfigError, match="lookahead_m"):
         GuideConfig(lookahead_m=0)
 
 
-@pytest.mark.parametrize("by_time", [False, True])
+@pytest.mark.parametrize("objective", [GoalDistance(), TravelTime(Bicycle(), 1.0)])
 def test_no_tensor_is_made_on_another_device_but_by_the_search(
-    monkeypatch: pytest.MonkeyPatch, by_time: bool
+    monkeypatch: pytest.MonkeyPatch, objective: Objective
 ) -> None:
-    real = factories.problem(torch.full((2, 16, 24), 0.9), robot=Bicycle())
+    real = factories.problem(torch.full((2, 16, 24), 0.9), robot=Bicycle(), objective=objective)
     searched = astar.search(real)
     with fake_cuda(real) as problem:
         moved = astar.CostToGo(searched.cost.to("cuda"), searched.following.to("cuda"))
         monkeypatch.setattr(astar, "search", lambda *_: moved)
-        planner = Guided(GuideConfig(by_time=by_time), Constant((0.5, 0.0)))
+        planner = Guided(GuideConfig(), Constant((0.5, 0.0)))
         state = planner.init(problem, generator())
         action, following, plan = planner.plan(first(problem, draw=True), state)
         recovery = following.recovery

@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from benchnav.grid import Grid
 from benchnav.planning.free_space import PRICE
+from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs, line_costs
 from benchnav.planning.problem import Problem
@@ -17,12 +19,13 @@ from tests.planning.planners.driving import generator
 GRID = Grid(10, 14, 0.5)
 
 
-def problem(seed: int = 0) -> Problem:
+def problem(seed: int = 0, by_time: bool = False) -> Problem:
     """Maps of 10 × 14 cells, rough and partly not free."""
     maps = 0.1 + torch.rand(3, *GRID.shape, generator=generator(seed))
     elevation = torch.rand(3, *GRID.shape, generator=generator(seed + 1))
     robot = Unicycle(speed_mps=(0, 1.5))
-    return factories.problem(maps.clamp(max=1), (1.25, 1.25), (5.25, 3.25), robot, elevation_m=elevation)
+    objective = TravelTime(robot, 1.0) if by_time else GoalDistance()
+    return factories.problem(maps.clamp(max=1), (1.25, 1.25), (5.25, 3.25), robot, objective, None, elevation)
 
 
 def positions(seed: int, lines: int) -> torch.Tensor:
@@ -52,9 +55,9 @@ def sampled(given: Problem, member: int, start: torch.Tensor, end: torch.Tensor,
 
 @pytest.mark.parametrize("by_time", [False, True])
 def test_line_costs_equal_dense_sampling(by_time: bool) -> None:
-    given = problem()
+    given = problem(by_time=by_time)
     start, end = positions(3, 12), positions(4, 12)
-    costs = line_costs(ground_costs(given, by_time), start, end, 14)
+    costs = line_costs(ground_costs(given), start, end, 14)
     assert costs.shape == (3, 12)
     for b in range(3):
         for j in range(12):
@@ -65,22 +68,28 @@ def test_line_costs_equal_dense_sampling(by_time: bool) -> None:
 
 @pytest.mark.parametrize("by_time", [False, True])
 def test_line_costs_on_free_ground_equal_dense_sampling_to_the_digit(by_time: bool) -> None:
-    given = problem()
+    given = problem(by_time=by_time)
     given = replace(given, free=torch.ones_like(given.free))
     start, end = positions(5, 12), positions(6, 12)
-    costs = line_costs(ground_costs(given, by_time), start, end, 14)
+    costs = line_costs(ground_costs(given), start, end, 14)
     for b in range(3):
         for j in range(12):
             expected = sampled(given, b, start[b, j], end[b, j], by_time)
             assert costs[b, j].item() == pytest.approx(expected, rel=2e-4)
 
 
+def costing(grid: Grid, maps: torch.Tensor) -> GroundCosts:
+    """Flat free ground on which a metre costs what maps [B, H, W] say."""
+    per_m = grid.pad(maps, outside=0.0)
+    none = torch.zeros_like(per_m)
+    return GroundCosts(grid, lambda traversability, grade: traversability, per_m, none, (none, none))
+
+
 def numbered() -> GroundCosts:
     """A metre in cell (i, j) costs 10^j · (i + 1): each cell is told from all others."""
     maps = (10.0 ** torch.arange(4)) * torch.arange(1, 4)[:, None]
     grid = Grid(3, 4, 0.5)
-    per_m = grid.pad(maps[None], outside=0.0)
-    return GroundCosts(grid, per_m, torch.zeros_like(per_m))
+    return costing(grid, maps[None])
 
 
 def cost_of(ground: GroundCosts, *ends: tuple[float, float]) -> float:
@@ -122,13 +131,31 @@ def test_the_length_is_that_of_the_slope_along_the_line() -> None:
     torch.testing.assert_close(line_costs(ground, start, end, 14), torch.tensor([[2 * 1.25, 2.0]]))
 
 
+class Climbing(GoalDistance):
+    """Only going up costs; more where λ̂ is low."""
+
+    def path_cost(self, traversability: torch.Tensor, grade: torch.Tensor) -> torch.Tensor:
+        return 1 + 10 * grade.clamp(min=0) / traversability
+
+
+def test_a_users_path_cost_is_given_the_ground_and_the_rise_along_the_line() -> None:
+    rising = 0.4 * 0.5 * torch.arange(14).expand(1, 10, 14)
+    ground = torch.where(torch.arange(14) < 4, 0.5, 0.8).expand(1, 10, 14)
+    given = factories.problem(ground, goal=(5.25, 3.25), objective=Climbing(), elevation_m=rising)
+    ends = torch.tensor([[[1.0, 1.0], [3.0, 1.0], [1.0, 3.0]]])
+    costs = line_costs(ground_costs(given), ends[:, [0, 1, 0]], ends[:, [1, 0, 2]], 14)
+    # Up along x a metre at λ̂ 0.5 and one at 0.8, then down, then along the level.
+    expected = torch.tensor([[2 + 4 / 0.5 + 4 / 0.8, 2.0, 2.0]])
+    torch.testing.assert_close(costs, expected)
+
+
 # --- The rule.
 
 
-def seen(given: Problem, by_time: bool = False, lookahead_m: float = 4.0) -> torch.Tensor:
+def seen(given: Problem, lookahead_m: float = 4.0) -> torch.Tensor:
     """Way-points from the start."""
-    points = astar.path_points(given, astar.search(given, by_time), given.start, 16)
-    return choose_waypoint(ground_costs(given, by_time), points, lookahead_m)[0]
+    points = astar.path_points(given, astar.search(given), given.start, 16)
+    return choose_waypoint(ground_costs(given), points, lookahead_m)[0]
 
 
 def test_on_open_ground_it_is_as_far_as_the_look_ahead() -> None:
@@ -146,8 +173,8 @@ def test_it_is_the_goal_once_that_is_near() -> None:
 @pytest.mark.parametrize("by_time", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_it_is_the_farthest_point_that_is_worth_it(seed: int, by_time: bool) -> None:
-    given = problem(seed)
-    field, ground = astar.search(given, by_time), ground_costs(given, by_time)
+    given = problem(seed, by_time)
+    field, ground = astar.search(given), ground_costs(given)
     counted = set()
     for place in ((1.25, 1.25), (3.1, 4.6), (6.8, 0.3), (0.1, 2.4)):
         start = torch.tensor(place)
@@ -191,8 +218,7 @@ def test_a_short_cut_may_cost_a_tenth_more_than_the_path(factor: float, taken: b
     # A path of 4 m round a square, at 1 a metre; its diagonal leads for 1.5·√2 m through dearer cells.
     maps = torch.ones(1, 10, 14)
     maps[0, 1:4, 1:4] = (4 * factor - 0.5 * math.sqrt(2)) / (1.5 * math.sqrt(2))
-    per_m = GRID.pad(maps, outside=0.0)
-    ground = GroundCosts(GRID, per_m, torch.zeros_like(per_m))
+    ground = costing(GRID, maps)
     points = torch.tensor([[[0.25, 0.25], [2.25, 0.25], [2.25, 2.25]]])
     line = line_costs(ground, points[:, :1], points[:, 2:], 10).item()
     assert line == pytest.approx(4 * factor, rel=1e-5)
@@ -202,19 +228,19 @@ def test_a_short_cut_may_cost_a_tenth_more_than_the_path(factor: float, taken: b
 def test_by_time_no_line_cuts_through_slow_ground() -> None:
     slow = torch.full((1, 12, 16), 1.0)
     slow[0, 3:9, 5:8] = 0.31
-    given = factories.problem(slow, start=(1.75, 3.25), goal=(6.25, 3.25))
-    points = astar.path_points(given, astar.search(given, by_time=True), given.start, 20)
-    by_time = choose_waypoint(ground_costs(given, by_time=True), points, 8.0)[0]
-    by_length = choose_waypoint(ground_costs(given), points, 8.0)[0]
-    torch.testing.assert_close(by_length, given.goal_m)
-    assert (by_time[0] - given.goal_m[0]).norm() > 2
+    ends: Any = {"start": (1.75, 3.25), "goal": (6.25, 3.25)}
+    by_length = factories.problem(slow, **ends)
+    by_time = factories.problem(slow, **ends, objective=TravelTime(Unicycle(), 1.0))
+    points = astar.path_points(by_time, astar.search(by_time), by_time.start, 20)
+    farthest = [choose_waypoint(ground_costs(given), points, 8.0)[0] for given in (by_length, by_time)]
+    torch.testing.assert_close(farthest[0], by_length.goal_m)
+    assert (farthest[1][0] - by_time.goal_m[0]).norm() > 2
 
 
 def test_it_tells_of_a_line_across_the_corner_of_dearer_ground() -> None:
     maps = torch.ones(4, 10, 14)
     maps[:3, 0, 1] = 100.0
-    per_m = GRID.pad(maps, outside=0.0)
-    ground = GroundCosts(GRID, per_m, torch.zeros_like(per_m))
+    ground = costing(GRID, maps)
     places = torch.tensor([[0.45, 0.2], [0.2, 0.45], [0.25, 0.25], [0.45, 0.2]])
     onward = torch.tensor([[0.75, 0.75], [1.25, 1.25]]).expand(4, 2, 2)
     _, straight = choose_waypoint(ground, torch.cat((places[:, None], onward), dim=1), 4.0)

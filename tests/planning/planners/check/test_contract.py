@@ -17,7 +17,7 @@ from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 
-FEW = {"samples": 128, "horizon": 20}
+FEW = {"samples": 128, "horizon_s": 2.0}
 SMALL = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 50}}
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -9,14 +10,23 @@ from torch import Tensor
 
 from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.eval.run.rollout import run_episodes
 from benchnav.planning.objective import distance
+from benchnav.planning.planners.cl_rrt import cl_rrt
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig, CLRRTState
+from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig
+from benchnav.planning.planners.cl_rrt.tree import Route, search
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
+from benchnav.planning.world.outcome import Outcome
+from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import Immobile, World
 from tests import factories
 from tests.planning.planners.cl_rrt.maps import GRID, known, make_problem, open_map, walled_map
+from tests.planning.planners.driving import drive as closed_loop
 
 SMALL = CLRRTConfig(expansions=200)
 GAP = slice(20, 28)  # from y = 10 m to 14 m, wide enough to be found by every seed
@@ -486,7 +496,78 @@ def test_what_tables_say_of_it() -> None:
     assert planner.steers == (("speed_mps", "turn_rate_radps"),)
     assert planner.follows == "travel time"
     assert planner.remarks(factories.task(Unicycle())) == ()
-    assert "looks 1 m ahead" in planner.remarks(factories.task(DifferentialDrive()))[0]
+    assert planner.remarks(factories.task(Unicycle(speed_mps=(-1.0, 3.0)))) == ()
+    (remark,) = planner.remarks(factories.task(DifferentialDrive()))
+    assert "looks 1 m ahead" in remark
+    slow = CLRRT(CLRRTConfig(follower=FollowerConfig(speed_mps=1.0)))
+    said = ("CL-RRT drives at 1 m/s at most, where the robot's top speed is 3 m/s",)
+    assert slow.remarks(factories.task(Unicycle(speed_mps=(0.0, 3.0)))) == said
+    assert slow.remarks(factories.task(Unicycle())) == ()
+    # Backward it would be faster, but it is driven forward alone.
+    assert "at 2 m/s at most" in planner.remarks(factories.task(Unicycle(speed_mps=(-3.0, 2.0))))[0]
+
+
+@pytest.mark.parametrize("top_mps", [0.5, 3.0])
+def test_on_open_ground_it_is_as_fast_as_the_straight_line(top_mps: float) -> None:
+    problem = make_problem(open_map(), Unicycle(speed_mps=(0.0, top_mps)))
+    steps = [
+        closed_loop(planner, problem).steps.item()
+        for planner in (CLRRT(CLRRTConfig(expansions=50)), Straight())
+    ]
+    assert steps[0] <= 1.05 * steps[1]
+
+
+def test_a_fast_robot_finds_the_gap_in_less_time_than_a_slow_one() -> None:
+    maps, steps = walled_map(gap=GAP), []
+    for top in (1.0, 3.0):
+        robot = Unicycle(speed_mps=(0.0, top), turn_rate_radps=(-top, top))
+        problem = make_problem(maps, robot)
+        states, _, _ = drive(problem, 400)
+        assert arrived(problem, states[-1]).all()
+        assert all_free(problem, states[:, 0])
+        steps.append(len(states))
+    assert steps[1] < 0.4 * steps[0]
+
+
+def test_those_that_are_kept_go_on_as_they_would_in_the_batch() -> None:
+    problem = make_problem(torch.cat((walled_map(gap=GAP), open_map(), walled_map())))
+    planner, plan_state = begin(problem, CLRRTConfig(expansions=50))
+    state, members = problem.start, torch.tensor([2, 0])
+    for _ in range(3):
+        action, plan_state, _ = planner.plan(at(state), plan_state)
+        state = problem.robot(state, action, problem.traversability_at(state))
+    few = planner.select(plan_state, members)
+    for count in range(4):
+        state = state + torch.tensor([0.0, 1.5, 0.0]) * (count == 2)  # aside, so that it plans anew
+        action, plan_state, plan = planner.plan(at(state), plan_state)
+        few_action, few, few_plan = planner.plan(at(state[members]), few)
+        torch.testing.assert_close(few_action, action[members])
+        torch.testing.assert_close(few_plan.path, plan.path[members], equal_nan=True)
+        assert torch.equal(few.failures, plan_state.failures[members])
+        state = problem.robot(state, action, problem.traversability_at(state))
+
+
+def test_trees_are_grown_for_running_robots_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    grown: list[int] = []
+
+    def counted(loop: ClosedLoop, root: Tensor, *rest: Any) -> Route:
+        grown.append(len(root))
+        return search(loop, root, *rest)
+
+    monkeypatch.setattr(cl_rrt, "search", counted)
+    problem = make_problem(open_map(3))
+    # In truth two of three are held where they begin, which ends their episodes after a second.
+    truth = torch.cat((torch.zeros(2, *GRID.shape), open_map()))
+    world = World(immobile=Immobile(below=0.1, for_s=1.0))
+    places = factories.places(problem.goal_m, problem.start[:, :2])
+    terrain = replace(factories.terrain(truth, 0.01), grid=problem.grid)
+    simulation = Simulation(terrain, problem.task, world, places, 0, range(3))
+    planner = CLRRT(replace(SMALL, expansions=50, stall_s=2.0))
+    episodes = run_episodes(planner, problem, simulation, torch.Generator())
+    assert episodes.outcome.tolist() == [Outcome.IMMOBILISED] * 2 + [Outcome.SUCCESS]
+    assert episodes.steps[2] > 40
+    assert grown[0] == 3
+    assert set(grown[1:]) <= {1}
 
 
 @pytest.mark.parametrize(("expansions", "per_round"), [(100, 25), (100, 50), (200, 25)])
@@ -564,11 +645,13 @@ def test_distance_from_the_path_at_which_it_plans_anew(replan_distance_m: float)
 @pytest.mark.parametrize(
     "follower",
     [
-        FollowerConfig(lookahead_m=1.2),
+        FollowerConfig(),
+        FollowerConfig(speed_mps=1.0, lookahead_m=1.2),
+        FollowerConfig(speed_mps=1.0, lookahead_s=1.2),
         FollowerConfig(speed_mps=0.5),
-        FollowerConfig(speed_kp=0.1),
-        FollowerConfig(speed_ki=0.1),
-        FollowerConfig(speed_kd=0.05),
+        FollowerConfig(speed_mps=1.0, speed_kp=0.1),
+        FollowerConfig(speed_mps=1.0, speed_ki=0.1),
+        FollowerConfig(speed_mps=1.0, speed_kd=0.05),
     ],
 )
 def test_follower_drives_as_it_is_set(follower: FollowerConfig) -> None:
@@ -576,7 +659,7 @@ def test_follower_drives_as_it_is_set(follower: FollowerConfig) -> None:
     maps = open_map() * 0.6
     problem = make_problem(maps, Unicycle(speed_mps=(0.0, 2.0), turn_rate_radps=(-2.0, 2.0)))
     turned = replace(problem, start=problem.start + torch.tensor([0.0, 0.0, 1.0]))
-    _, usual, _ = drive(turned, 20)
+    _, usual, _ = drive(turned, 20, replace(SMALL, follower=FollowerConfig(speed_mps=1.0)))
     _, actions, _ = drive(turned, 20, replace(SMALL, follower=follower))
     assert (usual - actions).abs().max() > 0.02
 

@@ -124,6 +124,33 @@ def test_robot_with_acceleration_limits_joins_and_keeps_a_line() -> None:
     assert (actions[0, 0] - states[1, 3]).abs() > 0.5  # it cannot do what it is told at first
 
 
+def test_a_fast_robot_looks_as_far_ahead_as_keeps_it_on_a_line() -> None:
+    robot = Unicycle(speed_mps=(0.0, 6.0), turn_rate_radps=(-6.0, 6.0))
+    states, actions, _ = drive(line(40), (0, 0.5, 0.1), 1.0, 60, robot=robot)
+    assert actions[20:, 0].min().item() == pytest.approx(6.0)
+    assert states[30:, 1].abs().max() < 0.01
+    # Of what it would drive in a tenth of that time it weaves.
+    weaving, _, _ = drive(line(40), (0, 0.5, 0.1), 1.0, 60, FollowerConfig(lookahead_s=0.06), robot)
+    assert weaving[30:, 1].abs().max() > 0.05
+
+
+@pytest.mark.parametrize(
+    ("config", "robot", "wanted_mps", "lookahead_m"),
+    [
+        (FollowerConfig(), Unicycle(speed_mps=(-4.0, 3.0)), 3.0, 1.8),
+        (FollowerConfig(speed_mps=2.0, lookahead_s=0.5), Unicycle(speed_mps=(0.0, 3.0)), 2.0, 1.0),
+        (FollowerConfig(speed_mps=9.0), Unicycle(), 1.0, 0.6),
+        (FollowerConfig(lookahead_m=0.7), Unicycle(speed_mps=(0.0, 0.3)), 0.3, 0.7),
+    ],
+)
+def test_speed_and_look_ahead_are_those_of_the_robot_unless_set(
+    config: FollowerConfig, robot: Robot, wanted_mps: float, lookahead_m: float
+) -> None:
+    follower = PathFollower(config, robot)
+    assert follower.wanted_mps == wanted_mps
+    assert follower.lookahead_m == pytest.approx(lookahead_m)
+
+
 @pytest.mark.parametrize(
     "robot",
     [
@@ -138,7 +165,9 @@ def test_robots_that_cannot_follow_a_path_are_refused(robot: Robot) -> None:
         PathFollower(FollowerConfig(), robot)
 
 
-@pytest.mark.parametrize("field", ["lookahead_m", "speed_mps", "speed_kp", "speed_ki", "speed_kd"])
+@pytest.mark.parametrize(
+    "field", ["lookahead_m", "lookahead_s", "speed_mps", "speed_kp", "speed_ki", "speed_kd"]
+)
 def test_settings_are_checked(field: str) -> None:
     with pytest.raises(ConfigError, match=field):
         FollowerConfig(**{field: -1.0})

@@ -1,0 +1,86 @@
+"""What readers of a run's tables should know: pairs that were left out, and what was warned of."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchnav.errors import ConfigError
+from benchnav.eval.compare import compare_runs
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.report.write import print_report, write_report
+from benchnav.eval.run.merge import merge_shards
+from benchnav.eval.run.rerun import rerun
+from benchnav.eval.run.runner import Workers, run_suite
+from benchnav.eval.suite import Suite
+from benchnav.share import Share
+
+FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
+LINE = "left out: planner Steering with robot bicycle, which it cannot steer"
+WARNING = "warning: in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"
+
+
+def suite_on(dataset: Path, **changes: Any) -> Suite:
+    given: dict[str, Any] = {
+        "data": str(dataset), "model": "oracle", "planners": (FREE, STEERING), "risks": ("mean", "cvar:0.5"),
+        "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "instances": 2, "record": "none", "steps": "none",
+        "time_budget_s": 3.0,
+    }  # fmt: skip
+    return Suite(**(given | changes))
+
+
+def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
+    dataset_path: Path, tmp_path: Path, capsys: Any
+) -> None:
+    said: list[str] = []
+    folder = tmp_path / "run"
+    list(run_suite(suite_on(dataset_path), folder, say=said.append))
+    assert {LINE, WARNING} <= set(said)
+    run = open_run(folder)
+    pairs = {(trial.labels["planner"], trial.labels["robot"]) for trial, _ in run.trials.values()}
+    assert pairs == {("Faulty", "unicycle"), ("Faulty", "bicycle"), ("Steering", "unicycle")}
+    (dropped,) = run.about["dropped"]
+    assert (dropped["planner"], dropped["robot"]) == ("Steering", "bicycle")
+    assert dropped["reason"].startswith("Expected a robot with actions (speed_mps, turn_rate_radps)")
+    assert run.about["warnings"].count(WARNING.removeprefix("warning: ")) == 1
+    report = write_report(folder)
+    print_report(report)
+    printed = capsys.readouterr().out
+    table, _, below = printed.partition("└")
+    text, page = (folder / "summary.md").read_text(), (folder / "report.html").read_text()
+    for line in (LINE, WARNING):
+        assert line not in table
+        assert line in below
+        assert line in text.partition("|---|")[2]
+        assert line in page
+        assert line in (folder / "summary.tex").read_text()
+    # The family of tests is that of the trials that were run.
+    compared, shown = compare_runs([folder], "", "mean", {}, 0.05)
+    assert len(compared) == 3
+    assert {LINE, WARNING} <= set(shown.notes)
+    # A run that is extended, and one that is repeated, still say it.
+    list(run_suite(suite_on(dataset_path, robots=("unicycle",), seed=1), folder))
+    assert open_run(folder).about["dropped"] == [dropped]
+    next(steps := rerun(folder, tmp_path / "again", Workers()))
+    steps.close()
+    again = open_run(tmp_path / "again").about
+    assert (again["dropped"], again["warnings"]) == ([dropped], open_run(folder).about["warnings"])
+
+
+def test_a_run_in_which_nothing_is_left_is_refused(dataset_path: Path, tmp_path: Path) -> None:
+    suite = suite_on(dataset_path, planners=(STEERING,), robots=("bicycle",))
+    with pytest.raises(ConfigError, match="Expected a robot with actions"):
+        list(run_suite(suite, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Path) -> None:
+    parts = [tmp_path / "1", tmp_path / "2"]
+    for index, part in enumerate(parts, start=1):
+        list(run_suite(suite_on(dataset_path), part, shard=Share(index=index, of=2)))
+    list(merge_shards(parts, tmp_path / "all"))
+    about = open_run(tmp_path / "all").about
+    assert about["dropped"] == open_run(parts[0]).about["dropped"]
+    assert about["warnings"] == open_run(parts[1]).about["warnings"]
+    assert json.dumps(about["history"]).count(str(dataset_path)) == len(about["history"])
