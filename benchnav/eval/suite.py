@@ -49,6 +49,9 @@ class Suite:
         record: Episodes that are recorded for playback: none, failures, the first instance of each trial, or all.
         steps: Episodes whose steps are stored: none, those that are recorded, or all.
         trials: Several products: mappings of the keys above, each taking what it leaves out from there.
+        hypotheses: What the run is to show, fixed before its first unit: mappings of `one` and `other`, conditions by
+            their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
+            path_length; `kind`: difference, non-inferiority or equivalence; `direction`: higher or lower; `margin`.
     """
 
     data: str = "paper-v1"
@@ -71,6 +74,7 @@ class Suite:
     record: Record = "first"
     steps: Steps = "all"
     trials: tuple[dict[str, Any], ...] = ()
+    hypotheses: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         """Refuses suites with nothing in them."""

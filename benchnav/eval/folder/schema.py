@@ -54,6 +54,11 @@ _TRIAL = {
     "changed?": _Each(str, list),
     "latency?": {"median_ms": float, "p95_ms": float, "max_ms": float, "steps": int},
 }
+_TEST = {
+    **dict.fromkeys(("one", "other", "metric", "kind", "direction", "claim"), str),
+    "names": _Each(str, list),
+    "margin": float,
+}
 _DATASET = {"id?": str, "maps": _Each(_Each(str, list))}
 _ENTRY = {"command": str, "date": str, "suite": dict}
 _CODE = {"sources": str, "versions?": _Each(str), "processor?": str, "compiles?": bool}
@@ -71,6 +76,7 @@ _EARLIER = {
     "planner_limit_s?": float,
     "warnings?": _Each(str, list),
     "dropped?": _Each({"planner": str, "robot": str, "reason": str}, list),
+    "hypotheses?": {"tests": _Each(_TEST, list), "digest": str, "episodes": _Each(int)},
     "tables?": _Each(str),
     "history?": _Each(_ENTRY, list),
 }

@@ -90,8 +90,8 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
     return (
         f"Family: {pairs}. Holm's correction is over all of them, for success and for T_total apart.",
         "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
-        "interval of Bonett and Price. T_total: a failure counts as T; Δ and 95 % are of the mean, bootstrap over "
-        "maps." + share,
+        "interval of Bonett and Price. T_total: a failure counts as T; Δ and 95 % are of the mean, "
+        "from the intervals of success and of the time without failures." + share,
         "p (ranks): Wilcoxon's signed-rank test of T_total. It compares the ranks of the maps' differences and not "
         "their mean, so that it may disagree with the interval, which is of the mean.",
         "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "

@@ -11,6 +11,7 @@ from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.figure_style import trial_name
 from benchnav.eval.report.tables import rate_in_words
 from benchnav.eval.stats.best import TOLD, competing
+from benchnav.eval.stats.comparison import ALPHA
 from benchnav.planning.world.outcome import FAILURES
 
 _MOST_NAMED = 6
@@ -49,8 +50,8 @@ def findings(
 
 
 def p_in_words(p: float) -> str:
-    """Writes a p-value."""
-    return "p < 0.0001" if p < 1e-4 else f"p = {p:.2g}"
+    """Writes a p-value; of drawn sign flips the least there can be is 0.0001."""
+    return "p ≤ 0.0001" if p <= 1e-4 else f"p = {p:.2g}"
 
 
 def _sentences(
@@ -87,34 +88,34 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
     if others.empty:
         yield "There is no other setting to compare it with."
         return
-    alike, apart = others[others["best_alike"]], others[~others["best_alike"]]
+    alike, worse = others[others["best_alike"]], others[~others["best_alike"]]
+    settings = f"{len(others) + 1} settings"
+    unit = "group" if best["n_groups"] < best["n_maps"] else "map"
+    test = f"max-T sign-flip test by {unit} over {settings}"
+    if worse.empty:
+        shown, p = others["best_shown"].max(), others["best_p"].min()
+        maps = f"{int(best['best_maps'])} {unit}s"
+        power = f"; {maps} detect differences of {100 * shown:.0f} points or more with 80 % power"
+        yield (
+            f"No setting is significantly worse ({test}, p ≥ {max(np.floor(100 * p) / 100, ALPHA):g}"
+            f"{power if shown <= 1 else ''}): the run does not say which is best."
+        )
+        return
     if alike.empty:
-        other = "the other setting" if len(apart) == 1 else f"each of the {len(apart)} other settings"
-        yield f"It is told apart from {other}: it is the best here."
-    elif len(alike) == 1:
-        yield f"One other setting cannot be told from it (p ≥ 0.05): {names[alike['trial'].iloc[0]]}."
+        other = "The other setting is" if len(worse) == 1 else f"All {len(worse)} other settings are"
+        yield f"{other} significantly worse: it is the best here."
     else:
         listed = [names[trial] for trial in alike["trial"]]
         more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
-        yield (
-            f"{len(listed)} other settings cannot be told from it (p ≥ 0.05): "
-            f"{'; '.join(listed[:_MOST_NAMED])}{more}."
-        )
-    comparisons = "1 comparison" if len(others) == 1 else f"{len(others)} comparisons"
-    if apart.empty:
-        shown = others["best_shown"].max()
-        seen = (
-            f" So many maps show a difference from about {100 * shown:.0f} points on." if shown <= 1 else ""
-        )
-        yield f"No setting is told apart from it, so the run does not say which is best.{seen}"
-        return
-    following = apart.iloc[0]
-    place = "The next" if alike.empty else "The next that is told apart"
+        verb = "1 other setting is" if len(listed) == 1 else f"{len(listed)} other settings are"
+        yield f"{verb} not significantly worse (p ≥ {ALPHA}): {'; '.join(listed[:_MOST_NAMED])}{more}."
+    following = worse.iloc[0]
+    place = "The next" if alike.empty else "The next that is significantly worse"
+    low, high = 100 * following["best_low"], 100 * following["best_high"]
     yield (
         f"{place} is {names[following['trial']]} with {_rate(following)}: the difference is "
-        f"{100 * following['best_difference']:.1f} points (95 % interval {100 * following['best_low']:.1f} to "
-        f"{100 * following['best_high']:.1f}), {p_in_words(following['best_p_holm'])} after Holm's correction over "
-        f"{comparisons}."
+        f"{100 * following['best_difference']:.1f} points (95 % interval of the pair alone {low:.1f} to "
+        f"{high:.1f}), {p_in_words(following['best_p'])} ({test})."
     )
 
 

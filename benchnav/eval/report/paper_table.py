@@ -12,7 +12,7 @@ import pandas as pd
 from benchnav.eval.report.charts.panels import blocks
 from benchnav.eval.report.figure_style import display_name
 from benchnav.eval.report.rendering import latex, latex_label
-from benchnav.eval.report.tables import bold_note, rate_in_words
+from benchnav.eval.report.tables import bold_note, maps_in_words, rate_in_words
 from benchnav.eval.trial import NOT_USED
 
 _MOST_ACROSS = 3
@@ -20,7 +20,7 @@ _MEASURES = (r"Succ.\ [\%]", r"$T_\mathrm{total}$ [s]", r"$\bar{\lambda}$ [\%]")
 
 
 def paper_table(summary: pd.DataFrame, label: str) -> str:
-    """Writes a complete `table` environment; the best success of each block, and what is not told from it, is bold.
+    """Writes a complete `table` environment; bold is what is not significantly worse than a block's best.
 
     More than three blocks stand in several tabulars under each other.
 
@@ -31,7 +31,7 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
     known = blocks(summary)
     wide = "*" if len(known) > 1 else ""
     tabulars = [_tabular(known[i : i + _MOST_ACROSS], summary) for i in range(0, len(known), _MOST_ACROSS)]
-    note = latex(f"Bold: {bold_note(summary)}") if len(summary) > 1 else ""
+    note = latex(f"Bold: {bold_note(summary)}") if summary["best_marked"].any() else ""
     return "\n".join(
         [
             rf"\begin{{table{wide}}}[t]",
@@ -48,10 +48,10 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
 
 
 def _caption(summary: pd.DataFrame) -> str:
-    maps = summary["n_maps"]
-    count = f"{maps.min()}" if maps.nunique() == 1 else f"{maps.min()} to {maps.max()}"
+    maps, groups = (summary[name] for name in ("n_maps", "n_groups"))
+    count = maps_in_words(*(_span(counts) for counts in (maps, groups)))
     return (
-        f"Planning results on {count} maps a scenario: success with its 95\\,\\% interval, "
+        f"Planning results on {count} a scenario: success with its 95\\,\\% interval, "
         r"$T_\mathrm{total}$ with a failure counted as $T$ and mean traversability met $\bar{\lambda}$, "
         r"mean $\pm$ standard deviation over episodes."
     )
@@ -101,7 +101,7 @@ def _numbers(row: Mapping[Any, Any] | None) -> tuple[str, ...]:
     if row is None:
         return ("--",) * len(_MEASURES)
     rate = rate_in_words(row)
-    rate = rf"\textbf{{{rate}}}" if row["best_alike"] and row["best_rivals"] else rate
+    rate = rf"\textbf{{{rate}}}" if row["best_marked"] else rate
     interval = f"{100 * row['success_low']:.0f}--{100 * row['success_high']:.0f}"
     return (
         rf"{rate} {{\scriptsize ({interval})}}",
@@ -114,6 +114,10 @@ def _spread(mean: float, std: float) -> str:
     if np.isnan(mean):
         return "--"
     return f"{mean:.1f}" if np.isnan(std) else rf"{mean:.1f} $\pm$ {std:.1f}"
+
+
+def _span(counts: pd.Series) -> str:
+    return f"{counts.min()}" if counts.nunique() == 1 else f"{counts.min()} to {counts.max()}"
 
 
 def _several(summary: pd.DataFrame, name: str) -> bool:

@@ -8,6 +8,8 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.stats.best import BLOCK, TOLD, competing
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.difference import LEAST_MAPS
 from benchnav.eval.stats.summary import LABELS
 from benchnav.eval.trial import NOT_USED
 from benchnav.planning.world.outcome import FAILURES
@@ -27,13 +29,14 @@ _COLUMNS = {
     "model": "what predicts λ; ideal, oracle and clairvoyant are told the truth and serve as yardsticks.",
     "planner": "what chooses the actions.",
     "risk": "how the predicted distribution of λ becomes the one number λ̂ that the planner is given.",
+    "groups": "number of groups of maps that the trial was run on; the statistics take a group as one.",
     "maps": "number of maps that the trial was run on.",
     "episodes": "number of episodes of the trial.",
     "Succ. [%]": "share of episodes that reached the goal.",
     "95 % interval": "of the success rate: Wilson's, with maps as the unit, so that episodes on one map count as fewer "
     "the more alike they end.",
-    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval, by bootstrap over "
-    "maps.",
+    "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from "
+    f"those of the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
     "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
     "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
     ALONE: "wall time of planning one step of one robot alone on one thread, replanning included: the median, and in "
@@ -72,7 +75,7 @@ class ResultTable:
 
 
 def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> ResultTable:
-    """Formats a summary: rates and λ̄ in per cent; bold what the paired test does not tell from the best.
+    """Formats a summary: rates and λ̄ in per cent; bold what is not significantly worse than the best.
 
     Columns of labels that are the same for all trials are left out, but for scenario, planner and risk; so
     are the numbers of maps and episodes.
@@ -82,7 +85,11 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
-    counts = [name for name in ("n_maps", "n_episodes") if summary[name].nunique() > 1]
+    grouped = is_grouped(summary)
+    counts = [
+        name for name in ("n_groups", "n_maps", "n_episodes")
+        if summary[name].nunique() > 1 and (grouped or name != "n_groups")
+    ]  # fmt: skip
     marks, notes = _notes(summary, trials)
     headings = (
         *shown,
@@ -105,14 +112,14 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
     if any("¶" in cell for row in rows for cell in row):
         notes.append("¶ compiled planner: its time is that of compiled code.")
     rate = headings.index("Succ. [%]")
-    alike = [place for place, value in enumerate(summary["best_alike"]) if value]
+    marked = [place for place, value in enumerate(summary["best_marked"]) if value]
     return ResultTable(
         headings=headings,
         labels=len(shown),
         rows=tuple(rows),
         notes=tuple(notes),
-        bold=frozenset((place, rate) for place in alike) if len(summary) > 1 else frozenset(),
-        bold_note=bold_note(summary) if len(summary) > 1 else "",
+        bold=frozenset((place, rate) for place in marked),
+        bold_note=bold_note(summary) if marked else "",
         explained=tuple((heading, _COLUMNS[heading]) for heading in headings),
     )
 
@@ -123,8 +130,12 @@ def bold_note(summary: pd.DataFrame) -> str:
     Args:
         summary: as in `result_table`.
     """
-    words = ["the highest success rate of its block, and all that the paired test does not tell from it"]
-    words.append("(sign-flip test by map, Holm's correction over the block, p ≥ 0.05)")
+    words = ["not significantly worse than the highest success rate of its block"]
+    by = "group" if is_grouped(summary) else "map"
+    words.append(
+        f"(max-T sign-flip test by {by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
+        "significantly worse none is bold"
+    )
     left_out = [
         summary.loc[rows.index[~competing(rows)]]
         for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)
@@ -134,6 +145,16 @@ def bold_note(summary: pd.DataFrame) -> str:
         out = ", ".join(dict.fromkeys(told["model"]))
         words.append(f"; what is told the truth ({out}) does not compete")
     return " ".join(words).replace(" ;", ";") + "."
+
+
+def is_grouped(summary: pd.DataFrame) -> bool:
+    """Whether the unit of the statistics is a group of maps."""
+    return bool((summary["n_groups"] < summary["n_maps"]).any())
+
+
+def maps_in_words(maps: int | str, groups: int | str) -> str:
+    """Says how many maps there are, and in how many groups where they have such."""
+    return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"
 
 
 def rate_in_words(row: Mapping[Any, Any]) -> str:

@@ -3,8 +3,8 @@
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from benchnav.eval.report.charts.curves import curve_figure, sweep_name
 from benchnav.eval.report.charts.distributions import distribution_figure
 from benchnav.eval.report.charts.driven import write_driven
 from benchnav.eval.report.charts.failure_sheet import failure_sheet
+from benchnav.eval.report.charts.forest import forest_figure
 from benchnav.eval.report.charts.outcomes import outcome_figure
 from benchnav.eval.report.charts.success import success_figure
 from benchnav.eval.report.charts.sweeps import find_sweeps
@@ -26,21 +27,35 @@ from benchnav.eval.report.failure_choice import GroundOf, Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.figure_style import STYLE, save
 from benchnav.eval.report.findings import Finding, findings
+from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.page import Drawn, write_page
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recorded.recording import read_snapshots
-from benchnav.eval.report.rendering import markdown, to_markdown, to_terminal
-from benchnav.eval.report.tables import LATENCIES, NOT_USED, ResultTable, result_table
+from benchnav.eval.report.rendering import markdown, to_latex, to_markdown, to_terminal
+from benchnav.eval.report.tables import (
+    LATENCIES,
+    NOT_USED,
+    ResultTable,
+    is_grouped,
+    maps_in_words,
+    result_table,
+)
 from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.stats.best import against_best, told_the_truth
+from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
 
 PAGE = "report.html"
 
 _SUCCESS = (
-    "Success rates with their 95 % intervals; filled: not told from the best of its panel by the paired test; grey: "
-    "planners that look at nothing predicted."
+    "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where "
+    "another is; grey: planners that look at nothing predicted."
+)
+_HYPOTHESES = "Hypotheses that were fixed before the run, and their tests."
+_FOREST = (
+    "Paired differences of all hypotheses, which were fixed before the run; p after Holm's correction over them. "
+    "Filled: supported; thick and thin: 90 % and 95 % intervals of one difference alone."
 )
 _OUTCOMES = "How episodes ended."
 _DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean λ met."
@@ -63,6 +78,7 @@ class Report:
         table: a row a trial.
         warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
+        tests: a row a hypothesis, from `hypotheses.test_hypotheses`; none where the suite held none.
         episodes: the rows behind the summary.
         failures: a row a failed episode.
         sheets: failures on their ground.
@@ -74,6 +90,7 @@ class Report:
     table: ResultTable
     warnings: tuple[str, ...]
     summary: pd.DataFrame
+    tests: pd.DataFrame
     episodes: pd.DataFrame
     failures: pd.DataFrame
     sheets: Sheets
@@ -95,7 +112,12 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     if run.version == 1:
         episodes = convert_rows(episodes, about)
         about = {**about, **convert_about(about, episodes)}
-    summary = summarise(episodes)
+    worlds = {trial: entry["value"]["world"] for trial, entry in about["trials"].items()}
+    summary = summarise(episodes, worlds)
+    tests = (
+        test_hypotheses(about["hypotheses"], episodes, worlds) if "hypotheses" in about else pd.DataFrame()
+    )
+    grouped = is_grouped(summary)
     best = against_best(episodes, summary, told_the_truth(about["trials"]))
     summary = summary.merge(best, on="trial", how="left", validate="1:1")
     summary = _with_latency(summary, about["trials"])
@@ -104,10 +126,11 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     left_out = [sheets.left_out] if sheets.left_out else []
     return Report(
         header=(*_header(summary, about), *_redrawn(episodes, about["trials"])),
-        findings=tuple(findings(summary, failures, sheets.told)),
+        findings=_findings(findings(summary, failures, sheets.told), tests, about, grouped),
         table=result_table(summary, about["trials"]),
         warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
         summary=summary,
+        tests=tests,
         episodes=episodes,
         failures=failures,
         sheets=sheets,
@@ -131,6 +154,10 @@ def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | No
     write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
     write_text(out / "summary.tex", _as_latex(report, name))
+    if not report.tests.empty:
+        write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
+        shown = hypothesis_table(report.tests, is_grouped(report.summary))
+        write_text(out / "hypotheses.tex", to_latex(shown, _HYPOTHESES, f"{name}-hypotheses"))
     figures = [*_charts(out, report), *_trajectories(folder, out, report.summary), *_driven(folder, out)]
     write_text(out / "summary.md", _as_markdown(report, figures))
     page = write_page(
@@ -149,13 +176,24 @@ def print_report(report: Report) -> None:
     print("\n".join([*report.header, table, *report.warnings, *said]))
 
 
+def _findings(
+    explored: Sequence[Finding], tests: pd.DataFrame, about: Mapping[str, Any], grouped: bool
+) -> tuple[Finding, ...]:
+    """What a run says; beside hypotheses that were fixed before it all else is exploratory."""
+    if tests.empty:
+        return tuple(explored)
+    rest = (replace(finding, title=f"Exploratory: {finding.title}") for finding in explored)
+    return (hypothesis_finding(tests, about, grouped), *rest)
+
+
 def _charts(out: Path, report: Report) -> list[Drawn]:
     """Draws the figures at the width of a column."""
     summary = report.summary
-    alike = set(summary.loc[summary["best_alike"], "trial"])
-    made: list[tuple[str, str, Callable[[], Figure]]] = [
-        ("success", _SUCCESS, partial(success_figure, summary, alike))
-    ]
+    marked = set(summary.loc[summary["best_marked"], "trial"])
+    made: list[tuple[str, str, Callable[[], Figure]]] = []
+    if not report.tests.empty:
+        made.append(("forest", _FOREST, partial(forest_figure, report.tests)))
+    made.append(("success", _SUCCESS, partial(success_figure, summary, marked)))
     sweeps = find_sweeps(report.about["trials"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
     for sweep in sweeps:
@@ -210,8 +248,9 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     lines = [f"World {label}: {text}." for label, text in worlds.items()]
     seeds = dict.fromkeys(seed for trial in trials for seed in trial["seeds"])
     lines.append(f"Data: {_list(summary['data'])}. Models: {_list(summary['model'])}. Seeds: {_list(seeds)}.")
-    if summary["n_episodes"].nunique() == summary["n_maps"].nunique() == 1:
-        lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {summary['n_maps'][0]} maps.")
+    if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
+        maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
+        lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {maps}.")
     options = dict.fromkeys(
         f"{trial['labels']['planner']} {change}" for trial in trials for change in trial.get("changed", ())
     )
@@ -268,6 +307,13 @@ def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
             f"**{markdown(finding.title)}**",
             "",
             *(f"- {markdown(said)}" for said in finding.sentences),
+            "",
+        ]
+    if not report.tests.empty:
+        lines += [
+            "## Hypotheses",
+            "",
+            to_markdown(hypothesis_table(report.tests, is_grouped(report.summary))),
             "",
         ]
     lines += ["## Results", "", *(f"- {markdown(line)}" for line in report.header), ""]

@@ -11,6 +11,7 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.run.check_world import check_budgets, check_known_ground, check_luck
+from benchnav.eval.stats.hypotheses import fix_hypotheses
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
 from benchnav.eval.unit import Extent
@@ -45,11 +46,13 @@ class Checked:
         trials: by id, with how often each is to be run.
         dropped: pairs of which the planner cannot steer the robot, by their labels, each with the reason.
         warnings: what readers of the results should know.
+        hypotheses: from `fix_hypotheses`.
     """
 
     trials: dict[str, tuple[Trial, Extent]]
     dropped: tuple[dict[str, str], ...]
     warnings: tuple[str, ...]
+    hypotheses: dict[str, Any]
 
 
 def check_suite(suite: Suite, elsewhere: bool) -> Checked:
@@ -99,7 +102,16 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         there = datasets[trial.data].map_count(trial.split)
         extent = Extent.product(suite.all_seeds, suite.realisations, suite.instances or there)
         wanted[trial.id] = (trial, extent)
-    return Checked(trials=wanted, dropped=tuple(dropped), warnings=tuple(dict.fromkeys(warnings)))
+    return Checked(
+        trials=wanted,
+        dropped=tuple(dropped),
+        warnings=tuple(dict.fromkeys(warnings)),
+        hypotheses=fix_hypotheses(
+            suite.hypotheses,
+            {i: trial for i, (trial, _) in wanted.items()},
+            {i: sum(count for _, _, count in extent.draws) for i, (_, extent) in wanted.items()},
+        ),
+    )
 
 
 def _steered(trials: list[Trial]) -> tuple[list[Trial], list[dict[str, str]]]:

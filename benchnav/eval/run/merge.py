@@ -112,6 +112,8 @@ def _check_alike(runs: Sequence[Run]) -> int:
     reasons = []
     for run in runs[1:]:
         unlike = _unlike_trials(first, run) + provenance.differences(first.about, run.about)
+        if run.about.get("hypotheses") != first.about.get("hypotheses"):
+            unlike.append("hypotheses")
         if _shard(run).of != _shard(first).of:
             unlike.insert(0, f"number of shards ({_shard(first).of} to {_shard(run).of})")
         if unlike:

@@ -85,6 +85,7 @@ def rerun(
         trials=run.trials,
         dropped=tuple(run.about.get("dropped", ())),
         warnings=tuple(run.about.get("warnings", ())),
+        hypotheses=run.about.get("hypotheses", {}),
         keep=Keep(),
         planner_limit_s=run.about["planner_limit_s"],
         device=device_of_run(run.about).type,

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -84,6 +84,7 @@ class Work:
         device: where all is computed, "cpu" or "cuda".
         dropped: pairs of planner and robot that were left out, as `check.Checked` has them.
         warnings: what readers of the results should know.
+        hypotheses: from `fix_hypotheses`; empty where there are none.
     """
 
     suite: Mapping[str, Any]
@@ -94,6 +95,7 @@ class Work:
     device: str = "cpu"
     dropped: tuple[Mapping[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+    hypotheses: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +155,7 @@ def run_suite(
             trials=checked.trials,
             dropped=checked.dropped,
             warnings=checked.warnings,
+            hypotheses=checked.hypotheses,
             keep=suite.keep,
             planner_limit_s=planner_limit_s,
             shard=shard,
@@ -332,6 +335,7 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
             f"Expected `out` to be new or to hold {_share(work.shard)}, but {folder} holds "
             f"{_share(earlier.shard)}. Choose another `out`."
         )
+    _check_hypotheses(work.hypotheses, earlier.about, folder)
     check_labels(trial for trials in (earlier.trials, work.trials) for trial, _ in trials.values())
     trials = _joined(earlier.trials, work.trials)
     now = _about(earlier.about, work, trials)
@@ -351,6 +355,17 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
     elif now != {name: value for name, value in earlier.about.items() if name not in (SEAL, "tables")}:
         write_run(folder, {**now, "tables": earlier.about.get("tables", {})})
     return now, trials
+
+
+def _check_hypotheses(wanted: Mapping[str, Any], earlier: Mapping[str, Any], folder: Path) -> None:
+    """Refuses hypotheses that a run was not begun with: they would be written after what they are tested by."""
+    fixed = earlier.get("hypotheses", {}).get("digest", "none")
+    if wanted and wanted["digest"] != fixed:
+        raise ConfigError(
+            f"Expected the `hypotheses` that {folder} was begun with (digest {fixed}), got others (digest "
+            f"{wanted['digest']}), which would be written after its first results. Leave `hypotheses` out to go on, or "
+            "choose another `out`."
+        )
 
 
 def _or_its_device(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -400,6 +415,7 @@ def _about(earlier: Mapping[str, Any], work: Work, trials: Trials) -> dict[str, 
         "run_id": earlier["run_id"],
         **({"shard": work.shard.to_dict()} if work.shard else {}),
         "suite": dict(work.suite),
+        **({"hypotheses": fixed} if (fixed := earlier.get("hypotheses", work.hypotheses)) else {}),
         "trials": entries,
         "dropped": provenance.join(earlier.get("dropped", ()), work.dropped),
         "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),

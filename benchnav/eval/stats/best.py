@@ -1,15 +1,24 @@
-"""The best trial of each block of a run, and which others the paired test does not tell from it."""
+"""The best condition of each block of a run, and which others are significantly worse.
+
+One max-T test looks at all pairs of a block's conditions at once: on each map the signs of all differences are flipped
+together, so that what the conditions share counts. It goes step by step, as the model confidence set does: the
+condition that another beats by most is set aside, and the rest are compared anew. So the chance that any condition
+which is as good as the best is called worse is about 5 % however many there are (`benchmarks/statistics_studies.py`).
+Sources: Westfall and Young (1993), "Resampling-Based Multiple Testing", 2.3 and 2.6; Hansen, Lunde and Nason (2011),
+"The model confidence set", for the order.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from statsmodels.stats.multitest import multipletests
+from scipy.stats import norm
 
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import sign_flip_p, standard_deviation, success_interval
+from benchnav.eval.stats.difference import sign_flips, standard_deviation, success_interval
 from benchnav.eval.stats.power import smallest_difference
+from benchnav.eval.stats.summary import units_of
 from benchnav.eval.trial import NOT_USED
 
 # Trials of a block met the same maps and the same luck, and were asked the same.
@@ -18,6 +27,18 @@ BLOCK = ("data", "scenario", "world", "robot", "objective")
 TOLD = ("clairvoyant", "oracle", "ideal")
 
 _LUCK = ["seed", "realisation", "instance"]
+_OF_BLOCK = ("best", "best_rivals", "best_episodes", "best_maps")
+_COLUMNS = [
+    "trial",
+    *_OF_BLOCK,
+    "best_difference",
+    "best_low",
+    "best_high",
+    "best_p",
+    "best_shown",
+    "best_alike",
+]
+_COLUMNS.append("best_marked")
 
 
 def told_the_truth(trials: Mapping[str, Any]) -> dict[str, str]:
@@ -55,14 +76,49 @@ def competing(rows: pd.DataFrame) -> pd.Series:
     return pd.Series(True, index=rows.index)
 
 
+def best_set_p(values: np.ndarray, flips: np.ndarray) -> tuple[np.ndarray, float]:
+    """Tests of each condition whether it is as good as the best.
+
+    Args:
+        values: by map and condition, the higher the better, shape [M, K].
+        flips: from `difference.sign_flips`, shape [ways, M].
+
+    Returns:
+        p by condition, corrected for their number, shape [K], 1 for the best; and the least |t| that would be
+        significant in the first step, where t is the sum of a pair's differences over the root of that of their
+        squares.
+    """
+    gaps = values[:, :, None] - values[:, None, :]
+    norms = np.sqrt((gaps**2).sum(0))
+    scale = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0)
+    ahead = gaps.sum(0) * scale  # of the row's condition before the column's
+    left = list(range(values.shape[1]))
+    order, statistic = [], []
+    while len(left) > 1:
+        most = ahead[np.ix_(left, left)].max(0)
+        place = int(most.argmax())
+        statistic.append(most[place])
+        order.append(left.pop(place))
+    order += left
+    flipped = flips @ values
+    p, furthest = np.ones(len(order)), np.zeros(len(flips))
+    for step in reversed(range(len(statistic))):
+        own, rest = order[step], order[step + 1 :]
+        gap = np.abs(flipped[:, [own]] - flipped[:, rest]) * scale[own, rest]
+        furthest = np.maximum(furthest, gap.max(1))
+        # Sums are exact to rounding, and ways that tie with what was seen count.
+        p[own] = np.mean(furthest >= statistic[step] * (1 - 1e-9))
+    p[order[:-1]] = np.maximum.accumulate(p[order[:-1]])
+    return p, float(np.quantile(furthest, 1 - ALPHA))
+
+
 def against_best(
     episodes: pd.DataFrame, summary: pd.DataFrame, told: Mapping[str, str] | None = None
 ) -> pd.DataFrame:
-    """Compares the best trial of each block with all others that compete, map by map.
+    """Compares the conditions of each block that compete, map by map, and tells which are worse than the best.
 
     All of them on the episodes that they have in common, so that one which was run on more maps is not judged by
-    others. The best has the highest success rate there and, of several, the least mean T_total. Holm's correction
-    is over the others of its block.
+    others. The best has the highest success rate there and, of several, the least mean T_total.
 
     Args:
         episodes: rows of episodes.
@@ -71,67 +127,66 @@ def against_best(
 
     Returns:
         A row a trial, in the order of the summary: `trial`; `told`, what is told the truth, of `TOLD`, empty
-        where nothing is; `best`, the trial that is the best of its block;
-        `best_rivals`, how many others compete; `best_episodes`, of each of them in common; `best_difference`, by how
-        much the best's success rate is higher, with its 95 % interval `_low`, `_high`; `best_p_holm`; `best_shown`,
-        the smallest difference that so many maps show with a chance of 80 %; and `best_alike`, true where the best is
-        not told from it. NaN and false where a trial does not compete, NaN and true for the best itself.
+        where nothing is; `best`, the trial that is the best of its block; `best_rivals`, how many others compete;
+        `best_episodes`, of each of them in common, on `best_maps`, of which a group counts as one;
+        `best_difference`, by how much the best's success rate is higher, with its 95 % interval `_low`, `_high`, of
+        the pair alone; `best_p`, from `best_set_p`; `best_shown`, the minimum detectable difference with 80 % power;
+        `best_alike`, true where it competes and is not significantly worse than the best; and `best_marked`, true
+        where it is alike and something in its block is worse. NaN where a trial does not compete, and for the best
+        itself.
     """
     groups = dict(list(episodes.groupby("trial", sort=False)))
     summary = summary.assign(told=summary["trial"].map(told or {}).fillna(""))
     found: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
-        rivals = _in_common({trial: groups[trial] for trial in rows.loc[competing(rows), "trial"]})
-        best, *others = sorted(
-            rivals, key=lambda trial: (-rivals[trial]["success"].mean(), rivals[trial]["total_time_s"].mean())
-        )
-        alpha = ALPHA / max(len(others), 1)
-        compared = [_compare(rivals[best], rivals[other], alpha) for other in others]
-        p = [one["best_p_holm"] for one in compared]
-        corrected = multipletests(p, ALPHA, method="holm")[1] if p else []
-        for other, one, value in zip(others, compared, corrected, strict=True):
-            found.append({"trial": other, **one, "best_p_holm": value, "best_alike": bool(value >= ALPHA)})
-        left_out = rows.loc[~rows["trial"].isin(list(rivals)), "trial"]
-        found += [
-            {"trial": best, "best_alike": True},
-            *({"trial": one, "best_alike": False} for one in left_out),
-        ]
-        for entry in found[-len(rows) :]:
-            entry |= {"best": best, "best_rivals": len(others), "best_episodes": len(rivals[best])}
-    columns = ["trial", "best", "best_rivals", "best_episodes", "best_difference", "best_low", "best_high"]
-    columns += ["best_p_holm", "best_shown", "best_alike"]
-    table = pd.DataFrame(found).reindex(columns=columns)
+        compared = _compare({trial: groups[trial] for trial in rows.loc[competing(rows), "trial"]})
+        some_worse = not all(one["best_alike"] for one in compared.values())
+        about = {name: value for name, value in next(iter(compared.values())).items() if name in _OF_BLOCK}
+        for trial in rows["trial"]:
+            one = compared.get(trial, about | {"best_alike": False})
+            found.append({"trial": trial, **one, "best_marked": one["best_alike"] and some_worse})
+    table = pd.DataFrame(found).reindex(columns=_COLUMNS)
     return summary[["trial", "told"]].merge(table, on="trial", how="left", validate="1:1")
 
 
-def _in_common(trials: Mapping[str, pd.DataFrame]) -> Mapping[str, pd.DataFrame]:
-    """Episodes of trials under the luck that all of them met; all of each where there is none."""
+def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
+    """By trial its columns of `against_best`."""
+    common = _in_common(rivals)
+    judged = common or rivals
+    best, *others = sorted(
+        judged, key=lambda trial: (-judged[trial]["success"].mean(), judged[trial]["total_time_s"].mean())
+    )
+    episodes, maps = len(judged[best]), units_of(judged[best]).nunique()
+    about = {
+        "best": best,
+        "best_rivals": len(others),
+        "best_episodes": episodes,
+        "best_maps": maps,
+        "best_alike": True,
+    }
+    if not common:  # nothing to compare
+        return {trial: about | ({"best_p": 1.0} if trial != best else {}) for trial in rivals}
+    wins = {trial: rows["success"].groupby(units_of(rows)).sum() for trial, rows in common.items()}
+    values = np.stack([wins[trial].to_numpy(dtype=float) for trial in (best, *others)], axis=1)
+    draws = episodes / maps
+    p, critical = best_set_p(values, sign_flips(maps))
+    made = {best: about}
+    for place, trial in enumerate(others, start=1):
+        gain = values[:, 0] - values[:, place]
+        entry = about | {"best_p": p[place], "best_alike": bool(p[place] >= ALPHA)}
+        entry["best_difference"] = gain.sum() / episodes
+        if maps > 1:
+            _, entry["best_low"], entry["best_high"] = map(float, success_interval(gain, draws))
+            std = float(standard_deviation(gain, draws))
+            entry["best_shown"] = smallest_difference(std, maps, 2 * norm.sf(critical))
+        made[trial] = entry
+    return made
+
+
+def _in_common(trials: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Episodes of trials under the draws that all of them met, in one order; none where there is no such draw."""
     met = [set(rows[_LUCK].itertuples(index=False, name=None)) for rows in trials.values()]
     common = pd.DataFrame(sorted(set.intersection(*met)), columns=_LUCK)
     if common.empty:
-        return trials
-    return {trial: rows.merge(common, on=_LUCK) for trial, rows in trials.items()}
-
-
-def _compare(best: pd.DataFrame, other: pd.DataFrame, alpha: float) -> dict[str, float]:
-    """Success of the best less that of another; p is not corrected yet."""
-    columns = [*_LUCK, "success"]
-    both = best[columns].merge(other[columns], on=_LUCK, suffixes=("", "_other"))
-    if both.empty:
-        return {"best_p_holm": 1.0}  # no map in common: nothing tells them apart
-    draws = both.groupby("instance")["success"].transform("size")
-    count = int(draws.mode().max())  # as many draws as most episodes have
-    both = both[draws == count]
-    gain = both["success"].astype(int) - both["success_other"].astype(int)
-    by_map = gain.groupby(both["instance"]).sum().to_numpy()
-    if len(by_map) < 2:
-        return {"best_difference": float(by_map.mean()) / count, "best_p_holm": sign_flip_p(by_map)}
-    difference, low, high = (float(value) for value in success_interval(by_map, count))
-    shown = smallest_difference(float(np.asarray(standard_deviation(by_map, count))), len(by_map), alpha)
-    return {
-        "best_difference": difference,
-        "best_low": low,
-        "best_high": high,
-        "best_p_holm": sign_flip_p(by_map),
-        "best_shown": shown,
-    }
+        return {}
+    return {trial: common.merge(rows, on=_LUCK) for trial, rows in trials.items()}

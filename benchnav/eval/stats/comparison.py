@@ -1,17 +1,20 @@
 """The table of a comparison: a row a pair of conditions, corrected over all rows together."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.stats.difference import (
-    mean_intervals,
+    by_map,
+    mean_interval,
     sign_flip_p,
     signed_rank_p,
     standard_deviation,
     success_interval,
+    total_time_interval,
 )
 from benchnav.eval.stats.pairing import Pair
 from benchnav.eval.stats.power import maps_needed, smallest_difference
@@ -41,17 +44,53 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     alpha = ALPHA / len(pairs)
     table = pd.DataFrame([_compare_success(pair, alpha, difference) for pair in pairs])
     unit = "share" if any(map(budgets_differ, pairs)) else "s"
-    late = [_late(pair.episodes, unit) for pair in pairs]
-    table = table.join(_intervals(late, "time", unit))
+    rows = [_in_shares(pair.episodes) if unit == "share" else pair.episodes for pair in pairs]
+    late = [_late(one) for one in rows]
+    table = table.join(_columns("time", unit, [time_difference(one) for one in rows]))
     table["time_p"] = [signed_rank_p(values) for values in late]
     arrived = [
         _late(pair.episodes[pair.episodes["success"] & pair.episodes["success_other"]]) for pair in pairs
     ]
-    table = table.join(_intervals(arrived, "arrival_time", "s"))
+    table = table.join(_columns("arrival_time", "s", [mean_interval(values) for values in arrived]))
     table["arrival_time_n_maps"] = [len(values) for values in arrived]
     for name in ("success_p", "time_p"):
         table[f"{name}_holm"] = multipletests(table[name], ALPHA, method="holm")[1]
     return table
+
+
+def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Difference of T_total of a pair, a failure counted as T, with the interval of `total_time_interval`.
+
+    Args:
+        rows: as `Pair.episodes`.
+        confidence: coverage asked for.
+
+    Returns:
+        Difference and the ends of its interval in seconds.
+    """
+    units, arrived, arrival_s, budget_s = units_of(rows), [], [], []
+    for suffix in ("", "_other"):
+        success = rows[f"success{suffix}"].astype(bool)
+        arrived.append(set(units[success]))
+        arrival_s.append(rows.loc[success, f"total_time_s{suffix}"])
+        budget_s.append(rows[f"time_budget_s{suffix}"])
+    arrivals = pd.concat(arrival_s)
+    # No arrival takes less than nothing, where there is none to go by.
+    arrival = arrivals.mean() if len(arrivals) else 0.0
+    gain, draws = _gain(rows)
+    _, low, high = success_interval(gain, draws, confidence)
+    mean, low_s, high_s = total_time_interval(
+        _late(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - arrival,
+        len(set.intersection(*arrived)), confidence,
+    )  # fmt: skip
+    return float(mean), float(low_s), float(high_s)
+
+
+def _gain(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
+    """Successes of the one less those of the other by map, shape [M], and the mean number of episodes on a map."""
+    gain = rows["success"].astype(int) - rows["success_other"].astype(int)
+    by_unit = gain.groupby(units_of(rows)).sum().to_numpy()
+    return by_unit, len(rows) / len(by_unit)
 
 
 def budgets_differ(pair: Pair) -> bool:
@@ -64,8 +103,7 @@ def budgets_differ(pair: Pair) -> bool:
 def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, object]:
     rows = pair.episodes
     one, other = rows["success"].astype(int), rows["success_other"].astype(int)
-    gain = (one - other).groupby(units_of(rows)).sum().to_numpy()
-    draws = len(rows) / len(gain)  # their mean where maps have unequally many
+    gain, draws = _gain(rows)
     mean, low, high = success_interval(gain, draws)
     std = float(standard_deviation(gain, draws))
     return {
@@ -86,16 +124,22 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
     }
 
 
-def _late(rows: pd.DataFrame, unit: str = "s") -> np.ndarray:
-    """By how much longer one condition took, by map or group of maps, in seconds or shares of T, shape [M]."""
-    one, other = rows["total_time_s"], rows["total_time_s_other"]
-    if unit == "share":
+def _late(rows: pd.DataFrame) -> np.ndarray:
+    """By how much longer one condition took, by map or group of maps, shape [M]."""
+    late = (rows["total_time_s"] - rows["total_time_s_other"]).to_numpy()
+    return by_map(late, units_of(rows).to_numpy())
+
+
+def _in_shares(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of a pair with times in shares of each condition's own T."""
+    made: dict[str, Any] = {}
+    for suffix in ("", "_other"):
         # An episode that began at its goal took no share of a T that is not known.
-        one = (one / rows["time_budget_s"]).fillna(0)
-        other = (other / rows["time_budget_s_other"]).fillna(0)
-    return (one - other).groupby(units_of(rows)).mean().to_numpy()
+        share = (rows[f"total_time_s{suffix}"] / rows[f"time_budget_s{suffix}"]).fillna(0)
+        made |= {f"total_time_s{suffix}": share, f"time_budget_s{suffix}": 1.0}
+    return rows.assign(**made)
 
 
-def _intervals(late: Sequence[np.ndarray], name: str, unit: str) -> pd.DataFrame:
+def _columns(name: str, unit: str, intervals: Sequence[Sequence[float | np.ndarray]]) -> pd.DataFrame:
     columns = [f"{name}_{value}_{unit}" for value in ("difference", "low", "high")]
-    return pd.DataFrame(dict(zip(columns, mean_intervals(late), strict=True)))
+    return pd.DataFrame(np.array(intervals, dtype=float), columns=columns)

@@ -1,7 +1,8 @@
 """Summaries of trials: success with its interval, and means with how many episodes each is made of.
 
-The map is the unit. Episodes on one map, under other seeds or realisations, have much in common, so that a
-hundred of them on twenty maps tell less than a hundred maps would. The design effect says how much less.
+The map is the unit, or the group of maps where a dataset has groups. Episodes on one map, under other seeds or
+realisations, have much in common, so that a hundred of them on twenty maps tell less than a hundred maps would. The
+design effect says how much less.
 """
 
 from collections.abc import Mapping
@@ -11,11 +12,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from benchnav.eval.stats.difference import mean_intervals
+from benchnav.eval.stats.difference import by_map, total_time_interval
 from benchnav.planning.world.outcome import FAILURES
 
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
-MAP = ("data", "scenario", "instance")
 
 # Of each column its name in the summary, which the statistic parts, and its unit.
 _QUANTITIES = {
@@ -124,32 +124,53 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
     return episodes["total_time_s"].where(~episodes["success"], granted)
 
 
-def summarise(episodes: pd.DataFrame) -> pd.DataFrame:
+def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
+    """Success rate of one condition with its 95 % interval, Wilson's on the episodes over `cautious_design_effect`."""
+    success = episodes["success"].to_numpy(dtype=bool)
+    effect = cautious_design_effect(success, units_of(episodes).to_numpy())
+    return float(success.mean()), *wilson_interval(float(success.mean()), len(success) / effect)
+
+
+def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Mean of T_total of one condition with its 95 % interval, which lies within 0 and T.
+
+    Args:
+        episodes: rows of one condition.
+        world: of the condition, as `run.json` holds it.
+
+    Returns:
+        Mean and ends in seconds; the ends are NaN where there are fewer than `difference.LEAST_MAPS` maps.
+    """
+    success, maps = episodes["success"].to_numpy(dtype=bool), units_of(episodes).to_numpy()
+    taken, budgets = episodes["total_time_s"].to_numpy(), time_budgets(episodes, world)
+    arrival = taken[success].mean() if success.any() else 0.0  # no arrival takes less
+    _, low, high = success_mean(episodes)
+    mean, low_s, high_s = total_time_interval(
+        by_map(taken, maps), by_map(1.0 - success, maps), (1 - high, 1 - low),
+        budgets.mean() - arrival, len(np.unique(maps[success])),
+    )  # fmt: skip
+    return float(mean), float(np.maximum(low_s, 0.0)), float(np.minimum(high_s, budgets.max()))
+
+
+def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     """Summarises each trial, in the order in which trials first appear.
 
     Args:
         episodes: rows of episodes, format version 2 or later.
+        worlds: by trial what λ did, as `run.json` holds it.
 
     Returns:
-        A row a trial: `trial` and its labels; `n_episodes`, `n_maps`; `success_rate` with Wilson's interval
-        `success_low`, `success_high` on the number of episodes over `cautious_design_effect`. Of each quantity
+        A row a trial: `trial` and its labels; `n_episodes`, `n_maps`, and `n_groups`, which is the number of maps
+        where the dataset has no groups; `success_rate` with Wilson's interval `success_low`, `success_high` on the
+        number of episodes over `cautious_design_effect`. Of each quantity
         `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
         counted as T; time of the successes alone; λ met; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
-        a bootstrap over maps. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`, which
+        from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`, which
         runs of earlier versions do not have; `compiled_share`; and `OUTCOME_count` of each failure.
     """
-    groups = [group for _, group in episodes.groupby("trial", sort=False)]
-    summary = pd.DataFrame([_summarise_trial(group) for group in groups])
-    by_map = [
-        group.groupby(list(MAP), sort=False, dropna=False)["total_time_s"].mean().to_numpy()
-        for group in groups
-    ]
-    _, low, high = mean_intervals(by_map)
-    place = summary.columns.get_loc("total_time_std_s") + 1
-    summary.insert(place, "total_time_low_s", low)
-    summary.insert(place + 1, "total_time_high_s", high)
-    return summary
+    groups = episodes.groupby("trial", sort=False)
+    return pd.DataFrame([_summarise_trial(group, worlds[str(trial)]) for trial, group in groups])
 
 
 def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray, weighted: float) -> float:
@@ -166,19 +187,21 @@ def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray,
     return min(max((between - within) / (between + (typical - 1) * within), 0.0), 1.0)
 
 
-def _summarise_trial(group: pd.DataFrame) -> dict[str, object]:
-    success = group["success"].to_numpy(dtype=bool)
-    member = group.groupby(list(MAP), sort=False, dropna=False).ngroup().to_numpy()
-    rate, effect = float(success.mean()), cautious_design_effect(success, member)
-    low, high = wilson_interval(rate, len(group) / effect)
+def _summarise_trial(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:
+    success, member = group["success"].to_numpy(dtype=bool), units_of(group).to_numpy()
+    effect = cautious_design_effect(success, member)
+    rate, low, high = success_mean(group)
     row: dict[str, object] = {name: group[name].iloc[0] for name in ("trial", *LABELS)}
-    row |= {"n_episodes": len(group), "n_maps": int(member.max()) + 1}
+    row |= {"n_episodes": len(group), "n_maps": group["instance"].nunique()}
+    row["n_groups"] = len(np.unique(member))
     row |= {"success_rate": rate, "success_low": low, "success_high": high, "design_effect": effect}
     columns = group.assign(success_time_s=group["total_time_s"].where(success))
     for column, (name, unit) in _QUANTITIES.items():
         values = columns[column]
         row |= {f"{name}_mean{unit}": values.mean(), f"{name}_std{unit}": values.std()}
         row[f"{name}_n"] = int(values.notna().sum())
+        if name == "total_time":
+            _, row["total_time_low_s"], row["total_time_high_s"] = total_time_mean(group, world)
     for name in ("planning_ms", "planning_ms_p95", "planning_start_ms"):
         row[f"{name}_median"] = group[name].median() if name in group else np.nan
     row["compiled_share"] = group["compiled"].astype(float).mean()

@@ -66,9 +66,14 @@ def _model(rows: pd.DataFrame) -> dict[str, Any]:
     return {"model": {"part": "oracle" if label == "–" else label, "options": {}}}
 
 
+def summarised(episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]) -> pd.DataFrame:
+    """A row a trial, all of one world."""
+    return summarise(episodes, dict.fromkeys(episodes["trial"].unique(), world))
+
+
 def summary(episodes: pd.DataFrame) -> pd.DataFrame:
     """What a report makes of rows."""
-    table = summarise(episodes)
+    table = summarised(episodes)
     return table.merge(against_best(episodes, table, told_the_truth(trials(episodes))), on="trial")
 
 

@@ -1,3 +1,4 @@
+import re
 from typing import Any
 
 import numpy as np
@@ -25,17 +26,17 @@ def summary_of(*trials: list[dict[str, Any]]) -> pd.DataFrame:
     return made.summary(made.rows(*trials))
 
 
-def test_a_best_that_is_told_apart_from_all_others() -> None:
+def test_a_best_that_all_others_are_worse_than() -> None:
     sentences = said(trial(90, risk="cvar:0.9"), trial(40, risk="mean"), trial(30, risk="var"))
     assert sentences[0] == (
         "The highest success rate is that of MPPI, cvar:0.9: 90 % of its episodes reached the goal (95 % interval "
         "83 to 94 %)."
     )
-    assert sentences[1] == "It is told apart from each of the 2 other settings: it is the best here."
+    assert sentences[1] == "All 2 other settings are significantly worse: it is the best here."
     assert sentences[2].startswith(
-        "The next is MPPI, mean with 40 %: the difference is 50.0 points (95 % interval "
+        "The next is MPPI, mean with 40 %: the difference is 50.0 points (95 % interval of the pair alone "
     )
-    assert sentences[2].endswith(", p < 0.0001 after Holm's correction over 2 comparisons.")
+    assert sentences[2].endswith(", p ≤ 0.0001 (max-T sign-flip test by map over 3 settings).")
     assert sentences[3] == "It failed in 10 of 100 episodes: 10 immobilised (100 %)."
     assert sentences[4] == (
         "All 3 compared settings together failed in 140 of 300 episodes: 140 immobilised (100 %)."
@@ -43,22 +44,30 @@ def test_a_best_that_is_told_apart_from_all_others() -> None:
     assert len(sentences) == 5
 
 
-def test_one_that_cannot_be_told_from_it_and_the_next_that_can() -> None:
+def test_one_that_is_not_worse_and_the_next_that_is() -> None:
     sentences = said(trial(40, risk="mean"), trial(88, risk="var"), trial(90, risk="cvar"))
-    assert sentences[1] == "One other setting cannot be told from it (p ≥ 0.05): MPPI, var."
+    assert sentences[1] == "1 other setting is not significantly worse (p ≥ 0.05): MPPI, var."
     assert sentences[2].startswith(
-        "The next that is told apart is MPPI, mean with 40 %: the difference is 50.0 points"
+        "The next that is significantly worse is MPPI, mean with 40 %: the difference is 50.0 points"
     )
 
 
-def test_several_that_cannot_be_told_from_it_are_named_up_to_six() -> None:
-    sentences = said(*(trial(90 - n, risk=f"r{n}") for n in range(9)))
+def test_several_that_are_not_worse_are_named_up_to_six() -> None:
+    sentences = said(*(trial(90 - n // 4, risk=f"r{n}") for n in range(9)), trial(5, risk="bad"))
     assert sentences[1] == (
-        "8 other settings cannot be told from it (p ≥ 0.05): "
+        "8 other settings are not significantly worse (p ≥ 0.05): "
         "MPPI, r1; MPPI, r2; MPPI, r3; MPPI, r4; MPPI, r5; MPPI, r6 and 2 more."
     )
-    assert sentences[2].startswith("No setting is told apart from it, so the run does not say which is best.")
-    assert "So many maps show a difference from about " in sentences[2]
+
+
+def test_where_nothing_is_worse_the_run_does_not_say_which_is_best() -> None:
+    sentences = said(trial(90, risk="a"), trial(89, risk="b"), trial(88, risk="c"))
+    assert re.fullmatch(
+        r"No setting is significantly worse \(max-T sign-flip test by map over 3 settings, p ≥ 0\.\d+; 100 maps detect "
+        r"differences of \d points or more with 80 % power\): the run does not say which is best\.",
+        sentences[1],
+    )
+    assert not any("The next" in line for line in sentences)
 
 
 def test_the_interval_is_that_of_the_difference_and_the_power_that_of_the_hardest_pair() -> None:
@@ -66,11 +75,11 @@ def test_the_interval_is_that_of_the_difference_and_the_power_that_of_the_hardes
     row = summary[summary["risk"] == "mean"].iloc[0]
     low, high = 100 * row["best_low"], 100 * row["best_high"]
     told = findings(summary, NONE)[0].sentences[2]
-    assert f"(95 % interval {low:.1f} to {high:.1f})" in told
+    assert f"(95 % interval of the pair alone {low:.1f} to {high:.1f})" in told
     alike = summary_of(trial(90, risk="a"), trial(89, risk="b"), [*trial(87, risk="c")])
     shown = 100 * alike["best_shown"].max()
     assert alike["best_shown"].min() < alike["best_shown"].max()
-    assert f"from about {shown:.0f} points on" in findings(alike, NONE)[0].sentences[2]
+    assert f"differences of {shown:.0f} points or more" in findings(alike, NONE)[0].sentences[1]
 
 
 def test_settings_that_were_run_on_unlike_maps_are_said_to_be_compared_on_those_they_share() -> None:
@@ -87,8 +96,8 @@ def test_a_single_setting_and_two() -> None:
     alone = said(trial(100))
     assert alone[1:] == ["There is no other setting to compare it with.", "It never failed."]
     two = said(trial(90, risk="a"), trial(10, risk="b"))
-    assert two[1] == "It is told apart from the other setting: it is the best here."
-    assert two[2].endswith("after Holm's correction over 1 comparison.")
+    assert two[1] == "The other setting is significantly worse: it is the best here."
+    assert two[2].endswith("(max-T sign-flip test by map over 2 settings).")
 
 
 def test_failures_are_counted_by_outcome_the_most_frequent_first() -> None:
@@ -139,4 +148,4 @@ def test_each_block_has_its_own_finding() -> None:
 
 
 def test_p_in_words() -> None:
-    assert [p_in_words(p) for p in (0.00001, 0.0123, 1.0)] == ["p < 0.0001", "p = 0.012", "p = 1"]
+    assert [p_in_words(p) for p in (0.00001, 0.0123, 1.0)] == ["p ≤ 0.0001", "p = 0.012", "p = 1"]

@@ -33,7 +33,7 @@ def test_settings_stand_down_and_scenarios_across() -> None:
     ]
     assert r"\cmidrule(lr){3-5} \cmidrule(lr){6-8}" in text
     assert [row[:2] for row in rows] == [["A* + DWA", "mean"], ["", "cvar:0.9"], ["MPPI", "mean"]]
-    # 40 and 38 of 40 cannot be told apart, 10 can; hg has one setting alone, so none is bold.
+    # Not 38 but 10 of 40 are significantly worse than 40; hg has one setting alone, so none is bold.
     assert [row[2].split(" ")[0] for row in rows] == [r"\textbf{100}", "25", r"\textbf{95}"]
     assert rows[1][3] == r"80.0 $\pm$ 35.1"
     assert rows[0][5:] == ["--"] * 3
@@ -69,8 +69,8 @@ def test_a_model_is_named_where_there_are_several() -> None:
     assert r"\begin{table}[t]" in text
 
 
-@pytest.mark.parametrize(("trials", "expected"), [(1, False), (2, True)])
-def test_bold_is_explained_where_it_is_used(trials: int, expected: bool) -> None:
-    text = table_of(*((made.trial(risk=f"r{i}"), 30) for i in range(trials)))
+@pytest.mark.parametrize(("counts", "expected"), [((30,), False), ((30, 29), False), ((30, 29, 5), True)])
+def test_bold_is_used_and_explained_where_something_is_worse(counts: tuple[int, ...], expected: bool) -> None:
+    text = table_of(*((made.trial(risk=f"r{i}"), count) for i, count in enumerate(counts)))
     assert ("Bold:" in text) == expected
     assert (r"\textbf" in text) == expected

@@ -288,3 +288,16 @@ def test_the_commands(  # type: ignore[no-untyped-def]
     )
     assert status == 1
     assert "errors.txt" in error
+
+
+def test_shards_of_one_suite_share_their_hypotheses(suite: Suite, parts: list[Path], tmp_path: Path) -> None:
+    claim = {
+        "one": {"planner": "bad"},
+        "other": {"planner": "Faulty"},
+        "metric": "success",
+        "direction": "lower",
+    }
+    shard = Share(index=2, of=OF)
+    parts[1] = finish(replace(suite, hypotheses=(claim,)), tmp_path / "other" / "part2", shard)
+    with pytest.raises(ConfigError, match="part2: hypotheses"):
+        list(merge_shards(parts, tmp_path / "all"))

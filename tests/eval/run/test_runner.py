@@ -570,3 +570,36 @@ def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: P
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
     assert (tmp_path / "run" / "episodes.parquet").exists()
+
+
+def test_hypotheses_are_fixed_before_the_first_unit_and_stay(dataset_path: Path, tmp_path: Path) -> None:
+    faulty, straight = {"planner": "Faulty", "risk": "mean"}, {"planner": "Faulty", "risk": "cvar"}
+    given = {"one": faulty, "other": straight, "metric": "success"}
+    suite = quick(dataset_path, scenarios=("std",), hypotheses=(given,))
+    folder, steps = tmp_path / "run", run_suite(suite, tmp_path / "run")
+    next(steps)
+    about = open_run(folder).about
+    fixed = about["hypotheses"]
+    assert not list(folder.glob("units/*/*"))
+    (test,) = fixed["tests"]
+    assert [about["trials"][test[side]]["labels"]["risk"] for side in ("one", "other")] == ["mean", "cvar"]
+    assert fixed["episodes"] == {test["one"]: 2, test["other"]: 2}
+    list(steps)
+    finish(quick(dataset_path, scenarios=("std",), seed=5), folder)  # without them the run goes on
+    assert open_run(folder).about["hypotheses"] == fixed
+    report = write_report(folder)
+    assert report.tests["n_episodes"].tolist() == [4]
+    assert (
+        "fixed for 2 episodes of a condition; the run was extended to 4" in report.findings[0].sentences[-1]
+    )
+    other = (given | {"metric": "score"},)
+    with pytest.raises(ConfigError, match=f"digest {fixed['digest']}.*got others"):
+        finish(replace(suite, hypotheses=other), folder)
+    finish(quick(dataset_path, scenarios=("std",)), tmp_path / "plain")
+    with pytest.raises(ConfigError, match="digest none"):
+        finish(suite, tmp_path / "plain")
+    assert "hypotheses" not in open_run(tmp_path / "plain").about
+    wrong = (given | {"one": {"planner": "Fulty"}},)
+    with pytest.raises(ConfigError, match="Did you mean 'Faulty'"):
+        finish(replace(suite, hypotheses=wrong), tmp_path / "wrong")
+    assert not (tmp_path / "wrong" / "run.json").exists()

@@ -3,8 +3,8 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from benchnav.eval.stats.best import TOLD, against_best, competing, told_the_truth
-from benchnav.eval.stats.summary import summarise
+from benchnav.eval.stats.best import TOLD, against_best, best_set_p, competing, told_the_truth
+from benchnav.eval.stats.difference import sign_flip_p, sign_flips
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
@@ -17,10 +17,46 @@ def episodes(labels: dict[str, str], successes: range, **changes: object) -> lis
 
 def compared(*trials: list[dict]) -> pd.DataFrame:  # type: ignore[type-arg]
     rows = made.rows(*trials)
-    summary = summarise(rows)
+    summary = made.summarised(rows)
     found = against_best(rows, summary, told_the_truth(made.trials(rows)))
     assert list(found["trial"]) == list(summary["trial"])
     return found.assign(risk=summary["risk"], model=summary["model"]).set_index("risk")
+
+
+def by_hand(values: np.ndarray) -> np.ndarray:
+    """p of the max-T test as its sources say it: every way to flip, every subset of conditions anew."""
+    signs = np.array(np.meshgrid(*[[-1, 1]] * len(values))).reshape(len(values), -1).T
+    left, p, least = list(range(values.shape[1])), np.ones(values.shape[1]), 0.0
+    while len(left) > 1:
+        pairs = [(i, j) for i in left for j in left if i != j and np.any(values[:, i] != values[:, j])]
+        if not pairs:
+            break
+        gaps = np.stack([values[:, i] - values[:, j] for i, j in pairs], axis=1)
+        norms = np.sqrt((gaps**2).sum(0))
+        seen, ways = gaps.sum(0) / norms, np.abs(signs @ gaps) / norms
+        worst = pairs[int(seen.argmax())][1]
+        least = max(least, float(np.mean(ways.max(1) >= seen.max() - 1e-9)))
+        p[worst] = least
+        left.remove(worst)
+    return p
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_best_set_is_the_step_down_max_t_test_by_hand(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    values = generator.binomial(3, [0.9, 0.8, 0.8, 0.3], size=(9, 4)).astype(float)
+    p, critical = best_set_p(values, sign_flips(9))
+    np.testing.assert_allclose(p, by_hand(values))
+    assert p[values.sum(0).argmax()] == 1
+    assert 1.5 < critical < 3.5
+
+
+def test_two_conditions_are_tested_as_compare_does() -> None:
+    generator = np.random.default_rng(1)
+    values = generator.binomial(2, [0.9, 0.5], size=(12, 2))
+    p, critical = best_set_p(values.astype(float), sign_flips(12))
+    assert p.min() == pytest.approx(sign_flip_p(values[:, 0] - values[:, 1]))
+    assert critical == pytest.approx(1.96, abs=0.4)
 
 
 def test_the_best_is_compared_with_all_others_and_corrected_over_them() -> None:
@@ -31,14 +67,38 @@ def test_the_best_is_compared_with_all_others_and_corrected_over_them() -> None:
     )
     assert set(found["best"]) == {found.loc["best", "trial"]}
     assert list(found["best_rivals"]) == [2, 2, 2]
-    # With one episode a map the test is McNemar's; Holm's first step doubles the smaller of two p.
-    exact = {"low": binomtest(0, 19).pvalue, "near": binomtest(0, 2).pvalue}
-    assert found.loc["low", "best_p_holm"] == pytest.approx(2 * exact["low"])
-    assert found.loc["near", "best_p_holm"] == pytest.approx(exact["near"])
+    assert list(found["best_maps"]) == [MAPS] * 3
+    # Of 10 000 ways to flip none is as far as the 19 maps that the lowest lost; the near one lost two.
+    assert found.loc["low", "best_p"] == pytest.approx(1e-4)
+    assert found.loc["near", "best_p"] == pytest.approx(binomtest(0, 2).pvalue, abs=0.02)
     assert found["best_alike"].to_dict() == {"low": False, "best": True, "near": True}
+    assert found["best_marked"].to_dict() == {"low": False, "best": True, "near": True}
     assert found.loc["low", "best_difference"] == pytest.approx(19 / 30)
     assert found.loc["low", "best_low"] < 19 / 30 < found.loc["low", "best_high"]
     assert np.isnan(found.loc["best", "best_difference"])
+
+
+def test_nothing_is_marked_where_nothing_is_worse() -> None:
+    found = compared(episodes(made.trial(risk="a"), range(29)), episodes(made.trial(risk="b"), range(28)))
+    assert found["best_alike"].all()
+    assert not found["best_marked"].any()
+
+
+def test_groups_of_maps_are_the_unit_of_the_best() -> None:
+    """The same episodes: thirty maps tell two settings apart, three groups of them cannot."""
+
+    def trials(**changes: object) -> list[list[dict]]:  # type: ignore[type-arg]
+        return [
+            [made.row(made.trial(risk=risk), i, 30.0 if i < count else None) | {n: f(i) for n, f in changes.items()}
+             for i in range(MAPS)]
+            for risk, count in (("a", 28), ("b", 8))
+        ]  # fmt: skip
+
+    by_map, by_group = compared(*trials()), compared(*trials(group=lambda i: i // 10))
+    assert not by_map.loc["b", "best_alike"]
+    assert by_group.loc["b", "best_alike"]
+    assert by_group.loc["b", "best_p"] == pytest.approx(0.25)  # 2 of 2³ ways
+    assert list(by_group["best_maps"]) == [3, 3]
 
 
 def test_of_equal_rates_the_faster_is_the_best() -> None:
@@ -70,7 +130,7 @@ def test_maps_are_paired_under_the_same_luck() -> None:
     ]
     found = compared(one, other)
     assert found.loc["two", "best_difference"] == pytest.approx(0.5)
-    assert found.loc["two", "best_p_holm"] == pytest.approx(2 / 2**9)
+    assert found.loc["two", "best_p"] == pytest.approx(2 / 2**9)
     few = [made.row(made.trial(risk="three"), i, None) for i in range(4)]  # only under the first seed
     assert compared(one, few).loc["three", "best_difference"] == pytest.approx(1)
 
@@ -89,15 +149,16 @@ def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
     trials = [episodes(made.trial(risk="a"), range(29)), episodes(made.trial(risk="b"), range(5))]
     again = [[made.row(made.trial(risk=risk), 0, 30.0, seed=5)] for risk in "ab"]
     plain, with_one = compared(*trials), compared(*trials, *again)
-    # Of 30 maps the one that has two draws is left out, not the 29 that have one.
-    assert with_one.loc["b", "best_difference"] == pytest.approx(24 / 29)
+    # All 30 maps stay, one of them with two draws, of which the second ended alike.
+    assert with_one.loc["b", "best_difference"] == pytest.approx(24 / 31)
+    assert list(with_one["best_maps"]) == [30, 30]
     assert not with_one.loc["b", "best_alike"]
     assert plain.loc["b", "best_difference"] == pytest.approx(24 / 30)
 
 
-def test_the_difference_that_can_be_shown_is_at_the_level_of_the_first_step() -> None:
+def test_the_detectable_difference_is_at_the_level_of_the_first_step() -> None:
     two = compared(episodes(made.trial(risk="a"), range(20)), episodes(made.trial(risk="b"), range(10)))
-    more = [episodes(made.trial(risk=f"r{n}"), range(10)) for n in range(6)]
+    more = [episodes(made.trial(risk=f"r{n}"), range(n, n + 15)) for n in range(6)]
     many = compared(
         episodes(made.trial(risk="a"), range(20)), episodes(made.trial(risk="b"), range(10)), *more
     )
@@ -142,7 +203,7 @@ def test_yardsticks_are_not_compared() -> None:
     )
     assert set(found["best"]) == {found.loc["mine", "trial"]}
     assert list(found["best_rivals"]) == [1, 1, 1]
-    assert np.isnan(found.loc["told", "best_p_holm"])
+    assert np.isnan(found.loc["told", "best_p"])
     assert not found.loc["told", "best_alike"]
 
 

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest, wilcoxon
 
-from benchnav.eval.stats.comparison import compare
+from benchnav.eval.stats.comparison import compare, time_difference
 from benchnav.eval.stats.difference import standard_deviation, success_interval
 from benchnav.eval.stats.pairing import Pair
 from benchnav.eval.stats.power import maps_needed, smallest_difference
@@ -98,11 +98,45 @@ def test_pairs_of_which_never_both_arrived_have_no_time_of_arrival() -> None:
 
 
 def test_so_few_maps_have_no_interval_of_time() -> None:
-    few, enough = (compare([pair(A[:n], B[:n])]).iloc[0] for n in (5, 6))
+    few, enough = (compare([pair(A[:n], B[:n])]).iloc[0] for n in (7, 8))
     for name in ("time_low_s", "time_high_s"):
         assert np.isnan(few[name])
         assert np.isfinite(enough[name])
     assert np.isfinite(few["time_difference_s"])
+
+
+def test_a_difference_of_time_knows_what_failures_cost() -> None:
+    """Both arrive everywhere and as fast as each other: what few maps could not show is in the interval."""
+    same = [30.0 + i % 3 for i in range(20)]
+    _, low, high = time_difference(pair(same, same).episodes)
+    _, fewer, more = success_interval(np.zeros(20, dtype=int), 1)
+    cost = 100 - np.mean(same)
+    assert (low, high) == pytest.approx((cost * fewer, cost * more))
+    narrow = time_difference(pair(same, same).episodes, confidence=0.5)
+    assert low < narrow[1] < narrow[2] < high
+    late = [time + 5 for time in same]
+    difference, low, high = time_difference(pair(late, same).episodes)
+    assert difference == pytest.approx(5)
+    assert (low + high) / 2 == pytest.approx(5)
+
+
+@pytest.mark.parametrize("maps", [8, 20])
+def test_intervals_of_a_difference_of_time_cover_it_on_few_maps(maps: int) -> None:
+    generator = np.random.default_rng(8)
+    held, count, rates = 0, 150, (0.85, 0.95)
+    for _ in range(count):
+        hard, luck = generator.standard_normal(maps), generator.random(maps)
+        taken = [
+            np.where(
+                luck < rate,
+                np.minimum(33 * np.exp(0.2 * hard + 0.2 * generator.standard_normal(maps)), 99),
+                100,
+            )
+            for rate in rates
+        ]
+        _, low, high = time_difference(pair(*(list(times) for times in taken)).episodes)
+        held += low <= 0.1 * (100 - 33 * np.exp(0.04)) <= high
+    assert held >= 135  # 93 % of 150 are 139.5
 
 
 def test_a_group_of_maps_is_one_number() -> None:

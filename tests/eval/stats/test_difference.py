@@ -2,14 +2,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest, norm, permutation_test, t
+from scipy.stats import binomtest, permutation_test, t, ttest_1samp
 
 from benchnav.eval.stats.difference import (
+    by_map,
     mean_interval,
     sign_flip_p,
+    sign_flips,
     signed_rank_p,
     standard_deviation,
     success_interval,
+    total_time_interval,
 )
 
 
@@ -67,33 +70,62 @@ def test_an_interval_ends_at_one() -> None:
     assert (mean, high) == (1, 1)
 
 
-def test_mean_interval_is_near_that_of_normal_theory() -> None:
-    values = np.random.default_rng(0).normal(5.0, 2.0, (3, 400))
-    mean, low, high = mean_interval(values)
-    half = norm.ppf(0.975) * values.std(1) / 20
-    np.testing.assert_allclose(mean, values.mean(1))
-    np.testing.assert_allclose(low, mean - half, atol=0.03)
-    np.testing.assert_allclose(high, mean + half, atol=0.03)
-    assert mean_interval(values, confidence=0.5)[1][0] > low[0]
+def test_mean_interval_is_students() -> None:
+    values = np.random.default_rng(0).normal(5.0, 2.0, (3, 12))
+    for confidence in (0.95, 0.9):
+        expected = ttest_1samp(values, 0, axis=1).confidence_interval(confidence)
+        mean, low, high = mean_interval(values, confidence)
+        np.testing.assert_allclose(mean, values.mean(1))
+        np.testing.assert_allclose((low, high), (expected.low, expected.high))
 
 
-def test_mean_interval_of_skewed_times_leans_the_right_way() -> None:
-    values = np.random.default_rng(1).lognormal(0, 1.2, 60)
-    mean, low, high = mean_interval(values)
-    assert high - mean > 1.2 * (mean - low)
-
-
-def test_mean_interval_where_nothing_can_be_resampled() -> None:
-    _, low, high = mean_interval(np.array([[4.0], [5.0]]))
+def test_seven_maps_and_none_have_no_interval_of_a_mean() -> None:
+    mean, low, high = mean_interval(np.arange(7.0))
+    assert mean == 3
     assert np.isnan([low, high]).all()
-    mean, low, high = mean_interval(np.array([[2.0, 2.0, 2.0], [1.0, 2.0, 6.0]]))
-    assert (mean[0], low[0], high[0]) == (2, 2, 2)
-    assert low[1] < mean[1] < high[1]
+    assert np.isfinite(mean_interval(np.arange(8.0))).all()
+    assert np.isnan(mean_interval(np.empty(0))).all()
 
 
-def test_a_row_has_its_interval_whatever_stands_beside_it() -> None:
-    values = np.random.default_rng(3).exponential(1.0, (4, 50))
-    assert mean_interval(values)[1][2] == pytest.approx(float(mean_interval(values[2])[1]))
+def test_total_time_is_put_together_of_failures_and_of_time_without_them() -> None:
+    """By hand: ten maps, two of which fail at 100 s; those that arrive take 30 or 40 s."""
+    times = np.array([30.0, 40, 30, 40, 30, 40, 30, 40, 100, 100])
+    failed = times == 100
+    mean, low, high = total_time_interval(times, 1.0 * failed, (0.05, 0.5), 65.0, 8)
+    without = np.array([30.0, 40, 30, 40, 30, 40, 30, 40, 35, 35])
+    half = t.ppf(0.975, 7) * without.std(ddof=1) / 10**0.5
+    assert mean == 48
+    assert low == pytest.approx(48 - (half**2 + (65 * 0.15) ** 2) ** 0.5)
+    assert high == pytest.approx(48 + (half**2 + (65 * 0.3) ** 2) ** 0.5)
+    narrow = total_time_interval(times, 1.0 * failed, (0.05, 0.5), 65.0, 8, confidence=0.5)
+    assert low < narrow[1] < narrow[2] < high
+
+
+def test_by_map_has_the_mean_of_all_and_that_of_each_map_where_they_are_alike() -> None:
+    values = np.array([1.0, 3, 5, 7, 9, 20])
+    np.testing.assert_allclose(by_map(values, np.array([4, 2, 2, 4, 7, 7])), [4, 4, 14.5])
+    found = by_map(values, np.array([0, 0, 0, 0, 1, 2]))
+    assert found.mean() == pytest.approx(values.mean())
+    # Contribution of the first map: 4 values, 14 under 4 times the mean of 7.5, where a map has 2 on average.
+    assert found[0] == pytest.approx(7.5 + (16 - 4 * 7.5) / 2)
+
+
+def test_one_sided_sign_flips_are_counted_to_their_own_side() -> None:
+    gain = np.array([2, 1, -1, 3, 0, 1])
+    signs = np.array(np.meshgrid(*[[-1, 1]] * 6)).reshape(6, -1)
+    sums = np.abs(gain) @ signs
+    assert sign_flip_p(gain, "higher") == pytest.approx(np.mean(sums >= 6))
+    assert sign_flip_p(gain, "lower") == pytest.approx(np.mean(sums <= 6))
+
+
+def test_signs_are_flipped_in_all_ways_or_in_as_many_as_are_drawn() -> None:
+    assert len(np.unique(sign_flips(5), axis=0)) == 2**5
+    many = sign_flips(40)
+    assert many.shape == (10_000, 40)
+    assert set(np.unique(many)) == {-1, 1}
+    assert (many[0] == 1).all()  # as they were seen is one of the ways
+    assert abs(many[1:].mean()) < 0.01
+    np.testing.assert_array_equal(many, sign_flips(40))
 
 
 def test_time_is_tested_by_ranks() -> None:

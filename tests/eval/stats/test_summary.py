@@ -3,8 +3,15 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from benchnav.eval.stats.difference import mean_interval
-from benchnav.eval.stats.summary import cautious_design_effect, design_effect, summarise, wilson_interval
+from benchnav.eval.stats.difference import total_time_interval
+from benchnav.eval.stats.summary import (
+    cautious_design_effect,
+    design_effect,
+    time_budgets,
+    total_time_mean,
+    wilson_interval,
+)
+from tests.eval.report import made
 from tests.eval.report.made import row, rows, trial
 
 
@@ -91,7 +98,7 @@ def test_design_effect_at_its_ends() -> None:
 
 
 def summary_of(*episodes: dict) -> pd.Series:  # type: ignore[type-arg]
-    summary = summarise(rows(*episodes))
+    summary = made.summarised(rows(*episodes))
     assert len(summary) == 1
     return summary.iloc[0]
 
@@ -155,7 +162,7 @@ def test_episodes_of_one_map_are_not_maps() -> None:
 
 def test_a_row_a_trial_in_order_of_appearance() -> None:
     order = [trial("mppi", scenario="std"), trial("cl_rrt", scenario="std"), trial("cl_rrt", scenario="hg")]
-    summary = summarise(rows(*(row(labels, i) for i in range(2) for labels in order)))
+    summary = made.summarised(rows(*(row(labels, i) for i in range(2) for labels in order)))
     assert summary[["planner", "scenario"]].to_numpy().tolist() == [
         ["mppi", "std"], ["cl_rrt", "std"], ["cl_rrt", "hg"]
     ]  # fmt: skip
@@ -179,21 +186,94 @@ def test_planning_time_is_the_median_and_compilation_a_share() -> None:
 def test_time_has_the_interval_of_its_own_trial_over_maps() -> None:
     generator = np.random.default_rng(4)
     taken = {name: generator.uniform(20, 60, (12, 3)) + late for name, late in (("mppi", 0), ("cl_rrt", 30))}
-    summary = summarise(
+    taken["cl_rrt"][2, 1] = taken["cl_rrt"][7] = 100
+    summary = made.summarised(
         rows(
-            row(trial(name), m, taken[name][m, seed], seed=seed)
+            row(trial(name), m, time if (time := taken[name][m, seed]) < 100 else None, seed=seed)
             for seed in range(3)
             for m in range(12)
             for name in taken
         )
     ).set_index("planner")
     for name, times in taken.items():
-        _, low, high = mean_interval(times.mean(axis=1))
-        found = summary.loc[name]
-        assert (found["total_time_low_s"], found["total_time_high_s"]) == pytest.approx(
-            (float(low), float(high)), abs=0.01
+        found, failed = summary.loc[name], times >= 100
+        ends = 1 - found["success_high"], 1 - found["success_low"]
+        _, low, high = total_time_interval(
+            times.mean(1), failed.mean(1), ends, 100 - times[~failed].mean(), int((~failed).any(1).sum())
         )
+        assert (found["total_time_low_s"], found["total_time_high_s"]) == pytest.approx((low, min(high, 100)))
         assert found["total_time_low_s"] < found["total_time_mean_s"] < found["total_time_high_s"]
+
+
+def test_a_time_budget_that_is_a_ratio_is_that_of_each_map() -> None:
+    """A robot of 2 m/s: T is three times half of the reference time; failures say it themselves."""
+    reference = np.array([20.0, 30.0, 40.0])
+    found = time_budgets(
+        rows(
+            row(trial(), 0, 12.0, time_ratio=12 / (20 / 2)),
+            row(trial(), 1, 30.0, time_ratio=30 / (30 / 2)),
+            row(trial(), 2, None, total_time_s=3 * 40 / 2, time_ratio=np.nan),
+        ),
+        {"time_budget_ratio": 3.0},
+    )
+    np.testing.assert_allclose(found, 3 * reference / 2)
+    assert list(time_budgets(rows(row(trial())), {"time_budget_s": 70.0})) == [70.0]
+
+
+def test_rare_failures_that_were_not_met_widen_the_interval_by_what_they_would_cost() -> None:
+    arrived = [row(trial(), i, 30.0 + i % 3) for i in range(20)]
+    tight, dear = (
+        made.summarised(rows(*arrived), {"time_budget_s": budget}).iloc[0] for budget in (40.0, 400.0)
+    )
+    mean = tight["total_time_mean_s"]
+    cost = (1 - tight["success_low"]) * np.array([40 - mean, 400 - mean])
+    for found, more in zip((tight, dear), cost, strict=True):
+        half = mean - found["total_time_low_s"]  # nothing fails less often than never
+        assert found["total_time_high_s"] - mean == pytest.approx(np.hypot(half, more))
+
+
+def test_what_never_arrived_has_an_interval_up_to_its_budget() -> None:
+    found = summary_of(*(row(trial(), i, None) for i in range(10)))
+    assert found["total_time_high_s"] == 100
+    assert found["total_time_low_s"] == pytest.approx(100 * (1 - found["success_high"]))
+
+
+@pytest.mark.parametrize(("maps", "each"), [(8, 1), (20, 1), (20, 3)])
+@pytest.mark.parametrize("rate", [0.8, 0.95, 0.99])
+def test_intervals_of_total_time_cover_it_on_few_maps(maps: int, each: int, rate: float) -> None:
+    generator = np.random.default_rng(5)
+    held, count = 0, 150
+    for _ in range(count):
+        success = drawn(generator, maps, each, 0.3, rate)
+        taken = np.where(
+            success, np.minimum(33 * np.exp(0.3 * generator.standard_normal(success.shape)), 99), 100
+        )
+        table = pd.DataFrame(
+            {
+                "instance": np.repeat(np.arange(maps), each),
+                "success": success.ravel(),
+                "total_time_s": taken.ravel(),
+            }
+        )
+        mean, low, high = total_time_mean(table, {"time_budget_s": 100.0})
+        held += low <= rate * 33 * np.exp(0.045) + (1 - rate) * 100 <= high
+        assert mean == pytest.approx(taken.mean())
+    # With 93 % or more covered, fewer than 128 of 150 are seen once in a thousand times; a bootstrap covers 120 to 130.
+    assert held >= 130
+
+
+def test_maps_of_one_group_are_one_unit() -> None:
+    """Ten maps of five groups; all maps of a group end alike, so that five is what they tell."""
+    labels = trial()
+    alone = [row(labels, i, 30.0 + i // 2 if i >= 2 else None) for i in range(10)]
+    grouped = [{**one, "group": one["instance"] // 2} for one in alone]
+    by_map, by_group = summary_of(*alone), summary_of(*grouped)
+    assert (by_map["n_maps"], by_map["n_groups"]) == (10, 10)
+    assert (by_group["n_maps"], by_group["n_groups"]) == (10, 5)
+    assert by_group["design_effect"] == pytest.approx(2)
+    assert by_group["success_low"] < by_map["success_low"]
+    assert np.isfinite(by_map["total_time_low_s"])
+    assert np.isnan(by_group["total_time_low_s"])  # of five there is none
 
 
 def test_two_maps_more_are_as_if_they_had_been_met() -> None:

@@ -11,7 +11,7 @@ from benchnav.eval.report.charts.panels import lay_out, planner_colours
 from benchnav.eval.trial import NOT_USED
 
 
-def success_figure(summary: pd.DataFrame, alike: Collection[str] = ()) -> Figure:
+def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figure:
     """Draws the success rate of every trial with its 95 % interval, a panel a block of the run.
 
     A planner that looks at nothing predicted is drawn as a line through its panel, the floor that others are
@@ -19,12 +19,12 @@ def success_figure(summary: pd.DataFrame, alike: Collection[str] = ()) -> Figure
 
     Args:
         summary: from `summary.summarise`.
-        alike: trials that are not told from the best of their block: their points are filled.
+        marked: trials whose points are filled, as `best_marked` of `best.against_best` has them.
     """
     layout, colours = lay_out(summary, ["success [%]"]), planner_colours(summary)
     for panel, rows in layout.panels:
         for height, row in layout.rows(rows):
-            _draw(panel, height, row, colours[str(row["planner"])], row["trial"] in alike)
+            _draw(panel, height, row, colours[str(row["planner"])], row["trial"] in marked)
         panel.set_xticks(np.arange(0, 101, 25))
     layout.panels[0][0].set_xlim(-4, 104)
     return layout.figure

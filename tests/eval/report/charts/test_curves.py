@@ -7,7 +7,6 @@ from matplotlib.figure import Figure
 
 from benchnav.eval.report.charts.curves import curve_figure, sweep_name
 from benchnav.eval.report.charts.sweeps import find_sweeps
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 LEVELS = (0.5, 0.8, 0.9)
@@ -37,7 +36,7 @@ def drawn(*trials: tuple[dict[str, str], int], **changes: Any) -> Figure:
         "+".join(made.row(labels)["trial"].split("+")): values(labels, **changes) for labels, _ in trials
     }
     (sweep,) = find_sweeps(known)
-    return curve_figure(sweep, summarise(rows))
+    return curve_figure(sweep, made.summarised(rows))
 
 
 def shown(figure: Figure) -> list[Axes]:

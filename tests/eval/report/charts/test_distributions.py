@@ -3,7 +3,6 @@ import pytest
 from matplotlib.axes import Axes
 
 from benchnav.eval.report.charts.distributions import distribution_figure
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 
@@ -31,7 +30,7 @@ def test_every_episode_is_a_dot_under_its_quantity_and_its_trial() -> None:
         ),
         (made.row(made.trial("b"), i, 50.0, traversability=0.9) for i in range(2)),
     )
-    figure = distribution_figure(summarise(rows), rows)
+    figure = distribution_figure(made.summarised(rows), rows)
     times, met = figure.axes
     np.testing.assert_allclose(np.concatenate(dots(times)), [20, 30, 100, 50, 50])
     np.testing.assert_allclose(np.concatenate(dots(met)), [0, 0.1, 0.2, 0.9, 0.9], atol=1e-12)
@@ -47,12 +46,12 @@ def test_every_episode_is_a_dot_under_its_quantity_and_its_trial() -> None:
 
 def test_each_scenario_has_a_line_of_panels() -> None:
     rows = made.rows(made.row(made.trial(scenario=name), 0, 20.0 + n) for n, name in enumerate(("std", "hg")))
-    figure = distribution_figure(summarise(rows), rows)
+    figure = distribution_figure(made.summarised(rows), rows)
     assert [panel.get_title() for panel in figure.axes] == ["std", "std", "hg", "hg"]
     assert [medians(panel) for panel in figure.axes] == [[20], [0.8], [21], [0.8]]
 
 
 def test_an_episode_that_met_nothing_is_no_dot() -> None:
     rows = made.rows(made.row(made.trial(), 0, None, traversability=np.nan))
-    _, met = distribution_figure(summarise(rows), rows).axes
+    _, met = distribution_figure(made.summarised(rows), rows).axes
     assert not met.collections

@@ -3,7 +3,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 
 from benchnav.eval.report.charts.outcomes import COLOURS, SUCCESS_COLOUR, outcome_figure
-from benchnav.eval.stats.summary import summarise
 from benchnav.planning.world.outcome import FAILURES
 from tests.eval.report import made
 
@@ -32,7 +31,7 @@ def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
         (made.row(second, i, None, outcome="stuck") for i in range(1)),
         (made.row(second, i) for i in range(1, 4)),
     )
-    figure = outcome_figure(summarise(rows))
+    figure = outcome_figure(made.summarised(rows))
     above, below = (drawn for _, drawn in sorted(bars(figure.axes[0]).items()))
     expected = [("immobilised", 20), ("stuck", 10), ("timeout", 20)]
     assert above == [
@@ -46,6 +45,6 @@ def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
 
 def test_each_scenario_has_its_panel() -> None:
     rows = made.rows(made.row(made.trial(scenario=name)) for name in ("std", "hg"))
-    figure = outcome_figure(summarise(rows))
+    figure = outcome_figure(made.summarised(rows))
     assert [panel.get_title() for panel in figure.axes] == ["std", "hg"]
     assert figure.get_figwidth() * 25.4 == pytest.approx(180)

@@ -7,7 +7,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from benchnav.eval.report.charts.success import success_figure
-from benchnav.eval.stats.summary import summarise
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
@@ -32,7 +31,7 @@ def points(panel: Axes) -> dict[str, float]:
 
 
 def test_each_rate_stands_at_its_name_with_its_interval() -> None:
-    summary = summarise(
+    summary = made.summarised(
         made.rows(
             shares(made.trial(**BLIND), 2), shares(made.trial("astar_dwa", "mean"), 9), shares(made.trial(), 7),
             shares(made.trial("astar_dwa"), 8),
@@ -47,7 +46,7 @@ def test_each_rate_stands_at_its_name_with_its_interval() -> None:
 
 
 def test_the_blind_baseline_is_a_line_through_its_own_panel() -> None:
-    summary = summarise(
+    summary = made.summarised(
         made.rows(
             *(shares(made.trial(**BLIND, scenario=name), count) for name, count in (("std", 4), ("hg", 1))),
             *(shares(made.trial(scenario=name), 10) for name in ("std", "hg")),
@@ -63,7 +62,7 @@ def test_the_blind_baseline_is_a_line_through_its_own_panel() -> None:
 def test_any_number_of_planners_risks_and_scenarios_fit(
     planners: int, risks: int, scenarios: int, tmp_path
 ) -> None:  # type: ignore[no-untyped-def]
-    summary = summarise(
+    summary = made.summarised(
         made.rows(
             made.row(made.trial(f"planner_{p}", f"cvar:{r}", scenario=f"scenario-{s}"))
             for p in range(planners) for r in range(risks) for s in range(scenarios)
@@ -85,7 +84,9 @@ def test_any_number_of_planners_risks_and_scenarios_fit(
 
 def test_models_and_worlds_are_told_apart() -> None:
     several = [made.trial(model=model, world=world) for model in ("a", "b") for world in ("paper", "stakes")]
-    figure = success_figure(summarise(made.rows(*(shares(labels, n) for n, labels in enumerate(several)))))
+    figure = success_figure(
+        made.summarised(made.rows(*(shares(labels, n) for n, labels in enumerate(several))))
+    )
     assert [panel.get_title() for panel in panels(figure)] == ["std, paper", "std, stakes"]
     first, second = panels(figure)
     assert points(first) == {"MPPI, a, cvar": 0, "MPPI, b, cvar": 20}
@@ -97,7 +98,7 @@ def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_bl
     told = made.trial("astar_dwa", "–", model="clairvoyant")
     for others in ((), (made.trial("astar_dwa", model="oracle"),)):
         labels = [made.trial(**BLIND), told, *others]
-        (panel,) = panels(success_figure(summarise(made.rows(*(shares(one, 5) for one in labels)))))
+        (panel,) = panels(success_figure(made.summarised(made.rows(*(shares(one, 5) for one in labels)))))
         named = [label.get_text() for label in panel.get_yticklabels()]
         assert named == ["straight", "A* + DWA, clairvoyant", "A* + DWA, oracle, cvar"][: len(labels)]
         marked = [line for line in panel.lines if line.get_marker() == "o"]
@@ -111,15 +112,15 @@ def points_by_height(panel: Axes) -> list[float]:
     return [float(line.get_xdata()[0]) for line in sorted(marked, key=lambda line: line.get_ydata()[0])]
 
 
-def test_points_are_filled_where_the_test_does_not_tell_them_from_the_best() -> None:
-    summary = summarise(made.rows(shares(made.trial(risk="a"), 9), shares(made.trial(risk="b"), 2)))
+def test_points_are_filled_where_they_are_marked() -> None:
+    summary = made.summarised(made.rows(shares(made.trial(risk="a"), 9), shares(made.trial(risk="b"), 2)))
     (panel,) = panels(success_figure(summary, {summary["trial"][0]}))
     marked = [line for line in panel.lines if line.get_marker() == "o"]
     assert [to_rgb(line.get_markerfacecolor()) == (1, 1, 1) for line in marked] == [False, True]
 
 
 def test_figures_have_the_width_of_a_column_or_a_page() -> None:
-    one = summarise(made.rows(shares(made.trial(), 5)))
+    one = made.summarised(made.rows(shares(made.trial(), 5)))
     assert success_figure(one).get_figwidth() * 25.4 == pytest.approx(88)
-    two = summarise(made.rows(*(shares(made.trial(scenario=name), 5) for name in ("std", "hg"))))
+    two = made.summarised(made.rows(*(shares(made.trial(scenario=name), 5) for name in ("std", "hg"))))
     assert success_figure(two).get_figwidth() * 25.4 == pytest.approx(180)

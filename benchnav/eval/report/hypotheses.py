@@ -1,0 +1,152 @@
+"""What a run says of the hypotheses that were fixed before it: sentences, and their table."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.eval.report.findings import Finding, p_in_words
+from benchnav.eval.report.tables import ResultTable
+from benchnav.eval.stats.comparison import ALPHA
+from benchnav.eval.stats.difference import LEAST_MAPS
+from benchnav.eval.trial import NOT_USED
+
+_TESTS = {
+    "difference": "differences by a sign-flip test by {unit}",
+    "non-inferiority": "non-inferiority by one one-sided test at the margin",
+    "equivalence": "equivalence by two one-sided tests at the margin (TOST)",
+}
+# The interval whose end decides a test at 5 %, before a correction.
+_INTERVALS = {"difference": ("", "95 %"), "non-inferiority": ("_90", "90 %"), "equivalence": ("_90", "90 %")}
+
+
+def hypothesis_finding(tests: pd.DataFrame, about: Mapping[str, Any], grouped: bool) -> Finding:
+    """Says of each hypothesis how its test came out.
+
+    Args:
+        tests: from `hypotheses.test_hypotheses`.
+        about: all of `run.json`.
+        grouped: the unit is a group of maps.
+    """
+    unit = "group" if grouped else "map"
+    said = [
+        f"{number}. {_capital(row['claim'])}: {_verdict(row)} ({_numbers(row, unit)})."
+        for number, row in enumerate(tests.to_dict("records"), start=1)
+    ]
+    return Finding(
+        title=f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})",
+        sentences=(*said, *_extended(about)),
+    )
+
+
+def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> ResultTable:
+    """Formats the tests, a row a hypothesis; bold where it is supported.
+
+    Args:
+        tests: from `hypotheses.test_hypotheses`.
+        grouped: the unit is a group of maps.
+    """
+    headings = (
+        "",
+        "hypothesis",
+        "groups" if grouped else "maps",
+        "values",
+        "difference",
+        "interval",
+        "p",
+        "result",
+    )
+    rows = []
+    for number, row in enumerate(tests.to_dict("records"), start=1):
+        p = p_in_words(row["p_holm"]).removeprefix("p ").removeprefix("= ")
+        values = f"{_short(row['mean_one'])} : {_short(row['mean_other'])}"
+        cells = (
+            str(row["n_maps"]),
+            values,
+            _with_unit(row["difference"], row["unit"]),
+            _range(row),
+            p,
+            _verdict(row),
+        )
+        rows.append((str(number), row["claim"], *cells))
+    used = [_TESTS[kind] for kind in _TESTS if (tests["kind"] == kind).any()]
+    notes = [
+        f"Tests: {'; '.join(used).format(unit=headings[2].removesuffix('s'))}. p is after Holm's correction over "
+        f"{_count(len(tests))}; supported where it is under {ALPHA}.",
+        "Intervals are of one difference alone: 95 % of a difference, and 90 % where a margin is tested, whose end "
+        "beyond the margin decides the test before the correction. "
+        f"Under {LEAST_MAPS} {headings[2]} success alone has one.",
+    ]
+    if (tests["metric"] == "path_length").any():
+        notes.append("Path length: of the episodes in which both arrived.")
+    bold = frozenset((place, 7) for place, supported in enumerate(tests["supported"]) if supported)
+    note = "supported." if bold else ""
+    return ResultTable(
+        headings=headings, labels=2, rows=tuple(rows), notes=tuple(notes), bold=bold, bold_note=note
+    )
+
+
+def _verdict(row: Mapping[Any, Any]) -> str:
+    if row["kind"] == "difference":
+        if not row["supported"]:
+            return (
+                "no significant difference"
+                if not row["direction"]
+                else f"not significantly {row['direction']}"
+            )
+        return f"significantly {row['direction'] or 'different'}"
+    name = {"equivalence": "equivalent", "non-inferiority": "not inferior"}[row["kind"]]
+    return name if row["supported"] else f"not shown to be {name}"
+
+
+def _numbers(row: Mapping[Any, Any], unit: str) -> str:
+    words = [f"difference {_with_unit(row['difference'], row['unit'])}"]
+    if (ends := _range(row)) != NOT_USED:
+        words.append(f"interval {ends}")
+    return ", ".join([*words, f"{p_in_words(row['p_holm'])}, {row['n_maps']} {unit}s"])
+
+
+def _extended(about: Mapping[str, Any]) -> list[str]:
+    """Tells where a run was extended after its hypotheses were fixed."""
+    planned = about["hypotheses"]["episodes"]
+    now = {trial: sum(count for _, _, count in about["trials"][trial]["draws"]) for trial in planned}
+    if now == planned:
+        return []
+    return [
+        f"They were fixed for {_span(planned.values())} episodes of a condition; the run was extended to "
+        f"{_span(now.values())} later, so that their p-values hold only if that was planned."
+    ]
+
+
+def _span(counts: Any) -> str:
+    least, most = min(counts), max(counts)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def _range(row: Mapping[Any, Any]) -> str:
+    suffix, words = _INTERVALS[row["kind"]]
+    low, high = row[f"low{suffix}"], row[f"high{suffix}"]
+    return NOT_USED if np.isnan(low) else f"{_signed(low)} to {_signed(high)} ({words})"
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return NOT_USED if np.isnan(value) else f"{_signed(value)} {unit}".rstrip()
+
+
+def _signed(value: float) -> str:
+    digits = 1 if abs(value) >= 0.95 else 2
+    return f"{round(value, digits) + 0.0:+.{digits}f}"  # no minus before a zero
+
+
+def _short(value: float) -> str:
+    return NOT_USED if np.isnan(value) else f"{value:.3g}"
+
+
+def _capital(text: str) -> str:
+    # Symbols such as λ̄ stay as they are.
+    return text[0].upper() + text[1:] if text.startswith(("success", "score", "path")) else text
+
+
+def _count(tests: int) -> str:
+    return "1 hypothesis" if tests == 1 else f"{tests} hypotheses"

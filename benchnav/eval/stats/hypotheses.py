@@ -1,0 +1,441 @@
+"""Hypotheses that a suite fixes before its first unit is run: what they name, and their tests.
+
+A hypothesis compares two conditions by one metric, map by map. A difference is tested by flipping signs;
+non-inferiority and equivalence within a margin by where the interval of the difference ends (two one-sided tests).
+Holm's correction is over the whole list.
+Sources: Schuirmann (1987), "A comparison of the two one-sided tests procedure and the power approach for assessing the
+equivalence of average bioavailability"; Wellek (2010), "Testing Statistical Hypotheses of Equivalence and
+Noninferiority", 1.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import brentq
+from statsmodels.stats.multitest import multipletests
+
+from benchnav import registry
+from benchnav.errors import ConfigError
+from benchnav.eval.stats.comparison import ALPHA, time_difference
+from benchnav.eval.stats.difference import (
+    by_map,
+    mean_interval,
+    sign_flip_p,
+    sign_flips,
+    success_interval,
+)
+from benchnav.eval.stats.summary import LABELS, time_budgets, units_of
+from benchnav.eval.trial import NOT_USED, Trial
+
+KINDS = ("difference", "non-inferiority", "equivalence")
+DIRECTIONS = ("higher", "lower")
+
+_DRAW = ["seed", "realisation", "instance"]
+_KEYS = ("one", "other", "metric", "kind", "direction", "margin")
+# Confidence at which a p-value of a margin is looked for, but for what rounds to 0 and 1.
+_MOST = 1 - 1e-12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """What two conditions are compared by.
+
+    Args:
+        column: of the table of episodes.
+        name: in text.
+        unit: of a difference and of a margin.
+        scale: that unit over the column's.
+        better: which way is better, of `DIRECTIONS`.
+    """
+
+    column: str
+    name: str
+    unit: str
+    scale: float
+    better: str
+
+
+METRICS = {
+    "success": Metric(column="success", name="success", unit="points", scale=100, better="higher"),
+    "T_total": Metric(column="total_time_s", name="T_total", unit="s", scale=1, better="lower"),
+    "score": Metric(column="score", name="score", unit="", scale=1, better="higher"),
+    "traversability": Metric(column="traversability", name="λ̄", unit="points", scale=100, better="higher"),
+    "path_length": Metric(column="path_length_m", name="path length", unit="m", scale=1, better="lower"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hypothesis:
+    """What is claimed of two conditions.
+
+    Args:
+        one: id of the condition that the claim is about.
+        other: id of the condition that it is compared with.
+        names: what text calls the two.
+        metric: of `METRICS`.
+        kind: of `KINDS`.
+        direction: of a difference, where `one` lies, or either way if empty; of non-inferiority, which way is better.
+        margin: of non-inferiority and equivalence, in the metric's unit.
+    """
+
+    one: str
+    other: str
+    names: tuple[str, str]
+    metric: str
+    kind: str
+    direction: str
+    margin: float
+
+    @property
+    def claim(self) -> str:
+        """The hypothesis as a sentence without its full stop."""
+        metric = METRICS[self.metric]
+        one, other = self.names
+        margin = f"{self.margin:g} {metric.unit}".rstrip()
+        if self.kind == "equivalence":
+            return f"{metric.name} of {one} and of {other} differs by less than {margin}"
+        if self.kind == "non-inferiority":
+            worse = DIRECTIONS[self.direction == DIRECTIONS[0]]
+            return f"{metric.name} of {one} is less than {margin} {worse} than that of {other}"
+        if self.direction:
+            return f"{metric.name} of {one} is {self.direction} than that of {other}"
+        return f"{metric.name} of {one} differs from that of {other}"
+
+
+def fix_hypotheses(
+    given: Sequence[Mapping[str, Any]], trials: Mapping[str, Trial], episodes: Mapping[str, int]
+) -> dict[str, Any]:
+    """Reads the hypotheses of a suite, for `run.json`.
+
+    Args:
+        given: as the suite lists them.
+        trials: its conditions by id.
+        episodes: of each condition, how many are to be run.
+
+    Returns:
+        `tests`, each as plain data; `digest` of them; and `episodes` of each condition that they name. Empty where
+        there are no hypotheses.
+
+    Raises:
+        ConfigError: a hypothesis names what is not there, or asks for what cannot be tested.
+    """
+    tests = [test for place, one in enumerate(given, start=1) for test in _read(one, place, trials)]
+    if not tests:
+        return {}
+    plain = [{**asdict(test), "names": list(test.names), "claim": test.claim} for test in tests]
+    for test in plain:
+        if plain.count(test) > 1:
+            raise ConfigError(f"Expected hypotheses that differ, got twice: {test['claim']}.")
+    named = dict.fromkeys(trial for test in tests for trial in (test.one, test.other))
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
+    return {
+        "tests": plain,
+        "digest": hashlib.sha256(text.encode()).hexdigest()[:16],
+        "episodes": {trial: episodes[trial] for trial in named},
+    }
+
+
+def test_hypotheses(
+    about: Mapping[str, Any], episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]
+) -> pd.DataFrame:
+    """Tests the hypotheses of a run.
+
+    Args:
+        about: from `fix_hypotheses`.
+        episodes: all rows of the run.
+        worlds: by condition what λ did.
+
+    Returns:
+        A row a hypothesis, of which `difference` is of `one` less `other`: all fields of `Hypothesis` and `claim`;
+        `unit` of all that follows; `n_maps`, of which a group counts as one, and `n_episodes` of each condition;
+        `mean_one`, `mean_other`, `difference`, and the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
+        `high_90`; `p`, after Holm's correction `p_holm`; and `supported`, true where `p_holm` is under 0.05. Under
+        `difference.LEAST_MAPS` maps a difference of anything but success has no interval.
+    """
+    rows = dict(list(episodes.groupby("trial", sort=False)))
+    made = []
+    for plain in about["tests"]:
+        fields = {name: value for name, value in plain.items() if name != "claim"}
+        test = Hypothesis(**{**fields, "names": tuple(plain["names"])})
+        one, other = (
+            rows[trial].assign(time_budget_s=time_budgets(rows[trial], worlds[trial]))
+            for trial in (test.one, test.other)
+        )
+        made.append({**plain, **_test(test, _side_by_side(one, other, test.metric))})
+    table = pd.DataFrame(made)
+    table["p_holm"] = multipletests(table["p"], ALPHA, method="holm")[1]
+    return table.assign(supported=table["p_holm"] < ALPHA)
+
+
+def _side_by_side(one: pd.DataFrame, other: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Episodes that both conditions have, and of which the metric is known; of a path, where both arrived."""
+    column = METRICS[metric].column
+    wanted = list(dict.fromkeys(["success", "total_time_s", "time_budget_s", column]))
+    left = [*_DRAW, *(["group"] if "group" in one else []), *wanted]
+    both = one[left].merge(other[[*_DRAW, *wanted]], on=_DRAW, suffixes=("", "_other"))
+    if metric == "path_length":
+        both = both[both["success"] & both["success_other"]]
+    return both.dropna(subset=[column, f"{column}_other"])
+
+
+def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
+    metric = METRICS[test.metric]
+    row: dict[str, Any] = {
+        "unit": metric.unit,
+        "n_maps": units_of(rows).nunique(),
+        "n_episodes": len(rows),
+        "mean_one": metric.scale * rows[metric.column].mean(),
+        "mean_other": metric.scale * rows[f"{metric.column}_other"].mean(),
+    }
+    for suffix, confidence in (("_90", 0.9), ("", 0.95)):
+        difference, low, high = _interval(rows, test.metric, confidence)
+        row |= {"difference": difference, f"low{suffix}": low, f"high{suffix}": high}
+    return row | {"p": p_of(test, rows)}
+
+
+def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> tuple[float, float, float]:
+    """Difference in the metric's unit, with its interval; NaN where there are too few maps."""
+    units = units_of(rows).to_numpy()
+    if metric == "T_total" and len(rows):
+        return time_difference(rows, confidence)
+    scale = METRICS[metric].scale
+    if metric == "success":
+        gain = _sums(rows, metric)
+        if len(gain) < 2:
+            return float(100 * gain.sum() / max(len(rows), 1)), np.nan, np.nan
+        found = success_interval(gain, len(rows) / len(gain), confidence)
+    else:
+        late = _late(rows, metric)
+        found = mean_interval(by_map(late, units) if len(late) else late, confidence)
+    difference, low, high = (scale * float(value) for value in found)
+    return difference, low, high
+
+
+def _late(rows: pd.DataFrame, metric: str) -> np.ndarray:
+    column = METRICS[metric].column
+    return rows[column].to_numpy(dtype=float) - rows[f"{column}_other"].to_numpy(dtype=float)
+
+
+def _sums(rows: pd.DataFrame, metric: str) -> np.ndarray:
+    """Sum of differences by map, shape [M]."""
+    return pd.Series(_late(rows, metric)).groupby(units_of(rows).to_numpy()).sum().to_numpy()
+
+
+def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
+    """p of a hypothesis before any correction; 1 where there are too few maps to tell.
+
+    Args:
+        test: what is claimed.
+        rows: episodes of the two conditions side by side, the other's columns ending in `_other`.
+    """
+    if test.kind == "difference":
+        return _difference_p(test, rows)
+    sides = {"higher": (-1.0,), "lower": (1.0,)}.get(test.direction, (-1.0, 1.0))
+    return max(_margin_p(test, rows, side) for side in sides)
+
+
+def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
+    sums = _sums(rows, test.metric)
+    if not len(sums):
+        return 1.0
+    if test.metric == "success":
+        return sign_flip_p(np.round(sums).astype(int), test.direction)
+    flipped = sign_flips(len(sums)) @ sums
+    seen = sums.sum()
+    slack = (
+        1e-9 * np.abs(sums).sum()
+    )  # sums are exact to rounding, and ways that tie with what was seen count
+    if test.direction == "higher":
+        return float(np.mean(flipped >= seen - slack))
+    if test.direction == "lower":
+        return float(np.mean(flipped <= seen + slack))
+    return float(np.mean(np.abs(flipped) >= abs(seen) - slack))
+
+
+def _margin_p(test: Hypothesis, rows: pd.DataFrame, side: float) -> float:
+    """p that the difference is beyond a margin, below −margin (side −1) or above it (side 1).
+
+    It is the level at which the end of the one-sided interval comes to lie on the margin.
+    """
+
+    def end(signed: float) -> float:
+        """Of the confidence the end on the margin's side; of a negative one the other end."""
+        _, low, high = _interval(rows, test.metric, abs(signed))
+        return side * ((high if side > 0 else low) if signed >= 0 else (low if side > 0 else high))
+
+    if np.isnan(end(0.5)):
+        return 1.0
+    if end(_MOST) < test.margin:
+        return (1 - _MOST) / 2
+    if end(-_MOST) > test.margin:
+        return 1.0
+    signed = brentq(lambda confidence: end(confidence) - test.margin, -_MOST, _MOST)
+    return (1 - float(signed)) / 2
+
+
+def _read(given: Mapping[str, Any], place: int, trials: Mapping[str, Trial]) -> list[Hypothesis]:
+    """A hypothesis of a suite: one test for each pair of conditions that it names."""
+    where = f"hypothesis {place}"
+    for key in given:
+        if key not in _KEYS:
+            raise ConfigError(
+                f"Expected keys of {where} among {', '.join(_KEYS)}, got {key!r}.{registry.hint(key, _KEYS)}"
+            )
+    for key in ("one", "other", "metric"):
+        if key not in given:
+            raise ConfigError(f"Expected {where} with `one`, `other` and `metric`, got none of `{key}`.")
+    metric = _choice(given["metric"], METRICS, "metric", where)
+    kind = _choice(given.get("kind", "difference"), KINDS, "kind", where)
+    direction = given.get("direction", "")
+    if direction != "":
+        direction = _choice(direction, DIRECTIONS, "direction", where)
+    margin = given.get("margin", 0)
+    if (
+        isinstance(margin, bool)
+        or not isinstance(margin, int | float)
+        or not np.isfinite(margin)
+        or margin < 0
+    ):
+        raise ConfigError(f"Expected `margin` of {where} to be a number ≥ 0, got {margin!r}.")
+    if (kind == "difference") != (margin == 0):
+        remedy = "Leave it out" if kind == "difference" else "Give one"
+        unit = METRICS[metric].unit
+        raise ConfigError(
+            f"Expected `margin` of {where} where its kind is non-inferiority or equivalence, above 0"
+            f"{f' in {unit}' if unit else ''}, got {margin:g} for {kind}. {remedy}."
+        )
+    if kind == "equivalence" and direction:
+        raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {direction!r}.")
+    if kind == "non-inferiority":
+        direction = direction or METRICS[metric].better
+    sides = _filter(given["one"], "one", where, trials), _filter(given["other"], "other", where, trials)
+    pairs = _pairs(*sides, where, trials)
+    if metric == "T_total":
+        _check_one_budget(pairs, where, trials)
+    named = _names(pairs, sides, trials)
+    return [
+        Hypothesis(
+            one=one,
+            other=other,
+            names=names,
+            metric=metric,
+            kind=kind,
+            direction=direction,
+            margin=float(margin),
+        )
+        for (one, other), names in zip(pairs, named, strict=True)
+    ]
+
+
+def _choice(value: Any, known: Sequence[str] | Mapping[str, Any], name: str, where: str) -> str:
+    if value not in list(known):
+        raise ConfigError(
+            f"Expected `{name}` of {where} among {', '.join(known)}, got {value!r}."
+            f"{registry.hint(str(value), list(known))}"
+        )
+    return str(value)
+
+
+def _filter(given: Any, side: str, where: str, trials: Mapping[str, Trial]) -> dict[str, str]:
+    """Labels by which a hypothesis names conditions."""
+    if not isinstance(given, Mapping) or not given:
+        raise ConfigError(
+            f"Expected `{side}` of {where} to name a condition by labels, such as {{planner: mppi, risk: mean}}, got "
+            f"{given!r}."
+        )
+    left = list(trials.values())
+    for name, value in given.items():
+        if name not in LABELS:
+            raise ConfigError(
+                f"Expected labels in `{side}` of {where} among {', '.join(LABELS)}, got {name!r}."
+                f"{registry.hint(str(name), LABELS)}"
+            )
+        known = list(dict.fromkeys(trial.labels[name] for trial in left))
+        if str(value) not in known:
+            raise ConfigError(
+                f"Expected `{name}` of `{side}` of {where} among {', '.join(known)}, got {value!r}."
+                f"{registry.hint(str(value), known)}"
+            )
+        left = [trial for trial in left if trial.labels[name] == str(value)]
+    return {name: str(value) for name, value in given.items()}
+
+
+def _pairs(
+    one: Mapping[str, str], other: Mapping[str, str], where: str, trials: Mapping[str, Trial]
+) -> list[tuple[str, str]]:
+    """Conditions that are named, each with that which is the same in all labels that neither side names."""
+    free = [name for name in LABELS if name not in one and name not in other]
+    sides = [
+        [i for i, trial in trials.items() if all(trial.labels[n] == v for n, v in side.items())]
+        for side in (one, other)
+    ]
+    pairs = []
+    for place, (own, others) in enumerate((sides, sides[::-1])):
+        for first in own:
+            partners = [i for i in others if i != first and _agree(trials[first], trials[i], free)]
+            if len(partners) > 1:
+                name = next(n for n in LABELS if len({trials[i].labels[n] for i in partners}) > 1)
+                raise ConfigError(
+                    f"Expected {where} to name one condition to compare with another, got {len(partners)} that differ "
+                    f"in {name} ({', '.join(trials[i].labels[name] for i in partners)}). Name the {name} in "
+                    f"`{('other', 'one')[place]}`."
+                )
+            pairs += [(first, i) for i in partners] if place == 0 else []
+    if not pairs:
+        raise ConfigError(
+            f"Expected {where} to name two conditions that are the same in {', '.join(free) or 'all else'}, got "
+            "none. Name in each what the other names."
+        )
+    for first, second in pairs:
+        a, b = trials[first], trials[second]
+        for name, of_a, of_b in (
+            ("data", a.data, b.data), ("scenario", a.scenario, b.scenario), ("world", a.world, b.world)
+        ):  # fmt: skip
+            if of_a != of_b:
+                raise ConfigError(
+                    f"Expected {where} to compare conditions on the same maps under the same λ, got two of another "
+                    f"{name}. Name one {name} in both."
+                )
+    return pairs
+
+
+def _agree(one: Trial, other: Trial, free: Sequence[str]) -> bool:
+    """Whether two conditions have the same labels; one that is not used goes with any."""
+    return all(
+        one.labels[name] == other.labels[name] or NOT_USED in (one.labels[name], other.labels[name])
+        for name in free
+    )
+
+
+def _check_one_budget(pairs: Sequence[tuple[str, str]], where: str, trials: Mapping[str, Trial]) -> None:
+    for first, second in pairs:
+        one, other = trials[first], trials[second]
+        if one.robot != other.robot and "time_budget_ratio" in one.world.to_dict():
+            raise ConfigError(
+                f"Expected {where} to compare T_total of conditions with one time budget, got robots whose T differs, "
+                "which is what their failures count as. Compare their success, or give the world `time_budget_s`."
+            )
+
+
+def _names(
+    pairs: Sequence[tuple[str, str]], sides: Sequence[Mapping[str, str]], trials: Mapping[str, Trial]
+) -> list[tuple[str, str]]:
+    """What text calls the conditions: by the labels that name them, and by what else differs between the pairs."""
+    several = {
+        name
+        for name in LABELS
+        if not any(name in side for side in sides)
+        and len({trials[i].labels[name] for pair in pairs for i in pair} - {NOT_USED}) > 1
+    }
+
+    def name_of(trial: Trial, side: Mapping[str, str]) -> str:
+        words = [trial.labels[name] for name in LABELS if name in side or name in several]
+        return ", ".join(word for word in words if word != NOT_USED)
+
+    one, other = sides
+    return [(name_of(trials[first], one), name_of(trials[second], other)) for first, second in pairs]
