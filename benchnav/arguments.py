@@ -141,8 +141,9 @@ def explain(message: str, words: Sequence[str], known: Known) -> str:
         given = [flag.value for flag in _read(words, known)[0] if flag.name == name]
         typed = bool(given)
         kind = known.kinds[name]
-        # What the user typed reads better than what the parser made of it.
+        # What the user typed reads better than what the parser made of it, without the brackets that `_read` adds.
         got = given[-1] if typed else (value[1] or value[2]) if value else message
+        got = got if not typed or any(got in word for word in words) else got[1:-1]
         where = f"--{name}" if typed else f"`{name}`{_in_files(words)}"
         near = hint(got, [member for member in _members(kind) if isinstance(member, str)])
         return f"Expected {where} as {in_words(kind)}, got {got!r}.{near}"

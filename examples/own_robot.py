@@ -19,19 +19,13 @@ class Tracked(Unicycle):
 
     def __call__(self, state, action, traversability):
         turning = traversability.clamp(min=0.05) ** (self.turn_loss - 1)
-        slowed = (
-            action * action.new_tensor([1.0, 0.0])
-            + action * action.new_tensor([0.0, 1.0]) * turning[..., None]
-        )
+        slowed = action * turning[..., None] ** action.new_tensor([0.0, 1.0])  # (v, ω): ω alone
         return super().__call__(state, slowed, traversability)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Energy:
-    """Distance to the goal, and what the tracks waste where they slip.
-
-    Planners that search paths, such as A*, minimise `path_cost`; without it they would take the shortest path.
-    """
+    """Distance to the goal, and what the tracks waste where they slip; A* minimises its `path_cost`."""
 
     waste: float = 2.0
 
@@ -42,5 +36,4 @@ class Energy:
         return distance(state, target)
 
     def path_cost(self, traversability, grade):
-        # Over a metre of ground the tracks run for 1 / λ metres.
         return 1 + self.waste * (1 / traversability - 1)

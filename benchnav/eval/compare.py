@@ -29,8 +29,8 @@ from benchnav.eval.stats.pairing import (
     check_one_value_each,
     find_pairs,
 )
-from benchnav.eval.stats.summary import LABELS, time_budgets
-from benchnav.eval.trial import NOT_USED
+from benchnav.eval.stats.summary import time_budgets
+from benchnav.eval.trial import LABELS, NOT_USED
 from benchnav.files import write_text
 
 _CAPTION = (

@@ -28,6 +28,8 @@ from benchnav.planning.world.world import World
 from benchnav.registry import Part
 
 PART_KINDS = ("model", "risk", "planner", "robot", "objective")
+# Columns of `Trial.labels`, in the order of tables.
+LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
 NOT_USED = "–"
 
 # What the mappings of `trials` may hold, with the other way to write it.

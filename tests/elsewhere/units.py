@@ -35,7 +35,7 @@ from tests.elsewhere.device import elsewhere, waits
 from tests.test_mixture import random_mixture
 
 SMALL = {"samples": 20, "horizon_s": 0.4}
-DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon": 4}}}
+DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon_s": 0.4}}}
 CL_RRT = {"part": "cl_rrt", "options": {"expansions": 50, "edge_time_s": 3.0}}
 MPPI = {"part": "mppi", "options": SMALL}
 GUIDED = {"part": "astar_mppi", "label": "guided", "options": {"mppi": SMALL}}

@@ -115,6 +115,8 @@ class Still(Faulty):
 class Timed(Faulty):
     """Takes 80 ms for its first step, then 4 ms and for every tenth 40 ms; notes how many robots it plans for."""
 
+    writes = ("log",)
+
     def __init__(self, log: str) -> None:
         super().__init__(after_s=1e9)
         self.log, self.calls = Path(log), 0

@@ -68,7 +68,7 @@ def test_the_gain_has_the_sign_of_the_best(tmp_path: Path, monkeypatch, capsys) 
 
 def test_each_variant_has_a_row(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
-    other = episodes.assign(model="oracle", trial=episodes["trial"] + "o", success=True)
+    other = episodes.assign(model="oracle", trial=episodes["trial"] + "o", success=True, outcome="success")
     lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", pd.concat([episodes, other])))
     assert [line.split(" |")[0] for line in lines[3:5]] == ["| paper-v1", "| oracle"]
     assert "| 100.0 | 50.0 |" in lines[3]
@@ -78,8 +78,11 @@ def test_each_variant_has_a_row(tmp_path: Path, monkeypatch, capsys) -> None:  #
 def test_variants_are_told_apart_by_the_whole_label(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
     worlds = [
-        episodes.assign(world=label, trial=episodes["trial"] + label, success=won)
-        for label, won in (("stakes immobile=0.05/2s", True), ("stakes immobile=0.2/2s", False))
+        episodes.assign(world=label, trial=episodes["trial"] + label, success=won, outcome=outcome)
+        for label, won, outcome in (
+            ("stakes immobile=0.05/2s", True, "success"),
+            ("stakes immobile=0.2/2s", False, "timeout"),
+        )
     ]
     lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", pd.concat(worlds)))
     assert lines[3].startswith("| stakes immobile=0.05/2s | 100.0 | 100.0 |")

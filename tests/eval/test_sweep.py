@@ -32,7 +32,7 @@ def test_several_lists_are_a_product_with_labels_of_their_own() -> None:
     }
     assert parts("planner", given) == [
         (
-            f"dwa lookahead_m={lookahead} dwa.horizon_s={horizon}",
+            f"dwa lookahead_m={lookahead:g} dwa.horizon_s={horizon:g}",
             {"lookahead_m": lookahead, "dwa": {"horizon_s": horizon, "speeds": 5}},
         )
         for lookahead in (2.0, 4.0)

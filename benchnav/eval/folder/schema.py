@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.stats.summary import LABELS
+from benchnav.eval.trial import LABELS
 from benchnav.planning.world.outcome import Outcome
 
 SEAL = "seal"

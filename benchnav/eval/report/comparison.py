@@ -9,8 +9,7 @@ import pandas as pd
 from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
-from benchnav.eval.stats.summary import LABELS
-from benchnav.eval.trial import NOT_USED
+from benchnav.eval.trial import LABELS, NOT_USED
 
 _LABELS = (*LABELS, "run")
 

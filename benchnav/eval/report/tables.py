@@ -10,8 +10,7 @@ import pandas as pd
 from benchnav.eval.stats.best import BLOCK, TOLD, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
-from benchnav.eval.stats.summary import LABELS
-from benchnav.eval.trial import NOT_USED
+from benchnav.eval.trial import LABELS, NOT_USED
 from benchnav.planning.world.outcome import FAILURES
 
 # What `follows` is where a planner follows the user's objective alone.

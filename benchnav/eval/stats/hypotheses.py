@@ -29,8 +29,8 @@ from benchnav.eval.stats.difference import (
     sign_flips,
     success_interval,
 )
-from benchnav.eval.stats.summary import LABELS, time_budgets, units_of
-from benchnav.eval.trial import NOT_USED, Trial
+from benchnav.eval.stats.summary import time_budgets, units_of
+from benchnav.eval.trial import LABELS, NOT_USED, Trial
 
 KINDS = ("difference", "non-inferiority", "equivalence")
 DIRECTIONS = ("higher", "lower")

@@ -9,8 +9,7 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.eval.stats.summary import LABELS
-from benchnav.eval.trial import NOT_USED
+from benchnav.eval.trial import LABELS, NOT_USED
 
 # By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
 _KEYS: Mapping[str, tuple[str, ...]] = {

@@ -13,9 +13,8 @@ import pandas as pd
 from scipy.stats import norm
 
 from benchnav.eval.stats.difference import by_map, total_time_interval
+from benchnav.eval.trial import LABELS
 from benchnav.planning.world.outcome import FAILURES
-
-LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
 
 # Of each column its name in the summary, which the statistic parts, and its unit.
 _QUANTITIES = {

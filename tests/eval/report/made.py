@@ -10,7 +10,8 @@ import torch
 from benchnav.eval.report.recorded.drawn_plan import drawn_plan
 from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.stats.best import against_best, told_the_truth
-from benchnav.eval.stats.summary import LABELS, summarise
+from benchnav.eval.stats.summary import summarise
+from benchnav.eval.trial import LABELS
 from benchnav.grid import Grid
 
 PAPER = {

@@ -6,7 +6,7 @@ import pytest
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import failures_in_words, result_table
-from benchnav.eval.stats.summary import LABELS
+from benchnav.eval.trial import LABELS
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}

@@ -105,6 +105,8 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_instanc
     }
     met: Counter[tuple[Any, ...]] = Counter()
     for note in notes:
+        if len(note["goal_m"]) == 1:  # a robot alone, for its latency
+            continue
         (block,) = (b for b in BLOCKS if len(b) == len(note["goal_m"]))
         rows = list(block)
         np.testing.assert_allclose(note["start"][:, :2], places["start_m"][rows])

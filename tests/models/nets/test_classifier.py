@@ -1,4 +1,5 @@
 from types import SimpleNamespace
+from typing import Any
 
 import lightning
 import pytest
@@ -219,8 +220,13 @@ def test_training_stops_when_validation_no_longer_gains(
 
 
 def test_a_loss_that_is_no_number_is_one_error() -> None:
+    callback, module = KeepBest(), torch.nn.Linear(1, 1)
+    trainer: Any = SimpleNamespace(callback_metrics={"valid_loss": torch.tensor(torch.nan)}, current_epoch=0)
+    with pytest.raises(ConfigError, match="validate more often"):
+        callback.on_fit_end(trainer, module)  # type: ignore[arg-type]
+    callback.on_validation_epoch_end(trainer, module)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="learning_rate"):
-        KeepBest().on_fit_end(SimpleNamespace(), torch.nn.Linear(1, 1))  # type: ignore[arg-type]
+        callback.on_fit_end(trainer, module)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("full_resolution", "learns"), [(True, True), (False, False)])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchnav import registry
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
@@ -128,7 +129,8 @@ def test_the_command_writes_and_draws_look_alikes(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("benchnav.models.predictor.load_model", lambda source: ColourModel())
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("model", "colours", ColourModel)
     evaluate_command("colours", str(dataset.path), out=str(tmp_path / "q"), maps=1)
     assert "twins=1" in capfd.readouterr().out
     assert (tmp_path / "q" / "figures" / "confusion.png").is_file()
