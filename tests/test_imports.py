@@ -18,7 +18,7 @@ MODELS = tuple(
 )
 # Of reports, how an episode is recorded and the map that a figure shows is kept.
 RECORDED = ("eval.report.recorded", "eval.report.playback.files", "eval.report.charts.driven")
-VALUES_OF_EVAL = ("eval.suite", "eval.trial", "eval.unit", "eval.keep")
+VALUES_OF_EVAL = ("eval.suite", "eval.trial", "eval.unit", "eval.keep", "eval.hypotheses")
 
 # What the modules of a drawer may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -43,7 +43,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval": ("eval", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/run": ("eval.run", "eval.folder", *RECORDED, *VALUES_OF_EVAL, "models", "planning", "datagen"),
-    "eval/stats": ("eval.stats", "eval.trial", "planning"),
+    "eval/stats": ("eval.stats", "eval.trial", "eval.hypotheses", "planning"),
     "eval/report": (
         *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
         "planning",

@@ -10,8 +10,8 @@ from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.hypotheses import fix_hypotheses
 from benchnav.eval.run.check_world import check_budgets, check_known_ground, check_luck
-from benchnav.eval.stats.hypotheses import fix_hypotheses
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import PART_KINDS, Trial, trials_of
 from benchnav.eval.unit import Extent

@@ -6,8 +6,9 @@ import pytest
 from scipy.stats import binomtest, ttest_1samp
 
 from benchnav.errors import ConfigError
+from benchnav.eval.hypotheses import Hypothesis, fix_hypotheses
 from benchnav.eval.stats.difference import success_interval
-from benchnav.eval.stats.hypotheses import Hypothesis, fix_hypotheses, p_of
+from benchnav.eval.stats.hypotheses import p_of
 from benchnav.eval.stats.hypotheses import test_hypotheses as run_tests
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import Trial, trials_of

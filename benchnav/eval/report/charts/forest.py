@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from benchnav.eval.hypotheses import METRICS
 from benchnav.eval.report.figure_style import OKABE_ITO, TWO_COLUMNS_IN
 from benchnav.eval.report.findings import p_in_words
-from benchnav.eval.stats.hypotheses import METRICS
 
 _ROW_IN, _PANEL_IN = 0.3, 0.55
 _COLOUR, _MARGIN = OKABE_ITO[0], "0.88"

@@ -150,9 +150,15 @@ def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Two of shape [B, 2].
     """
-    rates = action_limits(problem.robot) or (math.inf, math.inf)
-    reach = velocity.new_tensor(rates) * problem.dt_s
-    return (velocity - reach).clamp(*problem.action_bounds), (velocity + reach).clamp(*problem.action_bounds)
+    rates, bounds = action_limits(problem.robot), problem.action_bounds
+    if rates is None:
+        return bounds[0].expand_as(velocity), bounds[1].expand_as(velocity)
+    # Numbers, for a tensor made of them would be sent to the device at every step.
+    reach = [rate * problem.dt_s for rate in rates]
+    ends = [
+        torch.stack([velocity[:, axis] + sign * reach[axis] for axis in range(2)], dim=1) for sign in (-1, 1)
+    ]
+    return ends[0].clamp(*bounds), ends[1].clamp(*bounds)
 
 
 def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
