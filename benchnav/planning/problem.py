@@ -198,7 +198,7 @@ def motion_traversability(ground: Tensor, slowest: float) -> Tensor:
     return torch.where(ground == 0, 0, ground.abs().clamp(min=slowest))
 
 
-def _predicted(ground: Tensor) -> Tensor:
+def predicted_traversability(ground: Tensor) -> Tensor:
     """λ̂ as the risk setting gives it, 0 off the map, from values of `Problem.padded_ground`."""
     magnitude = ground.abs()
     return torch.where(magnitude <= _ZERO, 0, magnitude)
@@ -206,12 +206,12 @@ def _predicted(ground: Tensor) -> Tensor:
 
 def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
     """J of a step and the price of ground that is not free; see `Problem.stage_cost`."""
-    return objective.stage(state, action, _predicted(ground), target) + PRICE * (ground <= 0)
+    return objective.stage(state, action, predicted_traversability(ground), target) + PRICE * (ground <= 0)
 
 
 def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: Tensor) -> Tensor:
     """J of the last state and the price of ground that is not free; see `Problem.terminal_cost`."""
-    return objective.terminal(state, _predicted(ground), target) + PRICE * (ground <= 0)
+    return objective.terminal(state, predicted_traversability(ground), target) + PRICE * (ground <= 0)
 
 
 def pose_problem(

@@ -23,7 +23,13 @@ from benchnav.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem, motion_traversability, stage_cost, with_tensors
+from benchnav.planning.problem import (
+    Problem,
+    motion_traversability,
+    predicted_traversability,
+    stage_cost,
+    with_tensors,
+)
 from benchnav.planning.robots import Robot, action_limits, component_wise
 
 # A chunk of the horizon compiles in seconds.
@@ -233,7 +239,7 @@ def standing_cost(problem: Problem, state: Tensor, target_m: Tensor, steps: int)
         Its size, for a J may be negative, shape [B].
     """
     standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
-    traversability = problem.ground_at(state).abs()
+    traversability = predicted_traversability(problem.ground_at(state))
     stage = problem.objective.stage(state, standing, traversability, target_m)
     return (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
 
