@@ -118,7 +118,7 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
 ) -> None:
     monkeypatch.chdir(site)
     dataset = TerrainDataset("real.h5")
-    assert dataset.truth == "unknown"
+    assert dataset.truth_of("test/site") == "unknown"
     metrics = load_checkpoint("mine").part("gp").metrics
     assert set(metrics) == {"valid_nll"}
     assert metrics["valid_nll"] < -1
@@ -135,11 +135,11 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
         said, _ = capfd.readouterr()
         page = (tmp_path / model / "quality.md").read_text()
         for text in (said, page):
-            assert "RMSE E[λ] is –, since the true distribution of λ is unknown" in text
+            assert "RMSE E[λ] is – on test/site, since the true distribution of λ is unknown" in text
             assert "are against measured λ" in text
             assert ("is the class table of the recipe, not the truth" in text) == (model == "oracle")
         found = json.loads((tmp_path / model / "quality.json").read_text())
-        assert found["truth"] == "unknown"
+        assert found["truth"] == {"test/site": "unknown"}
         assert found["splits"]["test/site"]["rmse_expected"] is None
         headings, _, row = page.splitlines()[2:5]
         columns = [cell.strip() for cell in headings.split("|")]
@@ -170,5 +170,18 @@ def test_lambda_that_the_class_table_drew_is_not_called_measured(
     capfd.readouterr()
     assert call(monkeypatch, train, "evaluate", "oracle", "--data", "real.h5") == 0
     said = capfd.readouterr().out
-    if TerrainDataset("real.h5").truth == "unknown":
-        assert "drawn by the class table, not measured" in said
+    assert "drawn by the class table, not measured" in said
+    # Beside such ground the truth of what a recipe made is as well known as before.
+    made = ("create", "tiny-v1", "--splits", "[test/std]", "--first", 1, "--out", "made.h5")
+    assert call(monkeypatch, datagen, *made) == 0
+    assert call(monkeypatch, datagen, "merge", "made.h5", "real.h5", "--out", "mixed.h5") == 0
+    capfd.readouterr()
+    out = ("--out", tmp_path / "std", "--maps", 1)
+    assert (
+        call(monkeypatch, train, "evaluate", "oracle", "--data", "mixed.h5", "--splits", "[test/std]", *out)
+        == 0
+    )
+    assert "unknown" not in capfd.readouterr().out
+    found = json.loads((tmp_path / "std" / "quality.json").read_text())
+    assert found["truth"] == {"test/std": "generated"}
+    assert found["splits"]["test/std"]["rmse_expected"] == 0

@@ -233,7 +233,8 @@ def _joined(one: Compared, other: Compared) -> Compared:
         )
     rows = pd.concat([one.episodes, other.episodes]).drop_duplicates(DRAW, ignore_index=True)
     longer = max((one.maps, other.maps), key=len)
-    return replace(one, episodes=rows, maps=longer, code={**one.code, **other.code})
+    labels = {**one.labels, "run": NOT_USED}
+    return replace(one, labels=labels, episodes=rows, maps=longer, code={**one.code, **other.code})
 
 
 def _words(trial: Compared, names: Iterable[str] = LABELS[1:]) -> str:

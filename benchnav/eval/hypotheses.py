@@ -87,6 +87,12 @@ class Hypothesis:
         return f"{metric.name} of {one} differs from that of {other}"
 
 
+def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
+    """Digest of hypotheses as `run.json` holds them, 16 hexadecimal digits."""
+    text = json.dumps(tests, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def fix_hypotheses(
     given: Sequence[Mapping[str, Any]], trials: Mapping[str, Trial], episodes: Mapping[str, int]
 ) -> dict[str, Any]:
@@ -112,10 +118,9 @@ def fix_hypotheses(
         if plain.count(test) > 1:
             raise ConfigError(f"Expected hypotheses that differ, got twice: {test['claim']}.")
     named = dict.fromkeys(trial for test in tests for trial in (test.one, test.other))
-    text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
     return {
         "tests": plain,
-        "digest": hashlib.sha256(text.encode()).hexdigest()[:16],
+        "digest": digest_of_tests(plain),
         "episodes": {trial: episodes[trial] for trial in named},
     }
 
@@ -126,7 +131,7 @@ def _read(given: Mapping[str, Any], place: int, trials: Mapping[str, Trial]) -> 
     for key in given:
         if key not in _KEYS:
             raise ConfigError(
-                f"Expected keys of {where} among {', '.join(_KEYS)}, got {key!r}.{registry.hint(key, _KEYS)}"
+                f"Expected keys of {where} among {', '.join(_KEYS)}, got {key!r}.{registry.hint(str(key), _KEYS)}"
             )
     for key in ("one", "other", "metric"):
         if key not in given:

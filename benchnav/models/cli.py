@@ -199,9 +199,11 @@ def _options(
     in_memory: bool,
 ) -> "tuple[Config, FitOptions]":
     """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
+    from benchnav.files import output_path
     from benchnav.models.checkpoint import training_folder
     from benchnav.models.training.fit import FitOptions
 
+    output_path(out)  # refuses addresses
     settings = dict(trainer or {})
     if "max_epochs" in settings:
         config = replace(config, max_epochs=settings.pop("max_epochs"))

@@ -11,7 +11,7 @@ shapes: *B any leading dimensions, S state and A action dimensions.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -77,6 +77,8 @@ class TravelTime:
         robot: gives time step and top speed.
         goal_radius_m: a state this near to the target has arrived.
     """
+
+    gone: ClassVar = {"arrival_m": "It now takes the task's `goal_radius_m`."}
 
     robot: Robot
     goal_radius_m: float

@@ -138,6 +138,10 @@ def test_a_checkpoint_of_other_classes_is_refused_and_both_are_named(
             "Expected --classifier.decoder_channels as a list, each a whole number, got 'many'.",
         ),
         (["all", "--data", "DATA", "--out", "x/y", "--members", "2", "--seed", str(2**63 - 1)], "`seed`"),
+        *(
+            ([command, "--data", "DATA", "--out", "s3://bucket/model"], "place on this machine")
+            for command in ("all", "classifier", "gp", "mdn")
+        ),
     ],
 )
 def test_bad_input_is_refused_in_one_line(

@@ -25,7 +25,7 @@ from benchnav.errors import ConfigError, DatasetError
 _SLACK = 1e-3  # of a cell that an extent may fall short by
 _KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
 _MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
-_CLIFF = 5.67  # of 80°, metres a metre: no ground has all its cells so far from those of height 0
+_CLIFF = 5.67  # of 80°, metres a metre: steeper than natural ground beside cells of height 0
 _METRES = ("m", "metre", "meter", "metres", "meters")
 
 
@@ -107,9 +107,9 @@ class Survey:
             heights = np.abs(framed.get("elevation_m min", framed["elevation_m"])[place])
             least = np.min(heights, initial=np.inf, where=heights > 0)
             if (heights == 0).any() and self.cliff_m < least < np.inf:
-                raise self._out_of_range(
-                    "elevation_m", "elevations of `dem` without a gap next to 0", low, high, 0
-                )
+                expected = "elevations of `dem` without a gap next to 0"
+                other = "Where 0 is a height, declare a value that does not occur, such as -9999."
+                raise self._out_of_range("elevation_m", expected, low, high, 0, other)
         (north, east), (height, width) = self.tiling.stride, self.tiling.shape
         ground[:, ~self.known[0][run.row * north :][: height + 2]] = np.nan
         for place, column in enumerate(run.columns):
@@ -138,11 +138,13 @@ class Survey:
         least = np.min(low, initial=np.inf, where=~np.isnan(low))
         return float(least), float(np.max(high, initial=-np.inf, where=~np.isnan(high)))
 
-    def _out_of_range(self, name: str, expected: str, low: float, high: float, odd: float) -> DatasetError:
+    def _out_of_range(
+        self, name: str, expected: str, low: float, high: float, odd: float, other: str = ""
+    ) -> DatasetError:
         raster = self.layers[name].raster.name
         return DatasetError(
             f"Expected {expected}, got {low:g} to {high:g} in {raster}. If {odd:.9g} stands for missing, "
-            f"declare it: rio edit-info --nodata {odd:.9g} {raster}"
+            f"declare it: rio edit-info --nodata {odd:.9g} {raster}{other and f'. {other}'}"
         )
 
     def _classes(self, values: np.ndarray) -> np.ndarray:

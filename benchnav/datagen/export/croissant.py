@@ -15,7 +15,7 @@ import yaml
 
 from benchnav.datagen.export.parquet import FOLDER, MAP
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict, shipped_recipes
 from benchnav.errors import ConfigError
 
 METADATA = "croissant.json"
@@ -98,12 +98,16 @@ def is_ours(dataset: TerrainDataset, splits: Sequence[str]) -> bool:
         return False
     made = {part["recipe"] for part in parts}
     recipes = [recipe_from_dict(dataset.manifest["recipes"][number], f"in {dataset.path}") for number in made]
-    # How many maps there are of a split, and which splits, may differ: `create` has options for that.
-    return all(
-        recipe.id in shipped_recipes()
-        and replace(recipe, splits=load_recipe(recipe.id).splits) == load_recipe(recipe.id)
-        for recipe in recipes
-    )
+    return all(_is_shipped(recipe) for recipe in recipes)
+
+
+def _is_shipped(recipe: Recipe) -> bool:
+    """Whether a recipe is a shipped one but for its seed and its splits, for which `create` has options."""
+    shipped_id = recipe.id.removesuffix(f"-seed{recipe.seed}")
+    if shipped_id not in shipped_recipes():
+        return False
+    shipped = load_recipe(shipped_id)
+    return replace(recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits) == shipped
 
 
 def describe(dataset: TerrainDataset, splits: Sequence[str]) -> str:

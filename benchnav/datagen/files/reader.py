@@ -93,12 +93,6 @@ class TerrainDataset:
         """Names of `fields`."""
         return tuple(self.fields)
 
-    @property
-    def truth(self) -> Literal["generated", "unknown"]:
-        """Whether the distribution of λ in each cell is known, `truth_of` all splits."""
-        known = all(self.truth_of(split) == "generated" for split in self.splits)
-        return "generated" if known else "unknown"
-
     def truth_of(self, split: str) -> Literal["generated", "unknown"]:
         """Whether the distribution of λ in each cell of a split is known.
 

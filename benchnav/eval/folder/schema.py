@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.eval.hypotheses import DIRECTIONS, KINDS, METRICS, digest_of_tests
 from benchnav.eval.trial import LABELS
 from benchnav.planning.world.outcome import Outcome
 
@@ -158,6 +159,25 @@ def check_about(about: Any, version: int) -> None:
             raise DamageError(f"trial {trial_id} has seeds that are not those of its draws")
         if version > 2:
             _check_value(trial_id, entry, about["datasets"])
+    if "hypotheses" in about:
+        _check_hypotheses(about["hypotheses"], about["trials"])
+
+
+def _check_hypotheses(about: Mapping[str, Any], trials: Mapping[str, Any]) -> None:
+    """Refuses hypotheses that cannot be tested, or that their digest is not of."""
+    for test in about["tests"]:
+        known = {
+            "metric": METRICS,
+            "kind": KINDS,
+            "direction": ("", *DIRECTIONS),
+            "one": trials,
+            "other": trials,
+        }
+        for name, values in known.items():
+            if test[name] not in values:
+                raise DamageError(f"a hypothesis has {name} {test[name]!r}, which there is none of")
+    if digest_of_tests(about["tests"]) != about["digest"]:
+        raise DamageError("its hypotheses are not those of their digest")
 
 
 def _check_value(trial_id: str, entry: Mapping[str, Any], datasets: Mapping[str, Any]) -> None:

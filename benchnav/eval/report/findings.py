@@ -60,9 +60,11 @@ def _sentences(
     rivals = rows[competing(rows)]
     best = rivals[rivals["trial"] == rivals["best"].iloc[0]].to_dict("records")[0]
     others = rivals[rivals["trial"] != best["trial"]].sort_values("best_difference", kind="stable")
+    shared = int((others["success_rate"] == best["success_rate"]).sum())
+    also = f" and {shared} more" if shared else ""
     yield (
-        f"The highest success rate is that of {names[best['trial']]}: {_rate(best)} of its episodes reached the goal "
-        f"(95 % interval {100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
+        f"The highest success rate is that of {names[best['trial']]}{also}: {_rate(best)} of its episodes "
+        f"reached the goal (95 % interval {100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
     )
     common = int(best["best_episodes"])
     if not others.empty and (rivals["n_episodes"] > common).any():
@@ -97,7 +99,8 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
         maps = f"{int(best['best_maps'])} {unit}s"
         power = f"; {maps} detect differences of {100 * shown:.0f} points or more with 80 % power"
         yield (
-            f"No setting is significantly worse ({test}, p ≥ {max(np.floor(100 * p) / 100, ALPHA):g}"
+            f"No setting is significantly worse ({test}, p {'=' if p >= 1 else '≥'} "
+            f"{max(np.floor(100 * p) / 100, ALPHA):g}"
             f"{power if shown <= 1 else ''}): the run does not say which is best."
         )
         return

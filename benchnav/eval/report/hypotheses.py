@@ -96,8 +96,9 @@ def _verdict(row: Mapping[Any, Any]) -> str:
                 else f"not significantly {row['direction']}"
             )
         return f"significantly {row['direction'] or 'different'}"
-    name = {"equivalence": "equivalent", "non-inferiority": "not inferior"}[row["kind"]]
-    return name if row["supported"] else f"not shown to be {name}"
+    if not row["supported"]:
+        return f"{row['kind']} not shown"
+    return {"equivalence": "equivalent", "non-inferiority": "not inferior"}[row["kind"]]
 
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:

@@ -99,7 +99,7 @@ def evaluate(
         "device": place.type,
         "package_version": __version__,
         "nearest_colour_accuracy": by_colour,
-        "truth": dataset.truth,
+        "truth": {split: dataset.truth_of(split) for split in chosen},
         "notes": notes,
     }
     report = quality_json(about, qualities)
@@ -128,8 +128,9 @@ def evaluate(
 def _check_targets(out: str, json: str, overwrite: bool) -> None:
     """Refuses what cannot be written to before any work is done."""
     from benchnav.errors import ConfigError
+    from benchnav.files import output_path
 
-    target, folder = Path(json), Path(out)
+    target, folder = output_path(json), output_path(out)
     if json and (not target.parent.is_dir() or target.is_dir()):
         raise ConfigError(
             f"Expected `json` to be a file in a folder that exists, got {json}. Make {target.parent} first."
@@ -187,20 +188,22 @@ def _without_truth(model: "AnyModel", dataset: "TerrainDataset", splits: "Sequen
     """Says what cannot be measured where the truth is unknown, and what is measured in its place."""
     from benchnav.models.predictor import Ideal, Oracle
 
-    if dataset.truth == "generated":
+    unknown = [split for split in splits if dataset.truth_of(split) == "unknown"]
+    if not unknown:
         return []
-    sources = [part.get("source", {}) for split in splits for part in dataset.splits[split]["parts"]]
+    sources = [part.get("source", {}) for split in unknown for part in dataset.splits[split]["parts"]]
     measured = all(source.get("traversability") for source in sources)
     observed = (
         "measured λ" if measured else "λ that was, at least in part, drawn by the class table, not measured"
     )
     lines = [
-        "RMSE E[λ] is –, since the true distribution of λ is unknown on imported ground; RMSE λ, NLL, CRPS, "
-        f"“in 90 %” and “< VaR” are against {observed}"
+        f"RMSE E[λ] is – on {', '.join(unknown)}, since the true distribution of λ is unknown on imported ground; "
+        f"RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” there are against {observed}"
     ]
     if isinstance(model, Oracle | Ideal):
         lines.append(
-            "warning: what this model says is the class table of the recipe, not the truth of this ground"
+            f"warning: what this model says of {', '.join(unknown)} is the class table of the recipe, not the truth "
+            "of this ground"
         )
     return lines
 
@@ -268,7 +271,8 @@ def _figures(
             [sum(counts) for counts in zip(*rows, strict=True)]
             for rows in zip(*(quality.slope_cells for quality in by_class.values()), strict=True)
         ]
-        yield "latent", partial(figures.latent_figure, table, classes, cells, dataset.truth == "generated")
+        known = all(dataset.truth_of(split) == "generated" for split in qualities)
+        yield "latent", partial(figures.latent_figure, table, classes, cells, known)
     if maps:
         sheets = [
             map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))

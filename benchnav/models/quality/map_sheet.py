@@ -86,7 +86,7 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
     terrain = dataset.terrain(split, indices)
     with torch.inference_mode():
         mixture = predict(model, terrain)
-        known = dataset.truth == "generated"
+        known = dataset.truth_of(split) == "generated"
         true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if isinstance(model, ClassModel):

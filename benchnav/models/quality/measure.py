@@ -189,8 +189,9 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    alike, truth = twins(dataset.recipe.classes), dataset.truth == "generated"
+    alike = twins(dataset.recipe.classes)
     for split in choose_splits(model, dataset, splits):
+        truth = dataset.truth_of(split) == "generated"
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
         chunks = (terrain.to(device) for terrain in dataset.terrain_chunks(split))
         yield split, measure(model, chunks, generator, alike, truth)

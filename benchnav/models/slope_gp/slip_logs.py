@@ -101,7 +101,7 @@ def read_slip_logs(path: str | Path) -> SlipLogs:
     if 0 < steepest <= np.pi / 2 and observed.sum() >= _ENOUGH:
         raise DatasetError(
             f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {observed.sum()} rows, as of "
-            "radians. Multiply radians by 57.2958; where the ground is that level, write 0."
+            "radians. Multiply radians by 57.2958. Ground that level in degrees looks the same: log steeper too."
         )
     names, by_id, ids = _read_classes(rows["class"], observed, path)
     slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())

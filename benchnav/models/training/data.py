@@ -167,8 +167,9 @@ class MapSampler(Sampler[MapKey]):
 class MapData(lightning.LightningDataModule):
     """The maps of the splits `train` and `valid`.
 
-    Training maps are turned and mirrored at random, all fields alike. That stays physical: the light
-    comes from a random direction. Where processes train together, each takes its part of every batch.
+    Training maps are turned and mirrored at random, all fields alike. Of synthetic maps that stays
+    physical: the light comes from a random direction. A photo's light comes from one. Where processes train
+    together, each takes its part of every batch.
 
     Args:
         dataset: where they are.

@@ -209,23 +209,22 @@ def check_network(
             f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
             f"got {every}."
         )
-    sizes = {}
     for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
         maps, limit = dataset.map_count(split), getattr(trainer, name)
         batches = -(-maps // config.batch_size)
-        sizes[split] = maps // batches
         if (batches * limit if isinstance(limit, float) else limit) < 1:
             raise ConfigError(
                 f"Expected `trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
                 "Leave it out to take all."
             )
+    together = min(2, dataset.map_count(TRAIN) // -(-dataset.map_count(TRAIN) // config.batch_size))
     try:
         with torch.no_grad():
-            network.train()(*(values.expand(sizes[TRAIN], *values.shape[1:]) for values in inputs))
+            network.train()(*(values.expand(together, *values.shape[1:]) for values in inputs))
     except (RuntimeError, ValueError, TypeError, AssertionError) as error:
         height, width = dataset.grid.shape
         raise ConfigError(
-            f"Expected a network that takes batches of {sizes[TRAIN]} maps of {height}×{width} cells, got "
+            f"Expected a network that takes batches of {together} maps of {height}×{width} cells, got "
             f"{config.architecture} of {config.encoder}, which does not: {one_line(error)} Choose another."
         ) from error
 

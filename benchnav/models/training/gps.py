@@ -61,7 +61,7 @@ def train_gps_on_maps(
 
     model = fit_gps(config, sum_split(dataset, TRAIN), options)
     _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
-    known = dataset.truth == "generated"
+    known = dataset.truth_of(VALID) == "generated"
     measured = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     metrics = {f"valid_{name}": value for name, value in measured.items()}
     errors = (

@@ -86,6 +86,8 @@ class Target:
         if self.options.folder and interrupted(self.options.folder, [name]):
             remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
         named = f", another {' and '.join(f'`{key}`' for key in others)}" if others else ""
+        if not others and part.seed == seed:
+            named = ", other maps or another class table, or maps as recorded by benchnav before 0.7"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
             f"{part.seed} and {part.data_id}{named}. Repeat its settings, or {remedy}."

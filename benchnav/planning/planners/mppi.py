@@ -21,6 +21,7 @@ in any batch.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -59,6 +60,8 @@ class MPPIConfig:
         control_cost: weight γ of the information-theoretic control cost γ·uᵀΣ⁻¹ε; 0 takes the current mean
             itself as the base distribution (α = 1 in the source), the value of `temperature` takes 0 (α = 0).
     """
+
+    gone: ClassVar = {"horizon": "It is now `horizon_s`, in seconds."}
 
     horizon_s: float = 5.0
     samples: int = 5000
@@ -290,7 +293,8 @@ def cost_spread(cost: Tensor) -> Tensor:
     """How far the costs of samples lie above the least, on average: the unit of the relative temperature.
 
     Samples that pay the price of ground that is not free for more steps than the best does are left out: else the
-    temperature near such ground would be that of the price, and all ways over free ground would count alike.
+    temperature near such ground would be that of the price, and all ways over free ground would count alike. They
+    are told by an excess of half the price, so J itself should spread less, as the price of such ground asks too.
 
     Args:
         cost: shape [B, K].

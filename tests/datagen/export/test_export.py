@@ -314,6 +314,21 @@ def test_maps_of_others_are_never_ours(
 ) -> None:
     own = tmp_path / "tiny-v1.h5"
     assert datagen("create", "tiny-v1", "--splits", "[test/std]", "--first", "1", "--out", own) == 0
+    sibling = (
+        "create",
+        "tiny-v1",
+        "--seed",
+        "3",
+        "--splits",
+        "[test/std]",
+        "--first",
+        "1",
+        "--out",
+        "sibling.h5",
+    )
+    assert datagen(*sibling) == 0
+    assert datagen("export", "sibling.h5", "--out", "siblings") == 0
+    assert metadata(Path("siblings"))["creator"]["name"] == "The BenchNav authors"
     changed = (
         "create",
         "tiny-v1",

@@ -89,6 +89,7 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
         ({"one": "mppi"}, "name a condition by labels"),
         ({"one": {"planner": "mppi", "risk": "cvar"}}, r"`risk` .*Did you mean 'cvar:0\.9'\?"),
         ({"metrics": "score"}, r"keys of hypothesis 1 .*Did you mean 'metric'\?"),
+        ({3: 4}, "keys of hypothesis 1 .*got 3"),
         ({"margin": 1}, "Leave it out"),
         ({"kind": "equivalence"}, "above 0 in points, got 0 for equivalence. Give one"),
         ({"kind": "equivalence", "margin": -1}, "number ≥ 0, got -1"),

@@ -47,7 +47,8 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
 def _draw(panel: Axes, rows: pd.DataFrame) -> None:
     metric = METRICS[rows["metric"].iloc[0]]
     ends = rows[["low", "high", "difference"]].to_numpy(dtype=float)
-    reach = max(np.nanmax(np.abs(ends)), rows["margin"].max(), 1e-9) * 1.08
+    # Where no episode tells anything, a row has no numbers.
+    reach = np.nanmax([*np.abs(ends).ravel(), rows["margin"].max(), 1e-9]) * 1.08
     panel.set_xlim(-reach, reach)
     panel.set_ylim(len(rows) - 0.4, -0.6)
     panel.axvline(0, color="0.4", lw=0.6, zorder=1)

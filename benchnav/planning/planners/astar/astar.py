@@ -57,6 +57,13 @@ def edge_costs(problem: Problem) -> Tensor:
     grade = (elevation[:, target] - elevation[:, source]) / length_m
     metre = path_cost_of(problem.objective)
     at_source, at_target = metre(traversability[:, source], grade), metre(traversability[:, target], grade)
+    for found in (at_source, at_target):
+        if not isinstance(found, Tensor) or found.shape != grade.shape:
+            got = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
+            raise ConfigError(
+                f"Expected `path_cost` of {type(problem.objective).__name__} of the shape of λ̂ and grade, "
+                f"{list(grade.shape)}, got {got}. Give a cost for each piece of a path."
+            )
     least, most = torch.stack((at_source, at_target)).aminmax()
     if not 0 < least <= most < torch.inf:
         raise ConfigError(

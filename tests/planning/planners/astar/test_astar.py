@@ -82,6 +82,16 @@ class Climbing(GoalDistance):
         return 1 + 100 * grade.clamp(min=0) / traversability
 
 
+@pytest.mark.parametrize("cost", [torch.tensor(1.0), torch.ones(3), 1.0])
+def test_a_path_cost_that_is_none_for_each_piece_is_refused(cost: object) -> None:
+    class Same(GoalDistance):
+        def path_cost(self, traversability: torch.Tensor, grade: torch.Tensor) -> torch.Tensor:
+            return cost  # type: ignore[return-value]
+
+    with pytest.raises(ConfigError, match=r"path_cost.*Same.*a cost for each piece"):
+        astar.search(factories.problem(torch.full((1, 8, 8), 0.8), goal=(2.75, 2.75), objective=Same()))
+
+
 def test_a_users_path_cost_is_given_the_ground_and_the_rise_of_each_edge() -> None:
     # A ramp along x, at 0.4 m a cell, ends in a plateau; λ̂ is 0.5 on it and 0.8 on the ground above.
     elevation = 0.4 * torch.arange(12).clamp(max=6).expand(1, 16, 12).float()
