@@ -78,11 +78,13 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
+    from benchnav.files import output_path
     from benchnav.models.slope_gp.slip_logs import ENDINGS
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
 
     check_seed(seed)
+    output_path(out)  # refuses addresses
     options = FitOptions(device=device)
     if data.endswith(ENDINGS):
         train_gps_on_logs(data, out, gp, seed, options, overwrite)
