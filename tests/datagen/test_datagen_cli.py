@@ -553,7 +553,7 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
         (("preview", "paper-v1", "--out", "s3://bucket/maps.png"), "place on this machine"),
         (
             ("create", "tiny-v1", "--splits", "{a: 1}"),
-            "Expected --splits as a list, each text or null, got '[{a: 1}]'",
+            "Expected --splits as a list, each text or null, got '{a: 1}'",
         ),
     ],
 )
