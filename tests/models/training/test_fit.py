@@ -264,7 +264,7 @@ def test_maps_on_which_nothing_is_known_are_refused_first(
 
 def test_a_network_that_does_not_take_the_maps_is_refused_first(dataset: TerrainDataset) -> None:
     config = ClassifierConfig(architecture="dpt", encoder="tu-vit_tiny_patch16_224", batch_size=4)
-    with pytest.raises(ConfigError, match=r"batches of 3 maps of 32×32 cells, got dpt"):
+    with pytest.raises(ConfigError, match=r"batches of 2 maps of 32×32 cells, got dpt"):
         check_classifier(config, dataset, FitOptions(device="cpu", trainer=EXACT))
 
 

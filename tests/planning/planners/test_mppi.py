@@ -198,7 +198,7 @@ def test_the_horizon_is_in_seconds(horizon_s: float, dt_s: float, steps: int) ->
 
 
 def test_a_horizon_in_steps_is_answered_with_its_new_name() -> None:
-    with pytest.raises(ConfigError, match=r"got 'horizon'\. Did you mean 'horizon_s'\?"):
+    with pytest.raises(ConfigError, match=r"got 'horizon'\. It is now `horizon_s`, in seconds"):
         registry.make("planner", {"part": "mppi", "options": {"horizon": 50}})
 
 
