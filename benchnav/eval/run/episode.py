@@ -55,7 +55,7 @@ def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> 
     """Reads some instances of a split, with starts, goals, reference times and groups; else each map is one."""
     places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
     groups: Any = instances
-    if "group" in getattr(dataset, "field_names", ()):
+    if "group" in dataset.field_names:
         groups = dataset.read(split, instances, ["group"])["group"]
     return Block(
         terrain=dataset.terrain(split, instances),

@@ -37,8 +37,8 @@ _COLUMNS = [
     "best_p",
     "best_shown",
     "best_alike",
+    "best_marked",
 ]
-_COLUMNS.append("best_marked")
 
 
 def told_the_truth(trials: Mapping[str, Any]) -> dict[str, str]:
