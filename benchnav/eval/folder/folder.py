@@ -68,7 +68,7 @@ def open_run(folder: Path) -> Run:
         raise ConfigError(
             f"Expected a run folder with {RUN}, got {folder}. Make one with `benchnav-eval run`."
         )
-    with _damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
+    with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
         about = json.loads((folder / RUN).read_text())
         version = _format_version(about)
     if version > FORMAT_VERSION:
@@ -76,7 +76,7 @@ def open_run(folder: Path) -> Run:
             f"Expected a run folder of format version at most {FORMAT_VERSION}, got {folder} of version "
             f"{version}. Read it with a newer benchnav: pip install --upgrade benchnav."
         )
-    with _damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
+    with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
         schema.check_about(about, version)
         known = {} if version == 1 else about["trials"]
         trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in known.items()}
@@ -131,7 +131,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
             f"Expected a finished run, got {folder} without {name}. Give its `benchnav-eval run` command again to "
             "finish it."
         )
-    with _damaged(path, "Remove it and give the run's command again."):
+    with damaged(path, "Remove it and give the run's command again."):
         schema.check_table(path, run.about)
         rows = pd.read_parquet(path)
         schema.check_rows(rows, run.about, run.version)
@@ -139,7 +139,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
 
 
 @contextmanager
-def _damaged(path: Path, remedy: str) -> Iterator[None]:
+def damaged(path: Path, remedy: str) -> Iterator[None]:
     """Says in one line that a file is not what it has to be, whatever reading it raised."""
     try:
         yield

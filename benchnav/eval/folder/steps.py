@@ -3,18 +3,20 @@
 Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps", filters=[("trial", "==", id)])`.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.folder import damaged, open_run
+from benchnav.eval.folder.schema import DamageError
 from benchnav.eval.unit import Unit
 from benchnav.files import replacing
 
@@ -22,7 +24,9 @@ STEPS = "steps"
 
 LAST_COLUMN = "traversability"
 _KEYS = ("seed", "realisation", "instance")
+_VALUES = ("time_s", "x_m", "y_m", LAST_COLUMN)
 _ORDER = ["trial", *_KEYS, "step"]
+_REMEDY = "Remove the steps, which the report can do without, or run it again with another `--out`."
 
 
 def write_steps(folder: Path, unit: Unit, table: pa.Table) -> None:
@@ -64,14 +68,42 @@ def open_steps(folder: Path) -> ds.Dataset | None:
 
     Args:
         folder: the run folder.
+
+    Raises:
+        ConfigError: a file of them is damaged.
     """
-    if (folder / "steps.parquet").exists():
-        return ds.dataset(folder / "steps.parquet")
-    if not any((folder / STEPS).glob("*/*.parquet")):
+    single = folder / "steps.parquet"
+    if not single.exists() and not any((folder / STEPS).glob("*/*.parquet")):
         return None
-    # By its type, since an id of digits alone would be taken for a number.
-    parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
-    return ds.dataset(folder / STEPS, partitioning=parts)
+    with damaged(folder / STEPS, _REMEDY):
+        if single.exists():
+            return ds.dataset(single)
+        # By its type, since an id of digits alone would be taken for a number.
+        parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
+        return ds.dataset(folder / STEPS, partitioning=parts)
+
+
+def rows_of(
+    folder: Path, source: ds.Dataset, columns: Sequence[str] | None, condition: pc.Expression | None
+) -> pd.DataFrame:
+    """Reads steps.
+
+    Args:
+        folder: the run folder.
+        source: its steps.
+        columns: which; None for all.
+        condition: of which rows; None for all.
+
+    Raises:
+        ConfigError: a file of them is damaged.
+    """
+    with damaged(folder / STEPS, _REMEDY):
+        for name, whole in (*((key, True) for key in _KEYS), *((value, False) for value in _VALUES)):
+            if name not in source.schema.names:
+                raise DamageError(f"no column {name}")
+            if not (pa.types.is_integer if whole else pa.types.is_floating)(source.schema.field(name).type):
+                raise DamageError(f"{name} holds {source.schema.field(name).type}")
+        return source.to_table(columns=columns and list(columns), filter=condition).to_pandas()
 
 
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
@@ -105,7 +137,7 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     for name, values in wanted.items():
         own = ds.field(name).isin(pa.array(values, source.schema.field(name).type))
         condition = own if condition is None else condition & own
-    rows = source.to_table(filter=condition).to_pandas()
+    rows = rows_of(folder, source, None, condition)
     order = [name for name in _ORDER if name in rows]
     rows = rows.sort_values(order, kind="stable", ignore_index=True)
     return rows[[*order, *(name for name in rows if name not in order)]]

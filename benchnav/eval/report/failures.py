@@ -7,7 +7,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from benchnav.eval.folder.steps import open_steps
+from benchnav.eval.folder.steps import open_steps, rows_of
 
 _KEYS = ["trial", "seed", "realisation", "instance"]
 _LAST_S = 2.0
@@ -47,9 +47,7 @@ def steps_of(folder: Path, trials: list[str]) -> pd.DataFrame:
     source = open_steps(folder)
     if source is None:
         return pd.DataFrame({name: pd.Series(dtype=object if name == "trial" else float) for name in columns})
-    return source.to_table(
-        columns=columns, filter=ds.field("trial").isin(pa.array(trials, pa.string()))
-    ).to_pandas()
+    return rows_of(folder, source, columns, ds.field("trial").isin(pa.array(trials, pa.string())))
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:

@@ -1,6 +1,8 @@
 """Steps of a run, as partitioned Parquet."""
 
 import json
+import random
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +13,16 @@ import pytest
 import torch
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import write_run
+from benchnav.eval.folder.folder import EPISODES, read_table, write_run
 from benchnav.eval.folder.steps import align_steps, read_steps
 from benchnav.eval.keep import Keep
+from benchnav.eval.report.failures import failures_table
 from benchnav.eval.run.rows import step_table
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent, units
+from tests.edits import edit_table
 from tests.eval.run.test_rows import made, unit
 
 PLANNERS: tuple[Any, ...] = ({"part": "tests.eval.parts:Faulty", "label": "slow"}, "straight")
@@ -155,3 +159,19 @@ def test_an_episode_that_ended_at_once_has_its_one_state() -> None:
     rows = step_table(unit(), problem, at_once, [0]).to_pandas()
     assert (len(rows), rows["time_s"].tolist()) == (1, [0.0])
     assert np.isnan(rows["traversability"]).all()
+
+
+@pytest.mark.parametrize("count", [20, pytest.param(300, marks=pytest.mark.slow)])
+def test_edited_steps_are_read_or_refused_in_one_line(count: int, folder: Path, tmp_path: Path) -> None:
+    rows, said = read_table(folder, EPISODES), []
+    for seed in range(count):
+        chance, place = random.Random(seed), Path(shutil.copytree(folder, tmp_path / "run"))
+        edit_table(chance.choice(sorted(place.glob("steps/*/*.parquet"))), chance)
+        try:
+            read_steps(place)
+            failures_table(place, rows)
+        except ConfigError as error:
+            said.append(str(error))
+        shutil.rmtree(place)
+    assert len(said) > count / 5
+    assert all("Remove the steps" in line for line in said)
