@@ -1,4 +1,4 @@
-"""The suites of docs/risk.md can be run as they are written, and its script says what is so."""
+"""The suites that are shipped and those of docs/risk.md can be run as they are written; its tables say what is so."""
 
 import importlib.util
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import yaml
 
+from benchnav.eval.hypotheses import fix_hypotheses
 from benchnav.eval.suite import Suite
 from benchnav.eval.trial import trials_of
 from tests.eval.report.made import row, rows, trial
@@ -18,8 +19,8 @@ ROOT = Path(__file__).parents[2]
 STUDY = ROOT / "docs" / "risk"
 
 
-def script(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, STUDY / f"{name}.py")
+def tables() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -27,11 +28,19 @@ def script(name: str) -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("path", sorted(STUDY.glob("*.yaml")), ids=lambda path: path.stem)
-def test_each_suite_makes_trials(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+SUITES = [*STUDY.glob("*.yaml"), *(ROOT / "benchnav" / "eval" / "suites").glob("*.yaml")]
+
+
+@pytest.mark.parametrize("path", sorted(SUITES), ids=lambda path: path.stem)
+def test_each_suite_makes_trials_and_names_them_in_its_hypotheses(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(ROOT)
-    trials = trials_of(Suite(**yaml.safe_load(path.read_text())), lambda data: ["std"])
+    suite = Suite(**yaml.safe_load(path.read_text()))
+    trials = {trial.id: trial for trial in trials_of(suite, lambda data: ["std", "hg", "hs"])}
     assert len(trials) >= 6
+    tests = fix_hypotheses(suite.hypotheses, trials, dict.fromkeys(trials, 1)).get("tests", [])
+    assert len(tests) >= len(suite.hypotheses)
 
 
 def made(**success: Sequence[bool]) -> pd.DataFrame:
@@ -43,39 +52,37 @@ def made(**success: Sequence[bool]) -> pd.DataFrame:
     )
 
 
-def printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path) -> list[str]:
-    monkeypatch.setattr("sys.argv", ["order.py", str(folder)])
-    script("order").main()
-    return capsys.readouterr().out.split("\n")
+def sweep(folder: Path) -> list[str]:
+    return tables().sweep(folder).split("\n")
 
 
-def test_the_best_is_told_from_the_worst(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_the_best_is_told_from_the_worst(tmp_path: Path) -> None:
     # 10 of 12 maps are won by the best alone: the exact test is 2 / 2¹⁰, threefold by Holm's correction.
     episodes = made(cvar=[True] * 11 + [False], mean=[True] + [False] * 11, var=[True, False] * 6)
-    lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", episodes))
-    assert lines[1] == "| | cvar | mean | var | best − worst [points] (95 %) | p |"
-    assert lines[3].startswith("| all | 91.7 | 8.3 | 50.0 | cvar − mean +83.3 (+")
-    assert lines[3].endswith(f"| {3 * 2 / 2**10:.2g} |")
+    lines = sweep(run_folder(tmp_path / "run", episodes))
+    assert lines[0] == "| cvar | mean | var | best − worst [points] (95 %) | p |"
+    assert lines[2].startswith("| 91.7 | 8.3 | 50.0 | cvar − mean +83.3 (+")
+    assert lines[2].endswith(f"| {3 * 2 / 2**10:.2g} |")
 
 
-def test_the_gain_has_the_sign_of_the_best(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_the_gain_has_the_sign_of_the_best(tmp_path: Path) -> None:
     for name, order in (("a", ("mean", "cvar")), ("b", ("cvar", "mean"))):
         won = {"mean": [True] * 2 + [False] * 10, "cvar": [True] * 9 + [False] * 3}
         folder = run_folder(tmp_path / name, made(**{risk: won[risk] for risk in order}))
-        text = printed(monkeypatch, capsys, folder)[3]
+        text = sweep(folder)[2]
         assert "cvar − mean +58.3 (+" in text
 
 
-def test_each_variant_has_a_row(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_each_variant_has_a_row(tmp_path: Path) -> None:
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
     other = episodes.assign(model="oracle", trial=episodes["trial"] + "o", success=True, outcome="success")
-    lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", pd.concat([episodes, other])))
-    assert [line.split(" |")[0] for line in lines[3:5]] == ["| paper-v1", "| oracle"]
-    assert "| 100.0 | 50.0 |" in lines[3]
-    assert "| 100.0 | 100.0 |" in lines[4]
+    lines = sweep(run_folder(tmp_path / "run", pd.concat([episodes, other])))
+    assert [line.split(" |")[0] for line in lines[2:4]] == ["| paper-v1", "| oracle"]
+    assert "| 100.0 | 50.0 |" in lines[2]
+    assert "| 100.0 | 100.0 |" in lines[3]
 
 
-def test_variants_are_told_apart_by_the_whole_label(tmp_path: Path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_variants_are_told_apart_by_the_whole_label(tmp_path: Path) -> None:
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
     worlds = [
         episodes.assign(world=label, trial=episodes["trial"] + label, success=won, outcome=outcome)
@@ -84,6 +91,22 @@ def test_variants_are_told_apart_by_the_whole_label(tmp_path: Path, monkeypatch,
             ("stakes immobile=0.2/2s", False, "timeout"),
         )
     ]
-    lines = printed(monkeypatch, capsys, run_folder(tmp_path / "run", pd.concat(worlds)))
-    assert lines[3].startswith("| stakes immobile=0.05/2s | 100.0 | 100.0 |")
-    assert lines[4].startswith("| stakes immobile=0.2/2s | 0.0 | 0.0 |")
+    lines = sweep(run_folder(tmp_path / "run", pd.concat(worlds)))
+    assert lines[2].startswith("| stakes immobile=0.05/2s | 100.0 | 100.0 |")
+    assert lines[3].startswith("| stakes immobile=0.2/2s | 0.0 | 0.0 |")
+
+
+def test_only_the_tables_of_runs_that_are_there_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_folder(tmp_path / "runs" / "one", made(mean=[True] * 12, cvar=[True, False] * 6))
+    note = tmp_path / "note.md"
+    note.write_text(
+        "A\n<!-- sweep one -->\nold\n<!-- end -->\nB\n<!-- sweep two -->\nkept\n<!-- end -->\nC\n"
+    )
+    monkeypatch.setattr("sys.argv", ["tables.py", str(note), "--runs", str(tmp_path / "runs")])
+    tables().main()
+    before, (rest) = note.read_text().split("B\n")
+    assert rest == "<!-- sweep two -->\nkept\n<!-- end -->\nC\n"
+    assert before.startswith("A\n<!-- sweep one -->\n| mean | cvar |")
+    assert "old" not in before

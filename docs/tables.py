@@ -1,0 +1,170 @@
+"""Writes the tables of docs/results.md and docs/risk.md from the runs that they are of.
+
+    python docs/tables.py docs/risk.md            # reads runs/NAME; --runs FOLDER for others
+
+A table stands between `<!-- KIND RUN -->` and `<!-- end -->`; one whose run is not there stays as it is. Kinds:
+
+- `results`: the table of the run's report;
+- `hypotheses`: what the suite was to show, and the tests of it;
+- `settings`: success and mean T_total, a row for each model, planner and world, a column for each risk setting;
+- `sweep`: success of each setting under each value, and what the best gains on the worst; p of the sign-flip test,
+  after Holm's correction over all pairs of settings of the row. Best and worst are chosen by what was seen, so
+  that the gain leans upward;
+- `paper`: the paper's Table I beside a run's. Theirs: Wilson's interval of 20 episodes, and Student's of a mean of
+  20 by its standard deviation. p: Fisher's exact test of success, Welch's of T_total, Holm's correction over the
+  scenarios, each of the two apart.
+"""
+
+import argparse
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from scipy.stats import fisher_exact, t, ttest_ind_from_stats
+from statsmodels.stats.multitest import multipletests
+
+from benchnav.eval.compare import read_trials
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.report.hypotheses import hypothesis_table
+from benchnav.eval.report.rendering import to_markdown
+from benchnav.eval.report.write import read_report
+from benchnav.eval.stats.comparison import compare
+from benchnav.eval.stats.pairing import Pair, find_pairs
+from benchnav.eval.stats.summary import wilson_interval
+from benchnav.eval.trial import NOT_USED
+
+# MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.
+PAPER_EPISODES = 20
+PAPER = {"std": (0.90, 52.7, 22.5), "hg": (0.80, 60.2, 26.1), "hs": (0.85, 58.6, 25.7)}
+
+_BLOCK = re.compile(r"<!-- (\w+) ([\w-]+) -->\n.*?<!-- end -->", re.DOTALL)
+_BESIDE_RISK = ("data", "scenario", "world", "robot", "model", "planner")
+
+
+def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Formats a Markdown table."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def results(run: Path) -> str:
+    """The table of the run's report."""
+    return to_markdown(read_report(run).table)
+
+
+def hypotheses(run: Path) -> str:
+    """The tests of the run's hypotheses."""
+    return to_markdown(hypothesis_table(read_report(run).tests, grouped=False))
+
+
+def settings(run: Path) -> str:
+    """Success with its interval and mean T_total, risk settings across."""
+    summary = pd.read_csv(run / "summary.csv")
+    summary = summary[summary["risk"] != NOT_USED]
+    known = list(summary["risk"].unique())
+    several = [name for name in _BESIDE_RISK if summary[name].nunique() > 1]
+    rows = []
+    for labels, found in summary.groupby(several, sort=False):
+        cells = {
+            row["risk"]: f"{100 * row['success_rate']:.1f} ({100 * row['success_low']:.0f}–"
+            f"{100 * row['success_high']:.0f}), {row['total_time_mean_s']:.1f} s"
+            for row in found.to_dict("records")
+        }
+        rows.append([*labels, *(cells.get(risk, "") for risk in known)])
+    return table([*several, *known], rows)
+
+
+def sweep(run: Path) -> str:
+    """Success of each setting under each value that was swept, and what the best gains on the worst."""
+    pairs = find_pairs(read_trials([open_run(run)]), by="risk")
+    names = [name for name in _BESIDE_RISK if len({pair.shared[name] for pair in pairs}) > 1]
+    variants: dict[tuple[str, ...], list[Pair]] = {}
+    for pair in pairs:
+        labels = {**pair.shared, "data": Path(pair.shared["data"]).name}
+        variants.setdefault(tuple(labels[name] for name in names), []).append(pair)
+    known = list(dict.fromkeys(end for pair in pairs for end in (pair.other, pair.one)))
+    rows = []
+    for labels, own in variants.items():
+        success, gain, p = _best_and_worst(compare(own))
+        rows.append([*labels, *(f"{success[risk]:.1f}" for risk in known), gain, p])
+    return table([*names, *known, "best − worst [points] (95 %)", "p"], rows)
+
+
+def _best_and_worst(compared: pd.DataFrame) -> tuple[dict[str, float], str, str]:
+    """Success of each setting in per cent, what the best gains on the worst in points, and p."""
+    success: dict[str, float] = {}
+    for one in compared.to_dict("records"):
+        success |= {one["other"]: 100 * one["success_other"], one["one"]: 100 * one["success_one"]}
+    order = sorted(success, key=success.__getitem__)
+    worst, best = order[0], order[-1]
+    found = compared[compared["one"].isin((best, worst)) & compared["other"].isin((best, worst))].iloc[0]
+    ends = [100 * found["success_low"], 100 * found["success_high"]]
+    if found["one"] == worst:
+        ends = [-end for end in reversed(ends)]
+    gain = f"{best} − {worst} {success[best] - success[worst]:+.1f} ({ends[0]:+.0f} to {ends[1]:+.0f})"
+    return success, gain, f"{found['success_p_holm']:.2g}"
+
+
+def paper(run: Path) -> str:
+    """The paper's Table I beside the run's rows of MPPI under `cvar`."""
+    summary = pd.read_csv(run / "summary.csv")
+    ours = summary[(summary["planner"] == "mppi") & (summary["risk"] == "cvar")]
+    found = [(row["scenario"], *_beside(row)) for row in ours.to_dict("records") if row["scenario"] in PAPER]
+    success, time = (multipletests([row[place] for row in found], method="holm")[1] for place in (2, 3))
+    headings = ["scenario", "Succ. [%], paper", "ours", "p", "T_total [s], paper", "ours", "p"]
+    rows = [
+        [scenario, *cells[:2], f"{success[place]:.2g}", *cells[2:], f"{time[place]:.2g}"]
+        for place, (scenario, cells, *_) in enumerate(found)
+    ]
+    return table(headings, rows)
+
+
+def _beside(row: dict[Any, Any]) -> tuple[list[str], float, float]:
+    """The cells of a scenario, and p of success and of T_total, before correction."""
+    rate, mean, std = PAPER[row["scenario"]]
+    low, high = wilson_interval(rate, PAPER_EPISODES)
+    reach = t.ppf(0.975, PAPER_EPISODES - 1) * std / PAPER_EPISODES**0.5
+    cells = [
+        f"{100 * rate:.0f} ({100 * low:.0f}–{100 * high:.0f})",
+        f"{100 * row['success_rate']:.1f} ({100 * row['success_low']:.0f}–{100 * row['success_high']:.0f})",
+        f"{mean:.1f} ({mean - reach:.1f}–{mean + reach:.1f})",
+        f"{row['total_time_mean_s']:.1f} ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})",
+    ]
+    count = row["n_episodes"]
+    theirs, ours = round(rate * PAPER_EPISODES), round(row["success_rate"] * count)
+    success = fisher_exact([[theirs, PAPER_EPISODES - theirs], [ours, count - ours]]).pvalue
+    own = (row["total_time_mean_s"], row["total_time_std_s"], count)
+    time = ttest_ind_from_stats(mean, std, PAPER_EPISODES, *own, equal_var=False).pvalue
+    return cells, float(success), float(time)
+
+
+KINDS: dict[str, Callable[[Path], str]] = {
+    "results": results,
+    "hypotheses": hypotheses,
+    "settings": settings,
+    "sweep": sweep,
+    "paper": paper,
+}
+
+
+def main() -> None:
+    """Rewrites the tables of a document."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("document", type=Path)
+    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the runs")
+    given = parser.parse_args()
+
+    def written(block: re.Match[str]) -> str:
+        kind, name = block.groups()
+        if not (given.runs / name).is_dir():
+            print(f"left as it is: {kind} {name}")
+            return block.group()
+        return f"<!-- {kind} {name} -->\n{KINDS[kind](given.runs / name)}\n<!-- end -->"
+
+    given.document.write_text(_BLOCK.sub(written, given.document.read_text()))
+
+
+if __name__ == "__main__":
+    main()
