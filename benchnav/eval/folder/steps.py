@@ -98,11 +98,13 @@ def rows_of(
         ConfigError: a file of them is damaged.
     """
     with damaged(folder / STEPS, _REMEDY):
-        for name, whole in (*((key, True) for key in _KEYS), *((value, False) for value in _VALUES)):
+        for name in columns or _KEYS:
             if name not in source.schema.names:
                 raise DamageError(f"no column {name}")
-            if not (pa.types.is_integer if whole else pa.types.is_floating)(source.schema.field(name).type):
-                raise DamageError(f"{name} holds {source.schema.field(name).type}")
+        for field in source.schema:
+            fits = pa.types.is_integer if field.name in _KEYS else pa.types.is_floating
+            if field.name in (*_KEYS, *_VALUES) and not fits(field.type):
+                raise DamageError(f"{field.name} holds {field.type}")
         return source.to_table(columns=columns and list(columns), filter=condition).to_pandas()
 
 

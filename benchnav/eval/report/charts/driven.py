@@ -4,19 +4,20 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from benchnav.errors import ConfigError
 from benchnav.eval.folder.folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.report.contenders import NAMING, contender_names, trial_colours
-from benchnav.eval.report.figure_style import save
 from benchnav.eval.report.recorded.ground import HOLDING
 from benchnav.files import replacing
+
+if TYPE_CHECKING:  # runs keep the map of the figure, and draw nothing
+    from matplotlib.figure import Figure
 
 GROUND = "ground.npz"
 # What one map under one draw of luck is known by.
@@ -104,6 +105,8 @@ def write_driven(folder: Path, out: Path) -> dict[str, str]:
         steps = read_steps(folder, trial=trial, **place)
         if len(steps):
             tracks[trial] = steps[["x_m", "y_m"]].to_numpy()
+    from benchnav.eval.report.figure_style import save
+
     shown = rows[rows["trial"].isin(tracks)].iloc[:MOST_PATHS]
     if shown.empty:
         return {}
@@ -126,7 +129,7 @@ def write_driven(folder: Path, out: Path) -> dict[str, str]:
     return {"driven": " ".join(words)}
 
 
-def driven_figure(ground: DrivenGround, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> Figure:
+def driven_figure(ground: DrivenGround, rows: pd.DataFrame, tracks: Sequence[np.ndarray]) -> "Figure":
     """Draws paths over λ as it was, or over faded terrain where it was resampled.
 
     Args:
@@ -134,6 +137,8 @@ def driven_figure(ground: DrivenGround, rows: pd.DataFrame, tracks: Sequence[np.
         rows: an episode a trial.
         tracks: positions of each, shape [N + 1, 2].
     """
+    from matplotlib.figure import Figure
+
     if rows.empty:
         raise ConfigError("Expected one or more driven paths, got none.")
     high, wide = (count * ground.resolution_m for count in ground.holding.shape)

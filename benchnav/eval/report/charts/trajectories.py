@@ -23,7 +23,7 @@ from benchnav.eval.report.recorded.ground import (
     outline,
 )
 from benchnav.eval.report.recorded.snapshot import Snapshot
-from benchnav.eval.report.tables import NOT_USED
+from benchnav.eval.trial import NOT_USED
 
 MOST_PANELS = 8
 _PANELS_A_LINE = 4

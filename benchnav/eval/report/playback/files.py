@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-from benchnav.eval.report.playback.rerun_file import write_rerun
 from benchnav.eval.report.recorded.recording import Recording
 
 
@@ -37,6 +36,8 @@ def write_playback(folder: Path, stem: str, recording: Recording) -> Path:
     Returns:
         The path of the viewer's file, that of `playback_path`.
     """
+    from benchnav.eval.report.playback.rerun_file import write_rerun  # most units record nothing
+
     path = playback_path(folder, stem)
     recording.save(playback_path(folder, stem, ".npz"))
     write_rerun([recording], path)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from benchnav.eval.report.contenders import NAMING
 from benchnav.eval.report.playback.robot import Driver
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.eval.report.tables import NOT_USED
+from benchnav.eval.trial import NOT_USED
 
 
 def describe(drivers: Sequence[Driver]) -> str:

@@ -5,10 +5,8 @@ Letters in shapes: H×W cells, N positions, M lines.
 
 from collections.abc import Mapping
 
-import matplotlib
 import numpy as np
 
-from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
 from benchnav.planning.world.outcome import Outcome
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
@@ -28,6 +26,10 @@ def field_colours(field: np.ndarray, holding: np.ndarray) -> np.ndarray:
     Returns:
         Red, green and blue, uint8, shape [H, W, 3].
     """
+    import matplotlib  # runs record, and draw nothing
+
+    from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
+
     shades = matplotlib.colormaps[TRAVERSABILITY_COLOURS](field)[..., :3]
     colours = np.round(255 * shades).astype(np.uint8)
     colours[holding] = HOLDING

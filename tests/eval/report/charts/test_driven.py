@@ -169,7 +169,7 @@ def test_the_paths_are_those_of_the_maps_own_luck(
     monkeypatch.setattr(
         "benchnav.eval.report.charts.driven.driven_figure", lambda *given: shown.append(given)
     )
-    monkeypatch.setattr("benchnav.eval.report.charts.driven.save", lambda *given: None)
+    monkeypatch.setattr("benchnav.eval.report.figure_style.save", lambda *given: None)
     caption = write_driven(folder, folder)["driven"]
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
     ((_, own, tracks),) = shown
