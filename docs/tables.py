@@ -26,7 +26,7 @@ from scipy.stats import fisher_exact, t, ttest_ind_from_stats
 from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.compare import read_trials
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.folder import EPISODES, open_run
 from benchnav.eval.report.hypotheses import hypothesis_table
 from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.write import read_report
@@ -158,7 +158,7 @@ def main() -> None:
 
     def written(block: re.Match[str]) -> str:
         kind, name = block.groups()
-        if not (given.runs / name).is_dir():
+        if not (given.runs / name / EPISODES).exists():
             print(f"left as it is: {kind} {name}")
             return block.group()
         return f"<!-- {kind} {name} -->\n{KINDS[kind](given.runs / name)}\n<!-- end -->"
