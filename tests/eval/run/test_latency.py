@@ -10,12 +10,19 @@ import pytest
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.report.tables import ALONE
 from benchnav.eval.report.write import read_report
+from benchnav.eval.run import latency
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
 from benchnav.share import Share
+from tests.eval.conftest import MOST_STEPS
 
 INSTANCES = 3
+
+
+@pytest.fixture(autouse=True)
+def whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(latency, "_MOST_STEPS", MOST_STEPS)
 
 
 def suite_on(dataset: Path, *planners: Any, **changes: Any) -> Suite:
