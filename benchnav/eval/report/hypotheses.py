@@ -78,6 +78,11 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> ResultTable:
         "beyond the margin decides the test before the correction. "
         f"Under {LEAST_MAPS} {headings[2]} success alone has one.",
     ]
+    if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
+        notes.append(
+            "T_total: intervals allow for failures that so few maps did not show; p of a difference is of what was seen, "
+            "so that it can be small where the interval holds 0."
+        )
     if (tests["metric"] == "path_length").any():
         notes.append("Path length: of the episodes in which both arrived.")
     bold = frozenset((place, 7) for place, supported in enumerate(tests["supported"]) if supported)
