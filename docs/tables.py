@@ -64,7 +64,7 @@ def settings(run: Path) -> str:
     summary = pd.read_csv(run / "summary.csv")
     summary = summary[summary["risk"] != NOT_USED]
     known = list(summary["risk"].unique())
-    several = [name for name in _BESIDE_RISK if summary[name].nunique() > 1]
+    several = [name for name in _BESIDE_RISK if summary[name].nunique() > 1] or ["planner"]
     rows = []
     for labels, found in summary.groupby(several, sort=False):
         cells = {
