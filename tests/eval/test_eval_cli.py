@@ -16,7 +16,7 @@ from benchnav.share import Share
 
 SMALL = (
     "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1",
-    "--model", "oracle", "--time_budget_s", "30", "--planner_options", '{"mppi": {"samples": 64}}',
+    "--model", "oracle", "--time_budget_s", "10", "--planner_options", '{"mppi": {"samples": 64}}',
 )  # fmt: skip
 
 
@@ -67,7 +67,7 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
     )
     assert evaluate(monkeypatch, *arguments) == 0
     for trial, _ in open_run(out).trials.values():
-        assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 30.0)
+        assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 10.0)
         assert trial.rules.slowest == 0.05
         assert (trial.rules.free_space.by, trial.rules.free_space.above) == ("mean", 0.1)
 

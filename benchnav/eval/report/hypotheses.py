@@ -80,8 +80,8 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> ResultTable:
     ]
     if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
         notes.append(
-            "T_total: intervals allow for failures that so few maps did not show; p of a difference is of what was seen, "
-            "so that it can be small where the interval holds 0."
+            "T_total: intervals allow for failures that so few maps did not show; p of a difference is of what was "
+            "seen, so that it can be small where the interval holds 0."
         )
     if (tests["metric"] == "path_length").any():
         notes.append("Path length: of the episodes in which both arrived.")

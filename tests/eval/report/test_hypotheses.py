@@ -73,6 +73,12 @@ def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> N
     assert bool(table.bold) == (changes.get("supported", True))
 
 
+def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> None:
+    for test, said in ((a_test(kind="difference"), True), (a_test(), False), (a_test(**OTHER), False)):
+        notes = hypothesis_table(pd.DataFrame([test]), False).notes
+        assert any("where the interval holds 0" in note for note in notes) == said
+
+
 def test_a_forest_has_a_panel_a_metric_with_points_intervals_and_margins() -> None:
     rows = [
         a_test(),

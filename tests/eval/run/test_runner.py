@@ -41,7 +41,7 @@ TIMING = ["planning_ms", "planning_ms_p95", "planning_start_ms"]
 
 def suite_on(dataset: Path, **changes: object) -> Suite:
     made = Suite(
-        data=str(dataset), model="oracle", instances=2, time_budget_s=40.0, planner_options=BUDGETS,
+        data=str(dataset), model="oracle", instances=2, time_budget_s=12.0, planner_options=BUDGETS,
         risks=("cvar", "mean"), scenarios=("std", "hs"),
     )  # fmt: skip
     return replace(made, **changes)  # type: ignore[arg-type]
