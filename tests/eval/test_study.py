@@ -110,3 +110,20 @@ def test_only_the_tables_of_runs_that_are_there_are_written(
     assert rest == "<!-- sweep two -->\nkept\n<!-- end -->\nC\n"
     assert before.startswith("A\n<!-- sweep one -->\n| mean | cvar |")
     assert "old" not in before
+
+
+def test_settings_stand_beside_one_another_with_their_success_and_time(tmp_path: Path) -> None:
+    shared = {"data": "d", "scenario": "std", "world": "w", "robot": "r", "model": "m", "planner": "mppi"}
+    numbers = ("success_rate", "success_low", "success_high", "total_time_mean_s")
+    rows = [
+        {**shared, "risk": risk, **dict(zip(numbers, values, strict=True))}
+        for risk, values in (
+            ("mean", (1.0, 0.9, 1.0, 30.0)),
+            ("–", (0, 0, 0, 0)),
+            ("cvar", (0.5, 0.3, 0.7, 65.0)),
+        )
+    ]
+    pd.DataFrame(rows).to_csv(tmp_path / "summary.csv")
+    head, _, line = tables().settings(tmp_path).split("\n")
+    assert head == "| planner | mean | cvar |"
+    assert line == "| mppi | 100.0 (90–100), 30.0 s | 50.0 (30–70), 65.0 s |"
