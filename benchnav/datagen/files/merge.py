@@ -160,7 +160,8 @@ def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
 def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]:
     if first.fields != second.fields:
         extra = sorted(set(first.fields) ^ set(second.fields)) or ["fields"]
-        yield f"unlike fields ({', '.join(extra)} of one alone)"
+        hint = ": import both with overlap or both without, by --stride" if extra == ["group"] else ""
+        yield f"unlike fields ({', '.join(extra)} of one alone{hint})"
     for name in _SHARED:
         ours, theirs = getattr(first.recipe, name), getattr(second.recipe, name)
         if ours != theirs:
