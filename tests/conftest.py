@@ -5,9 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchnav import drawing
 from tests import factories
 
 torch.set_num_threads(1)
+# To embed a font as published figures have it takes half a second a file; tests/test_drawing.py tries it.
+SAVED = drawing._SAVED.copy()
+drawing._SAVED["pdf.fonttype"] = 3
 
 
 @pytest.fixture(scope="session")

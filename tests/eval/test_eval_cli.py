@@ -41,7 +41,8 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert evaluate(monkeypatch, "report", str(out)) == 0
     assert evaluate(monkeypatch, "replay", str(out), "--view", "false") == 0
     assert ".rrd" in capsys.readouterr().out
-    # The same command again finds all done; with another seed it extends the run.
+    # The same command again finds all done; with another seed it extends the run. Reports take longer than runs.
+    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     again = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
     assert evaluate(monkeypatch, *again) == 0
     assert "2 of 2 units were there already" in capsys.readouterr().err
@@ -65,6 +66,7 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
         "--task.free_space",
         "{by: mean, above: 0.1}",
     )
+    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     assert evaluate(monkeypatch, *arguments) == 0
     for trial, _ in open_run(out).trials.values():
         assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 10.0)
