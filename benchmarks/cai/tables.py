@@ -1,8 +1,13 @@
 """Tables of the trials beside the published ones, as Markdown.
 
-Intervals are Wilson's, 95 %, over trials. Two settings on the same trials are compared by the exact McNemar
-test, ours with theirs by Fisher's exact test.
+    python -m benchmarks.cai.tables published=a.csv distance²=b.csv     # runs side by side, each beside the first
+
+Intervals are Wilson's, 95 %, over trials. Two settings, or two runs, on the same trials are compared by the exact
+McNemar test, ours with theirs by Fisher's exact test.
 """
+
+import sys
+from collections.abc import Mapping
 
 import pandas as pd
 from scipy.stats import binomtest, fisher_exact
@@ -64,6 +69,45 @@ def tabulate_pairs(rows: pd.DataFrame) -> str:
     return markdown(["vegetation", *ours, *(f"theirs: {name}" for name in ours)], lines)
 
 
+def tabulate_runs(runs: Mapping[str, pd.DataFrame]) -> str:
+    """Success and mean time of several runs of the same trials, and what each changes on the first.
+
+    Args:
+        runs: trials by name, from `run_trials`; p is corrected by Holm's method over the lines of a run.
+    """
+    first, *others = runs
+    settings = list(runs[first].groupby(["density", "setting"], sort=False).groups)
+    keys = ["density", "setting", "map", "realisation"]
+    won = {name: rows.set_index(keys)["success"].astype(bool).sort_index() for name, rows in runs.items()}
+    took = {name: rows.set_index(keys)["time_s"].sort_index() for name, rows in runs.items()}
+    header, lines = ["vegetation", "setting", *runs, "theirs"], []
+    for line in settings:
+        cells = [
+            f"{100 * won[name][line].mean():.1f}, {show_time(took[name][line].mean())} s" for name in runs
+        ]
+        theirs = PUBLISHED.get(line)
+        cells.append(
+            f"{100 * theirs.successes / TRIALS:.1f}, {show_time(theirs.time_s)} s" if theirs else _NONE
+        )
+        lines.append([f"{100 * line[0]:.0f} %", f"`{line[1]}`", *cells])
+    tables = [markdown(header, lines)]
+    for name in others:
+        changes = [(won[name][line], won[first][line]) for line in settings]
+        counts = [(int((one & ~other).sum()), int((other & ~one).sum())) for one, other in changes]
+        corrected = multipletests([mcnemar_p(*pair) for pair in counts], method="holm")[1]
+        lines = [
+            [f"{100 * line[0]:.0f} %", f"`{line[1]}`", f"{100 * (gained - lost) / len(one):+.1f}", f"{gained}, {lost}",
+             show_p(p)]
+            for line, (gained, lost), (one, _), p in zip(settings, counts, changes, corrected, strict=True)
+        ]  # fmt: skip
+        tables.append(
+            markdown(
+                ["vegetation", "setting", "points", f"won with {name} alone, with {first} alone", "p"], lines
+            )
+        )
+    return "\n\n".join(tables)
+
+
 def mcnemar_p(gained: int, lost: int) -> float:
     """Two-sided p of the exact McNemar test, from the trials that only one of two settings won."""
     return float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
@@ -93,3 +137,11 @@ def show_p(p: float) -> str:
 def markdown(header: list[str], lines: list[list[str]]) -> str:
     """A Markdown table."""
     return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *lines])
+
+
+if __name__ == "__main__":
+    print(
+        tabulate_runs(
+            {name: pd.read_csv(path) for name, path in (word.split("=", 1) for word in sys.argv[1:])}
+        )
+    )

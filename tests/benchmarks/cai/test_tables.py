@@ -4,7 +4,14 @@ import pytest
 from scipy.stats import binom, fisher_exact
 
 from benchmarks.cai.published import PUBLISHED, PUBLISHED_PAIRS, TRIALS
-from benchmarks.cai.tables import mcnemar_p, show_p, show_share, tabulate_pairs, tabulate_success
+from benchmarks.cai.tables import (
+    mcnemar_p,
+    show_p,
+    show_share,
+    tabulate_pairs,
+    tabulate_runs,
+    tabulate_success,
+)
 
 
 def rows(density: float, **success: list[bool]) -> pd.DataFrame:
@@ -74,3 +81,16 @@ def test_pairs_are_those_of_one_trial() -> None:
 
 def test_no_arrival_has_no_time() -> None:
     assert "| 0.0 [0, 49] | – |" in tabulate_success(rows(0.4, mean=[False] * 4))
+
+
+def test_a_run_stands_beside_the_first_trial_by_trial() -> None:
+    first = rows(1.0, mean=[True] * 10 + [False] * 2, cvar_8=[True] * 12)
+    other = rows(1.0, mean=[False] * 9 + [True] * 3, cvar_8=[True] * 12).sample(frac=1, random_state=0)
+    whole, change = tabulate_runs({"a": first, "b": other.assign(time_s=20.0)}).split("\n\n")
+    assert whole.split("\n")[2] == "| 100 % | `mean` | 83.3, 10.0 s | 25.0, 20.0 s | 20.0, 11.6 s |"
+    header, _, mean, cautious = change.split("\n")
+    assert "won with b alone, with a alone" in header
+    # Two won and nine lost of twelve; p of the binomial tail, twice over two lines.
+    p = 2 * 2 * binom.cdf(2, 11, 0.5)
+    assert mean == f"| 100 % | `mean` | -58.3 | 2, 9 | {show_p(p)} |"
+    assert cautious == "| 100 % | `cvar:0.8` | +0.0 | 0, 0 | 1.00 |"
