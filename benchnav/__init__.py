@@ -5,7 +5,7 @@ Importing the package registers the Gymnasium environment `benchnav/OffRoad-v0`.
 
 import gymnasium
 
-__version__ = "0.6.0"
+__version__ = "0.7.0"
 
 gymnasium.register(
     id="benchnav/OffRoad-v0",
