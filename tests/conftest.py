@@ -9,9 +9,15 @@ from benchnav import drawing
 from tests import factories
 
 torch.set_num_threads(1)
-# To embed a font as published figures have it takes half a second a file; tests/test_drawing.py tries it.
-SAVED = drawing._SAVED.copy()
+# To embed a font as publishers ask takes half a second a file.
+_SAVED = drawing._SAVED.copy()
 drawing._SAVED["pdf.fonttype"] = 3
+
+
+@pytest.fixture
+def whole_fonts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has figures saved as they are outside tests."""
+    monkeypatch.setattr(drawing, "_SAVED", _SAVED)
 
 
 @pytest.fixture(scope="session")

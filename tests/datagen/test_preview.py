@@ -254,6 +254,7 @@ def test_hillshade_lights_the_north_west(dataset: TerrainDataset, monkeypatch: p
     assert veil[8, 24, 0] == 0
 
 
+@pytest.mark.usefixtures("whole_fonts")
 @pytest.mark.parametrize(
     ("kind", "magic"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("jpg", b"\xff\xd8")]
 )

@@ -53,6 +53,7 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("whole_fonts")
 def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", episodes())
     summary = write_report(folder).summary
