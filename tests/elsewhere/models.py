@@ -140,6 +140,7 @@ def test_each_command_uses_the_device_that_it_is_given(
         name = "fit" if module == "gps" else "fit_network"
         monkeypatch.setattr(f"benchnav.models.training.{module}.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
+    monkeypatch.setattr("benchnav.models.training.gps.find_soft_modes", lambda sums: (None, None))
     (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)
     data = str(tmp_path / "logs.csv") if command == "gp on logs" else str(dataset.path)
     cpu, cuda = ("--device", "cpu"), ("--device", "cuda")

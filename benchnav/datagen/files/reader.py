@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -48,6 +48,12 @@ class Piece:
     maps: int
 
 
+@lru_cache(maxsize=16)
+def _read_recipe(text: str, origin: str) -> Recipe:
+    """The recipe in a manifest, checked; kept, since to check it takes longer than to read a map."""
+    return recipe_from_dict(json.loads(text), origin)
+
+
 class TerrainDataset:
     """Reads a dataset.
 
@@ -76,7 +82,7 @@ class TerrainDataset:
     @cached_property
     def recipe(self) -> Recipe:
         """The recipe that the file was made by; of the first part where it was made from several."""
-        return recipe_from_dict(self.manifest["recipes"][0], f"in {self.path}")
+        return _read_recipe(json.dumps(self.manifest["recipes"][0]), f"in {self.path}")
 
     @property
     def grid(self) -> Grid:

@@ -18,6 +18,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
 from benchnav.files import sole_writer
+from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
@@ -382,8 +383,9 @@ def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) ->
 
 
 def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
-    dataset: TerrainDataset, whole: tuple[Path, TerrainClassifier], tmp_path: Path
-) -> None:
+    dataset: TerrainDataset, whole: tuple[Path, TerrainClassifier], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     command = [sys.executable, "-c", "from benchnav.models.cli import main; main()", "classifier"]
     command += ["--data", str(dataset.path), "--out", str(tmp_path / "m"), "--seed", "1"]
     command += ["--trainer.precision", "32-true", "--device", "cpu", "--half-precision", "false"]
@@ -397,9 +399,11 @@ def test_a_command_that_is_killed_and_resumed_ends_as_if_it_had_not_been(
     process.kill()
     process.wait()
     assert not (tmp_path / "m").exists()
-    refused = subprocess.run(command, capture_output=True, text=True)
-    assert refused.returncode == 2
-    assert "--resume" in refused.stderr
+    monkeypatch.setattr(sys, "argv", ["benchnav-train", *command[3:]])
+    with pytest.raises(SystemExit) as refused:
+        cli.main()
+    assert refused.value.code == 2
+    assert "--resume" in capsys.readouterr().err
     subprocess.run([*command, "--resume"], capture_output=True, env=environment, check=True)
     there = load_checkpoint(tmp_path / "m").part("classifier")
     for name, value in whole[1].state_dict().items():
