@@ -30,10 +30,11 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/benchnav-eval run --config demo --out runs/demo --jobs $(JOBS)
 
-# Tests run beside one another, and so do the commands that they start: a thread each. They plan on many small maps, each
-# of which would be compiled for; what is compiled is tried in tests of its own.
+# Tests run beside one another, and so do the commands that they start: a thread each. One process more than there are
+# processors works while others wait for commands. They plan on many small maps, each of which would be compiled for; what
+# is compiled is tried in tests of its own.
 test: $(STAMP)
-	OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	OMP_NUM_THREADS=1 TORCH_COMPILE_DISABLE=1 $(BIN)/python -m pytest -n $$(($(JOBS) + 1)) --dist loadfile --no-loadscope-reorder
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -n $(JOBS) -m slow

@@ -198,6 +198,8 @@ class TraversabilityMixture:
         at = value.unsqueeze(-3)
         component = torch.where(at <= 0, mass_at_0, torch.where(at >= 1, mass_at_1, density))
         total = torch.logsumexp(component + weights.log(), dim=-3)
+        # At an end it is a probability, which rounding must not bring above 1.
+        total = torch.where((value <= 0) | (value >= 1), total.clamp(max=0), total)
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.weights.dtype)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:

@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import optimize, stats
 from torch._subclasses.fake_tensor import FakeTensorMode
@@ -179,6 +179,7 @@ def test_risk_measures_are_ordered_finite_and_in_range(weights, means, stds, lev
     off=st.floats(-1e-4, 1e-4),
     dtype=st.sampled_from([torch.float32, torch.float64]),
 )
+@example([1.0, 1.0, 0.5, 1.0], [-3.0] * 5, 0.0, 0.0, torch.float64)
 @settings(max_examples=200, deadline=None)
 def test_weights_that_sum_to_nearly_1_tell_of_what_those_do_that_sum_to_it(
     weights, means, std, off, dtype
