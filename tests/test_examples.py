@@ -37,10 +37,10 @@ def test_a_model_of_ones_own_beats_a_constant_and_the_oracle_beats_both(tmp_path
 
 
 def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:
-    """Runs `benchnav-eval run`, as a user does, and gives the rows."""
+    """Runs `benchnav-eval run` with two jobs, as a user does, and gives the rows."""
     command = [
         Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle",
-        "--instances", "2", "--scenarios", "[std]", "--record", "none", "--out", "run",
+        "--instances", "2", "--scenarios", "[std]", "--record", "none", "--jobs", "2", "--out", "run",
         "--time_budget_s", "60",
     ]  # fmt: skip
     done = subprocess.run(
@@ -62,8 +62,6 @@ def test_a_planner_and_a_risk_measure_of_ones_own_by_file(dataset_path: Path, tm
         "[straight,./own_planner.py:Fan]",
         "--risks",
         "[mean,./own_risk.py:worst]",
-        "--jobs",
-        "2",
     )
     cells = rows.groupby(["planner", "risk"]).size()
     assert dict(cells) == {("straight", "–"): 2, ("Fan", "mean"): 2, ("Fan", "worst"): 2}
@@ -76,7 +74,7 @@ def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_pa
     assert len(path.read_text().splitlines()) < 40
     rows = evaluate(
         dataset_path, tmp_path, "--robots", f"[{path}:Tracked]", "--objectives", f"[{path}:Energy]",
-        "--planners", "[straight,astar_dwa]", "--risks", "[mean]",
+        "--planners", "[straight,astar_dwa,mppi]", "--risks", "[mean]", "--planner_options", "{mppi: {samples: 128}}",
     )  # fmt: skip
     assert set(rows["robot"]) == {"Tracked"}
     assert set(rows["objective"]) == {"Energy"}

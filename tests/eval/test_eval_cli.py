@@ -41,14 +41,14 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert evaluate(monkeypatch, "report", str(out)) == 0
     assert evaluate(monkeypatch, "replay", str(out), "--view", "false") == 0
     assert ".rrd" in capsys.readouterr().out
-    # The same command again finds all done; with another seed it extends the run. Reports take longer than runs.
-    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
+    # The same command again finds all done; with another seed it extends the run.
     again = ("run", "--data", str(dataset_path), "--out", str(out), *SMALL)
     assert evaluate(monkeypatch, *again) == 0
     assert "2 of 2 units were there already" in capsys.readouterr().err
     assert evaluate(monkeypatch, *again, "--seed", "1") == 0
     assert "2 of 4 units were there already" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
+    monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)  # a report takes longer than a run
     assert evaluate(monkeypatch, *again, "--overwrite", "true", "--instances", "99") == 2
     assert (out / "episodes.parquet").exists()
     assert evaluate(monkeypatch, *again, "--overwrite") == 0

@@ -30,13 +30,12 @@ def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
         planners=(planner,),
         risks=("mean",),
         scenarios=("std",),
-        instances=10,
         planner_options={planner: FEW_SAMPLES[planner]} if planner in FEW_SAMPLES else {},
         record="none",
     )
     for _ in run_suite(suite, tmp_path / "run"):
         pass
-    assert pd.read_parquet(tmp_path / "run" / "episodes.parquet")["success"].sum() >= 9
+    assert pd.read_parquet(tmp_path / "run" / "episodes.parquet")["success"].sum() >= 18
 
 
 # `straight` with the oracle on the first maps of std, in the world `paper`, seed 0: total time, path length, λ̄.

@@ -14,12 +14,7 @@ from tests import factories
 from tests.planning.planners.driving import Drive, drive
 
 FEW = {"samples": 256}
-OPTIONS: dict[str, dict[str, Any]] = {
-    "astar_dwa": {"dwa": {"horizon_s": 3.0}},
-    "astar_mppi": {"mppi": FEW},
-    "cl_rrt": {"expansions": 200},
-    "mppi": FEW,
-}
+OPTIONS: dict[str, dict[str, Any]] = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 200}}
 NAMES = registry.names("planner")
 # MPPI looks as far as its horizon alone and `straight` not at all; the others have a path over the whole map.
 GLOBAL = sorted(set(NAMES) - {"mppi", "straight"})
