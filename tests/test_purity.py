@@ -11,7 +11,7 @@ from benchnav import gridgraph, registry, rng
 from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.datagen.schema import entry_digests
+from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth import appearance, slope
 from benchnav.datagen.synth.generate import generate
 from benchnav.planning import risk
@@ -63,7 +63,7 @@ def test_datagen() -> None:
     same_after(lambda: generate(tiny_recipe(), "test/hg", indices), indices)
     same_after(lambda: rng.normal(1, indices, (3,)), indices)
     maps = generate(tiny_recipe(), "test/hg", np.arange(2))
-    same_after(lambda: entry_digests(maps), *maps.values())
+    same_after(lambda: entry_digests(maps, FIELDS), *maps.values())
     entry = {"scenario": "hg", "maps": 2, "parts": []}
     same_after(lambda: pack("d", tiny_recipe(), "test/hg", entry, maps), *maps.values())
 

@@ -89,18 +89,17 @@ def fields_in(maps: Mapping[str, np.ndarray]) -> dict[str, Field]:
     return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
 
 
-def entry_digests(maps: Mapping[str, np.ndarray], fields: Mapping[str, Field] | None = None) -> np.ndarray:
+def entry_digests(maps: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -> np.ndarray:
     """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
 
     Args:
         maps: arrays by field, each of shape [B, *entry shape].
-        fields: the F fields to digest; None for `fields_in(maps)`.
+        fields: the F fields to digest.
 
     Returns:
         uint8, shape [B, F, 32].
     """
     columns = []
-    fields = fields_in(maps) if fields is None else fields
     for name, field in fields.items():
         entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
         columns.append([hashlib.sha256(entry.tobytes()).digest() for entry in entries])

@@ -214,7 +214,8 @@ def test_maps_closer_than_their_width_overlap(tmp_path: Path) -> None:
 def test_maps_that_overlap_are_of_one_group_and_ground_apart_is_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
-    monkeypatch.setattr(importer, "SHARD_CELLS", 4 * 16 * 24)  # several files of a split
+    monkeypatch.setattr(importer, "SHARD_CELLS", 4 * 16 * 24)
+    monkeypatch.setattr(importer, "_CELLS_AT_ONCE", 4 * 16 * 24)  # so that a split has several files
     values = rough(16, 160)
     values[:, 70:80] = np.nan  # no map that shows these is kept
     dataset = read(write(tmp_path / "dem.tif", values), stride_m=1.5, suffix=suffix)

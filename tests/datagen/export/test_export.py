@@ -18,7 +18,7 @@ import yaml
 
 from benchnav.datagen import cli, schema
 from benchnav.datagen.export import parquet
-from benchnav.datagen.export.croissant import Publication
+from benchnav.datagen.export.croissant import Publication, is_ours
 from benchnav.datagen.export.export import export
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
@@ -105,6 +105,7 @@ def test_the_metadata_of_parquet_files_makes_the_maps_again(dataset_path: Path, 
     assert about["digest"] == dataset.splits["test/hg"]["digest"]
     assert about["recipes"] == json.loads(json.dumps(dataset.manifest["recipes"]))
     assert (about["id"], about["split"], about["maps"]) == (dataset.id, "test/hg", 2)
+    assert about["truth"] == "generated"
     assert found.field("elevation_m").metadata == {
         b"shape": b"[32, 32]", b"unit": b"m", b"meaning": b"elevation, in steps of 2^-13 m",
     }  # fmt: skip
@@ -307,6 +308,13 @@ def test_imported_maps_need_a_licence_and_a_creator(
     assert "maps are not of a shipped recipe" in capsys.readouterr().err
     assert datagen("export", dataset_path, "--out", "out", *OWN) == 0
     assert "file site.tif" in metadata(Path("out"))["description"]
+    about = {
+        split: json.loads(
+            pq.read_schema(Path(f"out/data/{split}-00000-of-00001.parquet")).metadata[b"benchnav"]
+        )
+        for split in ("train", "valid")
+    }
+    assert (about["train"]["truth"], about["valid"]["truth"]) == ("generated", "unknown")
 
 
 def test_maps_of_others_are_never_ours(
@@ -356,6 +364,11 @@ def test_maps_of_others_are_never_ours(
         == ["# BenchNav tiny-v1" in card for card in cards]
         == [True, False]
     )
+    both = TerrainDataset(own)
+    assert is_ours(both, ["test/std"])
+    both.manifest["recipes"] += TerrainDataset(Path("mine.h5")).manifest["recipes"]
+    both.manifest["splits"]["test/std"]["parts"].append({"maps": 1, "recipe": 1})
+    assert not is_ours(both, ["test/std"])
 
 
 def test_the_documented_lines_make_arrays_of_parquet(dataset_path: Path, tmp_path: Path) -> None:
@@ -399,7 +412,7 @@ def test_a_killed_export_leaves_nothing_under_its_name(dataset_path: Path, tmp_p
     killed = f"""
 import os
 from pathlib import Path
-from benchnav.datagen.export.croissant import Publication
+from benchnav.datagen.export.croissant import Publication, is_ours
 from benchnav.datagen.export.export import export
 from benchnav.datagen.files.reader import TerrainDataset
 for done, total in export(TerrainDataset({str(dataset_path)!r}), Path({str(tmp_path / "out")!r}), Publication()):

@@ -140,6 +140,9 @@ def test_recorded_digests_cover_what_maps_mean(tmp_path: Path) -> None:
     other.manifest["splits"][split]["parts"] = [{"maps": 8, "source": {}}]
     assert (dataset.truth_of(split), other.truth_of(split)) == ("generated", "unknown")
     assert other.truth_of("valid") == "generated"
+    mixed = TerrainDataset(dataset.path)
+    mixed.manifest["splits"][split]["parts"] = [{"maps": 7, "recipe": 0}, {"maps": 1, "source": {}}]
+    assert mixed.truth_of(split) == "unknown"
     digests.add(other.split_digest(split))
     assert len(digests) == 5
     assert dataset.about_digest("train") == dataset.about_digest("valid")

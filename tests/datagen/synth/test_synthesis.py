@@ -13,7 +13,7 @@ from benchnav import rng
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe, recipe_from_dict
 from benchnav.datagen.recipe.scenario import blend
-from benchnav.datagen.schema import entry_digests
+from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth import elevation
 from benchnav.datagen.synth.generate import generate, reference_time_s
 from benchnav.errors import ConfigError
@@ -302,5 +302,5 @@ def test_the_presets_of_a_recipe_are_those_of_its_synthesis() -> None:
     ],
 )
 def test_the_maps_of_stakes_v1_stay_as_models_were_trained_on(split: str, digest: str) -> None:
-    made = entry_digests(generate(STAKES, split, np.arange(2)))
+    made = entry_digests(generate(STAKES, split, np.arange(2)), FIELDS)
     assert hashlib.sha256(made.tobytes()).hexdigest() == digest
