@@ -73,7 +73,8 @@ def drive_straight(instance: int) -> tuple[float, float, float]:
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["std", "hg", "hs"])
 def test_astar_dwa_never_stalls_under_any_risk_setting(scenario: str, tmp_path: Path) -> None:
-    suite = Suite(planners=("astar_dwa",), scenarios=(scenario,), record="none")
+    risks = ("cvar", "var", "mean", "single-class")
+    suite = Suite(planners=("astar_dwa",), risks=risks, scenarios=(scenario,), record="none")
     for _ in run_suite(suite, tmp_path / "run", jobs=2):
         pass
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
