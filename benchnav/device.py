@@ -47,14 +47,14 @@ def device_of_run(about: Mapping[str, Any]) -> torch.device:
     """Finds the device that a run was computed on.
 
     Args:
-        about: its `run.json`; one of a time when there was no choice names none.
+        about: its `run.json`.
 
     Raises:
         ConfigError: there is no such device here.
     """
-    if about.get("device", "cpu") == "cuda" and not torch.cuda.is_available():
+    if about["device"] == "cuda" and not torch.cuda.is_available():
         raise ConfigError("Expected a GPU, on which this run was computed, got none that PyTorch can use.")
-    return find_device(about.get("device", "cpu"))
+    return find_device(about["device"])
 
 
 def gpu_name(device: str | torch.device) -> str | None:

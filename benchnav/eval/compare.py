@@ -128,14 +128,8 @@ def read_trials(runs: Sequence[Run]) -> list[Compared]:
     """Reads the trials of runs, each with its episodes.
 
     Raises:
-        ConfigError: a run is not finished, or of format version 1, or there twice.
+        ConfigError: a run is not finished, or there twice.
     """
-    for run in runs:
-        if run.version == 1:
-            raise ConfigError(
-                f"Expected runs of format version 2, got {run.folder} of version 1, which does not say on what maps it "
-                "was. Run its suite again."
-            )
     names = _names([run.folder for run in runs])
     shared = Counter(trial for run in runs for trial in run.trials)
     found = []

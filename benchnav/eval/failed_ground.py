@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.errors import BenchnavError, ConfigError
+from benchnav.errors import BenchnavError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import Run, open_run
 from benchnav.eval.report.charts.failure_sheet import FailedGround
@@ -51,10 +51,6 @@ def ground_of_run(folder: Path) -> GroundOf:
 def _ground(run: Run, rows: pd.DataFrame) -> FailedGround:
     """The ground under one seed and realisation."""
     trial_id = rows["trial"].iloc[0]
-    if trial_id not in run.trials:
-        raise ConfigError(
-            f"Expected a run of this version, got {run.folder} of format version {run.version}."
-        )
     trial, extent = run.trials[trial_id]
     instances = tuple(int(i) for i in rows["instance"])
     _check_maps(run, trial, instances)

@@ -33,8 +33,6 @@ def find_episodes(
         ConfigError: the run has no such episode, or they are not on one map.
     """
     run = open_run(folder)
-    if run.version == 1:
-        raise ConfigError(f"Expected a run of this version to replay, got {folder} of benchnav 0.1.")
     found: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         asked = dict(zip(labels, values, strict=True))

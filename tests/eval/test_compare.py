@@ -1,4 +1,3 @@
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,10 +14,10 @@ from benchnav.eval.report.rendering import latex
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, find_pairs
 from benchnav.eval.trial import NOT_USED
+from tests.eval.forged import CODE, forge_run
 from tests.eval.report.made import row, rows, trial
 from tests.eval.stats.test_pairing import value_of
 
-VERSION_1 = Path(__file__).parent.parent / "data" / "run-1"
 MAPS = 12
 
 
@@ -37,7 +36,6 @@ def settings(shift: int = 0) -> pd.DataFrame:
 
 
 PAPER = {"noise": "resampled", "time_budget_s": 100.0}
-CODE = {"sources": "s", "versions": {"torch": "2.1"}, "processor": "AVX2", "compiles": True}
 
 
 def run_folder(
@@ -61,15 +59,12 @@ def run_folder(
             "draws": [[int(seed), int(realisation), int(n)] for (seed, realisation), n in draws.items()],
         }
     about = {
-        "format": "benchnav-run", "format_version": 2, "run_id": "r", "trials": known, "suite": {},
-        "datasets": {"paper-v1": {"maps": {"test/std": [f"{i:x}" for i in range(MAPS)]}}},
-        "code": CODE, "planner_limit_s": 0.0, "device": "cpu", "gpu": None,
+        "datasets": {
+            "paper-v1": {"id": "paper-v1", "maps": {"test/std": [f"{i:x}" for i in range(MAPS)]}, "about": {}}
+        },
         "parts": {"planner mppi": {"origin": "file mppi.py", "digest": "1"}},
-    }  # fmt: skip
-    folder.mkdir(parents=True)
-    (folder / "run.json").write_text(json.dumps(about | changes))
-    episodes.to_parquet(folder / "episodes.parquet")
-    return folder
+    }
+    return forge_run(folder, episodes, known, **(about | changes))
 
 
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -336,7 +331,6 @@ def test_command_prints_and_writes(tmp_path: Path, monkeypatch, capsys) -> None:
         (("RUN", "--planner", "mpi"), "Did you mean 'mppi'"),
         (("RUN", "--points", "0"), r"`points` in (0, 100]"),
         (("RUN", "RUN"), "Expected runs that differ"),
-        (("RUN", str(VERSION_1)), "version 1"),
         (("RUN", "--by", "data"), "other maps"),
     ],
 )

@@ -1,6 +1,5 @@
 """Whatever of a run is edited, its report is refused in one line, or is what it was."""
 
-import json
 import random
 import shutil
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 from benchnav.errors import BenchnavError
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.find_episodes import find_episodes
-from benchnav.eval.folder.schema import SEAL
 from benchnav.eval.report.write import read_report
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
@@ -69,20 +67,3 @@ def test_an_edited_run_is_refused_or_read_as_it_was(count: int, run: Path, tmp_p
             assert after[2] == before[2], f"seed {seed}, {said}"
         shutil.rmtree(folder)
     assert refused > 0.9 * count
-
-
-@pytest.mark.parametrize("count", [25, pytest.param(300, marks=pytest.mark.slow)])
-def test_of_runs_without_a_seal_nothing_ends_in_a_traceback(count: int, run: Path, tmp_path: Path) -> None:
-    for seed in seeds(count):
-        chance = random.Random(-seed - 1)
-        folder = Path(shutil.copytree(run, tmp_path / "run"))
-        about = json.loads((folder / "run.json").read_text())
-        (folder / "run.json").write_text(
-            json.dumps({name: value for name, value in about.items() if name not in (SEAL, "tables")})
-        )
-        if chance.random() < 0.6:
-            edit_json(folder / "run.json", chance)
-        else:
-            edit_table(folder / "episodes.parquet", chance)
-        outcome(folder)
-        shutil.rmtree(folder)

@@ -1,11 +1,13 @@
-"""Run folders, format version 3: what lies where, and how it is read.
+"""Run folders, format version 4: what lies where, and how it is read.
 
 A run folder holds `run.json` (trials, and where everything came from), `units/` (what is finished: one
 Parquet file a unit, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
 when all is done, `episodes.parquet`, `errors.txt` where a planner or model failed, and the report. Every file
-is written under another name first. Version 2 had all steps within the files of units and in one table.
+is written under another name first. `run.json` ends in a seal, the digest of all else in it, and holds the digests
+of the run's tables, so that an edit of either is found.
 """
 
+import hashlib
 import json
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,7 +21,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder import schema
 from benchnav.eval.keep import Keep
 from benchnav.eval.trial import Trial, trial_from
 from benchnav.eval.unit import Extent, Unit
@@ -27,8 +28,10 @@ from benchnav.files import replacing, write_text
 from benchnav.options import one_line
 from benchnav.share import Share
 
-FORMAT, FORMAT_VERSION = "benchnav-run", 3
+FORMAT, FORMAT_VERSION = "benchnav-run", 4
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
+SEAL = "seal"
+KEYS = ["trial", "seed", "realisation", "instance"]  # of a row
 
 _METADATA = b"benchnav"
 
@@ -39,6 +42,10 @@ _DAMAGE = (
 )
 
 
+class DamageError(ValueError):
+    """A file of a run does not hold what it has to."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Run:
     """A run folder that was found.
@@ -46,14 +53,12 @@ class Run:
     Args:
         folder: where.
         about: all of `run.json`.
-        version: of its format; 1 is that of benchnav 0.1.
-        trials: by id, with how often each is run; none in version 1.
+        trials: by id, with how often each is run.
         shard: which share of the run the folder holds; None where it holds all.
     """
 
     folder: Path
     about: dict[str, Any]
-    version: int
     trials: dict[str, tuple[Trial, Extent]]
     shard: Share | None = None
 
@@ -62,7 +67,7 @@ def open_run(folder: Path) -> Run:
     """Reads what a run folder is about.
 
     Raises:
-        ConfigError: the folder is no run folder, or of a newer format.
+        ConfigError: the folder is no run folder, or of another format version.
     """
     if not (folder / RUN).is_file():
         raise ConfigError(
@@ -71,47 +76,62 @@ def open_run(folder: Path) -> Run:
     with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
         about = json.loads((folder / RUN).read_text())
         version = _format_version(about)
-    if version > FORMAT_VERSION:
+    if version != FORMAT_VERSION:
+        reader = (
+            "a newer benchnav" if version > FORMAT_VERSION else "benchnav 0.7, which reads versions 1 to 3"
+        )
         raise ConfigError(
-            f"Expected a run folder of format version at most {FORMAT_VERSION}, got {folder} of version "
-            f"{version}. Read it with a newer benchnav: pip install --upgrade benchnav."
+            f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. Read it "
+            f"with {reader}, or run its suite again."
         )
     with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
-        schema.check_about(about, version)
-        known = {} if version == 1 else about["trials"]
-        trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in known.items()}
+        if _sealed(about) != about:
+            raise DamageError("it was changed after benchnav wrote it")
+        trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in about["trials"].items()}
         shard = Share(**about["shard"]) if "shard" in about else None
-    return Run(folder=folder, about=about, version=version, trials=trials, shard=shard)
+    return Run(folder=folder, about=about, trials=trials, shard=shard)
 
 
 def _format_version(about: Any) -> int:
     """The version of `run.json`; before there was one it had no format, but the command that made it."""
     if not isinstance(about, dict):
-        raise schema.DamageError("it is no mapping")
+        raise DamageError("it is no mapping")
     if "format" not in about and "command" in about:
         return 1
     version = about.get("format_version")
-    if about.get("format") != FORMAT or type(version) is not int or version < 2:
-        raise schema.DamageError("it does not say that it is a run, or of which version")
+    if about.get("format") != FORMAT or type(version) is not int:
+        raise DamageError("it does not say that it is a run, or of which version")
     return version
 
 
 def write_run(folder: Path, about: Mapping[str, Any]) -> None:
     """Writes `run.json`, sealed."""
-    write_text(folder / RUN, json.dumps(schema.seal(about), indent=1))
+    write_text(folder / RUN, json.dumps(_sealed(about), indent=1))
+
+
+def _sealed(about: Mapping[str, Any]) -> dict[str, Any]:
+    """What `run.json` holds, with the digest of all of it."""
+    content = {name: value for name, value in about.items() if name != SEAL}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return {**content, SEAL: hashlib.sha256(text.encode()).hexdigest()}
+
+
+def _digest_of_file(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def caveats(about: Mapping[str, Any]) -> list[str]:
     """What readers of a run's tables should know: its warnings, and the pairs that it left out.
 
     Args:
-        about: of its `run.json` what there is of `warnings` and `dropped`.
+        about: of its `run.json` at least `warnings` and `dropped`.
     """
     left_out = [
         f"left out: planner {pair['planner']} with robot {pair['robot']}, which it cannot steer"
-        for pair in about.get("dropped", ())
+        for pair in about["dropped"]
     ]
-    return [*(f"warning: {line}" for line in about.get("warnings", ())), *left_out]
+    return [*(f"warning: {line}" for line in about["warnings"]), *left_out]
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
@@ -132,10 +152,9 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
             "finish it."
         )
     with damaged(path, "Remove it and give the run's command again."):
-        schema.check_table(path, run.about)
-        rows = pd.read_parquet(path)
-        schema.check_rows(rows, run.about, run.version)
-    return rows
+        if run.about.get("tables", {}).get(name) != _digest_of_file(path):
+            raise DamageError("it was changed after benchnav wrote it")
+        return pd.read_parquet(path)
 
 
 @contextmanager
@@ -146,7 +165,7 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
     except PermissionError:
         raise
     except _DAMAGE as error:
-        said = error if isinstance(error, schema.DamageError | ConfigError) else one_line(error)
+        said = error if isinstance(error, DamageError | ConfigError) else one_line(error)
         raise ConfigError(f"{path} is damaged: {said}. {remedy}") from error
 
 
@@ -180,16 +199,10 @@ def kept(folder: Path, unit: Unit, run_id: str) -> Keep:
     return Keep(**about["keep"]) if about else Keep()
 
 
-def making(folder: Path, unit: Unit) -> tuple[str, str] | None:
-    """Which making of a unit a folder holds, of any run: by the token, or by the run where that is of before tokens.
-
-    Returns:
-        The same for copies alone; None where there is no such unit.
-    """
-    about = _any_about(folder, unit)
-    if "made" in about:
-        return "made", about["made"]
-    return ("run", about["run_id"]) if "run_id" in about else None
+def making(folder: Path, unit: Unit) -> str | None:
+    """Which making of a unit a folder holds, of any run: the same for copies alone; None where it holds none."""
+    made: str | None = _any_about(folder, unit).get("made")
+    return made
 
 
 def _about(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
@@ -234,7 +247,7 @@ def finish_run(folder: Path, finished: Iterable[Unit]) -> None:
     about, finished = open_run(folder).about, list(finished)
     write_errors(folder, finished, about["run_id"])
     _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
-    tables = {EPISODES: schema.digest_of_file(folder / EPISODES)}
+    tables = {EPISODES: _digest_of_file(folder / EPISODES)}
     if about.get("tables") != tables:
         write_run(folder, {**about, "tables": tables})
 

@@ -162,13 +162,13 @@ def code_of(about: Mapping[str, Any], trial: Trial) -> dict[str, Any]:
 
 
 def _code(about: Mapping[str, Any]) -> dict[str, Any]:
-    """All that rows depend on beside trials and maps; runs of earlier versions do not say all of it."""
-    code = about.get("code", {})
+    """All that rows depend on beside trials and maps."""
+    code = about["code"]
     return {
-        **({"benchnav's own sources": {"digest": code["sources"]}} if "sources" in code else {}),
-        **code.get("versions", {}),
-        **{name: code[name] for name in ("processor", "compiles") if name in code},
-        **({"planner_limit_s": about["planner_limit_s"]} if "planner_limit_s" in about else {}),
+        "benchnav's own sources": {"digest": code["sources"]},
+        **code["versions"],
+        **{name: code[name] for name in ("processor", "compiles")},
+        "planner_limit_s": about["planner_limit_s"],
         "device": _device(about),
         **about["parts"],
     }
@@ -205,15 +205,16 @@ def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         meanings = now["datasets"].get(data, {}).get("about", {})
         changed += [
             f"class table, λ_stuck, resolution or kind of truth of {data} {split}"
-            for split, digest in about.get("about", {}).items()  # not recorded by earlier versions
+            for split, digest in about["about"].items()
             if meanings.get(split, digest) != digest
         ]
     return changed
 
 
 def _device(about: Mapping[str, Any]) -> str:
-    """What a run is computed on; the CPU where a run of earlier versions does not say."""
-    return about.get("gpu") or about.get("device", "cpu")
+    """What a run is computed on."""
+    device: str = about["gpu"] or about["device"]
+    return device
 
 
 def _map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:

@@ -15,8 +15,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import damaged, open_run
-from benchnav.eval.folder.schema import DamageError
+from benchnav.eval.folder.folder import DamageError, damaged, open_run
 from benchnav.eval.unit import Unit
 from benchnav.files import replacing
 
@@ -64,7 +63,7 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
 
 
 def open_steps(folder: Path) -> ds.Dataset | None:
-    """Opens the steps of a run, of this or an earlier format version; None where none were kept.
+    """Opens the steps of a run; None where none were kept.
 
     Args:
         folder: the run folder.
@@ -72,12 +71,9 @@ def open_steps(folder: Path) -> ds.Dataset | None:
     Raises:
         ConfigError: a file of them is damaged.
     """
-    single = folder / "steps.parquet"
-    if not single.exists() and not any((folder / STEPS).glob("*/*.parquet")):
+    if not any((folder / STEPS).glob("*/*.parquet")):
         return None
     with damaged(folder / STEPS, _REMEDY):
-        if single.exists():
-            return ds.dataset(single)
         # By its type, since an id of digits alone would be taken for a number.
         parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
         return ds.dataset(folder / STEPS, partitioning=parts)
@@ -109,7 +105,7 @@ def rows_of(
 
 
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
-    """Reads steps of a run, those of earlier format versions too.
+    """Reads steps of a run.
 
     Args:
         folder: a run folder.
@@ -125,8 +121,7 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     """
     run = open_run(folder)
     wanted = {name: _several(value) for name, value in filters.items()}
-    if run.trials:
-        wanted = _by_trial({i: trial.labels for i, (trial, _) in run.trials.items()}, wanted)
+    wanted = _by_trial({i: trial.labels for i, (trial, _) in run.trials.items()}, wanted)
     source = open_steps(folder)
     if source is None:
         raise ConfigError(

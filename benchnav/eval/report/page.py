@@ -70,25 +70,24 @@ def write_page(
 
 
 def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Says where a run came from, (what, value), as far as `run.json` tells.
+    """Says where a run came from, (what, value).
 
     Args:
-        about: all of `run.json`, of either format version.
+        about: all of `run.json`.
     """
-    code, machine = about.get("code", {}), about.get("machine", {})
-    versions = code.get("versions", about.get("versions", {}))
-    lines = [("run", about.get("run_id", "")), ("sources of benchnav", code.get("sources", ""))]
-    lines += [(f"version of {name}", str(version)) for name, version in versions.items()]
-    lines.append(("processor", f"{machine.get('processor', '')} {code.get('processor', '')}".strip()))
-    lines += [("cores", str(machine["cores"]))] if "cores" in machine else []
-    lines += [("device", f"{about['device']} {about.get('gpu') or ''}".strip())] if "device" in about else []
-    lines += [("compiler", "yes" if code["compiles"] else "no")] if "compiles" in code else []
-    for data, known in about.get("datasets", {}).items():
+    code, machine = about["code"], about["machine"]
+    lines = [("run", about["run_id"]), ("sources of benchnav", code["sources"])]
+    lines += [(f"version of {name}", version) for name, version in code["versions"].items()]
+    lines.append(("processor", f"{machine['processor']} {code['processor']}".strip()))
+    lines.append(("cores", str(machine["cores"])))
+    lines.append(("device", f"{about['device']} {about['gpu'] or ''}".strip()))
+    lines.append(("compiler", "yes" if code["compiles"] else "no"))
+    for data, known in about["datasets"].items():
         maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
-    for part, identity in about.get("parts", {}).items():
+    for part, identity in about["parts"].items():
         lines.append((part, _identity(identity)))
-    seeds = dict.fromkeys(seed for trial in about.get("trials", {}).values() for seed in trial["seeds"])
+    seeds = dict.fromkeys(seed for trial in about["trials"].values() for seed in trial["seeds"])
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]
 

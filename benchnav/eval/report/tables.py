@@ -225,9 +225,9 @@ def _notes(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> tu
     marks = []
     for trial in summary["trial"]:
         about = trials[trial]
-        follows = about.get("follows", "J")
+        follows = about["follows"]
         texts = [] if follows in _USERS_OWN else [f"minimises, in place of the task's J: {follows}"]
-        own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about.get("remarks", ()))]
+        own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]
         marks.append(",".join(_raised(number) for number in own))
     return marks, [f"{_raised(number)} {text}" for text, number in numbers.items()]
 

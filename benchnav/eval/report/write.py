@@ -40,7 +40,6 @@ from benchnav.eval.report.tables import (
     maps_in_words,
     result_table,
 )
-from benchnav.eval.report.version1 import convert_about, convert_rows
 from benchnav.eval.stats.best import against_best, told_the_truth
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
@@ -98,7 +97,7 @@ class Report:
 
 
 def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
-    """Makes the report of a finished run, of either format version, and writes nothing.
+    """Makes the report of a finished run, and writes nothing.
 
     Args:
         folder: a finished run.
@@ -109,9 +108,6 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     """
     run, episodes = open_run(folder), read_table(folder, "episodes.parquet")
     about = run.about
-    if run.version == 1:
-        episodes = convert_rows(episodes, about)
-        about = {**about, **convert_about(about, episodes)}
     worlds = {trial: entry["value"]["world"] for trial, entry in about["trials"].items()}
     summary = summarise(episodes, worlds)
     tests = (
@@ -252,16 +248,16 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
         maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
         lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {maps}.")
     options = dict.fromkeys(
-        f"{trial['labels']['planner']} {change}" for trial in trials for change in trial.get("changed", ())
+        f"{trial['labels']['planner']} {change}" for trial in trials for change in trial["changed"]
     )
     return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
 
 
 def _redrawn(episodes: pd.DataFrame, trials: Mapping[str, Any]) -> list[str]:
-    """How often frozen λ was drawn again; runs of before there was such have no such column."""
+    """How often frozen λ was drawn again."""
     frozen = [name for name, about in trials.items() if about["value"]["world"]["noise"] == "frozen"]
     episodes = episodes[episodes["trial"].isin(frozen)]
-    if "redrawn" not in episodes or not episodes["redrawn"].any():
+    if not episodes["redrawn"].any():
         return []
     draws = ["data", "scenario", "world", "seed", "realisation", "instance"]
     # All trials met the same; where a model failed nothing was drawn.

@@ -175,7 +175,7 @@ def _subset(about: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
         "planner_limit_s": about["planner_limit_s"],
         "device": about["device"],
         "gpu": about["gpu"],
-        "datasets": {trial.data: {"id": dataset["id"], "maps": maps}},
+        "datasets": {trial.data: {"id": dataset["id"], "maps": maps, "about": dataset["about"]}},
     }
 
 

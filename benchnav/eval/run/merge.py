@@ -10,7 +10,6 @@ from typing import Any
 from benchnav.errors import ConfigError
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import (
-    FORMAT_VERSION,
     RUN,
     Run,
     about_unit,
@@ -96,10 +95,6 @@ def _open_shard(part: Path) -> Run:
         raise ConfigError(
             f"Expected folders of shards, made with `benchnav-eval run … --shard I/N`, got {part}, which is a whole "
             "run."
-        )
-    if run.version != FORMAT_VERSION:
-        raise ConfigError(
-            f"Expected shards of format version {FORMAT_VERSION}, got {part} of version {run.version}."
         )
     return run
 

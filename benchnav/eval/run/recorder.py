@@ -14,7 +14,6 @@ from benchnav.eval.report.playback.files import playback_path, write_playback
 from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, drawing_interval, drawn_plan, thinned
 from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S
-from benchnav.eval.report.recorded.version2 import is_snapshot
 from benchnav.eval.run.episode import build, one_thread, read_block, simulate
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import path_length_m
@@ -123,7 +122,7 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     out = out or folder
     for place in (folder, out):
         stored = playback_path(place, unit.stem(member), ".npz")
-        if stored.exists() and not is_snapshot(stored):
+        if stored.exists():
             return Recording.load(stored)
     row = _row(folder, unit, unit.instances[member])
     with one_thread():

@@ -17,7 +17,7 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.device import device_of_run
 from benchnav.errors import BenchnavError, ConfigError
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, RUN, Run, making, open_run, read_table
+from benchnav.eval.folder.folder import EPISODES, RUN, Run, making, open_run, read_table
 from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_everywhere
@@ -83,8 +83,8 @@ def rerun(
     work = Work(
         suite=run.about["suite"],
         trials=run.trials,
-        dropped=tuple(run.about.get("dropped", ())),
-        warnings=tuple(run.about.get("warnings", ())),
+        dropped=tuple(run.about["dropped"]),
+        warnings=tuple(run.about["warnings"]),
         hypotheses=run.about.get("hypotheses", {}),
         keep=Keep(),
         planner_limit_s=run.about["planner_limit_s"],
@@ -118,10 +118,6 @@ def compare(run_folder: Path, folder: Path) -> Comparison:
 
 def _open(folder: Path) -> Run:
     run = open_run(folder)
-    if run.version != FORMAT_VERSION:
-        raise ConfigError(
-            f"Expected a run of format version {FORMAT_VERSION} to repeat, got {folder} of version {run.version}."
-        )
     read_table(folder, EPISODES)
     return run
 

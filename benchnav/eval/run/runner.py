@@ -30,6 +30,7 @@ from benchnav.eval.folder.folder import (
     FORMAT,
     FORMAT_VERSION,
     RUN,
+    SEAL,
     about_unit,
     caveats,
     finish_run,
@@ -40,7 +41,6 @@ from benchnav.eval.folder.folder import (
     write_run,
     write_unit,
 )
-from benchnav.eval.folder.schema import SEAL
 from benchnav.eval.folder.steps import align_steps, write_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_suite
@@ -325,11 +325,6 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
         write_run(folder, about)
         return about, work.trials
     earlier = open_run(folder)
-    if earlier.version < FORMAT_VERSION:
-        raise ConfigError(
-            f"Expected `out` to be new or a run of format version {FORMAT_VERSION}, but {folder} is of version "
-            f"{earlier.version}, which can be reported and not gone on with. Choose another `out`."
-        )
     if earlier.shard != work.shard:
         raise ConfigError(
             f"Expected `out` to be new or to hold {_share(work.shard)}, but {folder} holds "
@@ -369,7 +364,7 @@ def _check_hypotheses(wanted: Mapping[str, Any], earlier: Mapping[str, Any], fol
 
 
 def _or_its_device(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    device = earlier.get("device", "cpu")
+    device = earlier["device"]
     return "" if device == now["device"] else f", pass --device {device}"
 
 

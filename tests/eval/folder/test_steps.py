@@ -1,6 +1,5 @@
 """Steps of a run, as partitioned Parquet."""
 
-import json
 import random
 import shutil
 from dataclasses import replace
@@ -13,7 +12,7 @@ import pytest
 import torch
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import EPISODES, read_table, write_run
+from benchnav.eval.folder.folder import EPISODES, read_table
 from benchnav.eval.folder.steps import align_steps, read_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.report.failures import failures_table
@@ -129,18 +128,6 @@ def test_steps_of_recorded_episodes_alone_or_none(dataset_path: Path, tmp_path: 
     assert not (none / "steps").exists()
     with pytest.raises(ConfigError, match="--steps all"):
         read_steps(none)
-
-
-def test_the_table_of_format_version_2_is_read(folder: Path, tmp_path: Path) -> None:
-    everything = read_steps(folder)
-    about = json.loads((folder / "run.json").read_text()) | {"format_version": 2}
-    write_run(tmp_path, about)
-    everything.to_parquet(tmp_path / "steps.parquet")
-    pd.testing.assert_frame_equal(read_steps(tmp_path), everything)
-    trial = everything["trial"].iloc[0]
-    pd.testing.assert_frame_equal(
-        read_steps(tmp_path, trial=trial, instance=1), read_steps(folder, trial=trial, instance=1)
-    )
 
 
 def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> None:

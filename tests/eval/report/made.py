@@ -40,7 +40,7 @@ def row(
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
         "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
-        "compiled": True, "error": "",
+        "redrawn": 0, "compiled": True, "error": "",
     }  # fmt: skip
     return made | changes
 
@@ -55,7 +55,7 @@ def trials(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[st
     """What `run.json` says of the trials; `follows` and `remarks` by planner."""
     return {
         name: {"value": PAPER | _model(group), "labels": {label: group[label].iloc[0] for label in LABELS}}
-        | {"follows": "", "remarks": [], "seeds": sorted(set(group["seed"].tolist()))}
+        | {"follows": "", "remarks": [], "changed": [], "seeds": sorted(set(group["seed"].tolist()))}
         | notes.get(group["planner"].iloc[0], {})
         for name, group in episodes.groupby("trial", sort=False)
     }

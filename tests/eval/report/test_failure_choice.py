@@ -44,7 +44,10 @@ def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, di
             ).assign(traversability=[0.2, np.nan])
             for row in rows.to_dict("records")
         ]
-        pd.concat(parts).to_parquet(folder / "steps.parquet", index=False)
+        for place, part in enumerate(parts):
+            path = folder / "steps" / f"trial={part['trial'].iloc[0]}" / f"{place}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.drop(columns="trial").to_parquet(path, index=False)
     summary = made.summary(rows)
     sheets = collect_sheets(folder, summary, failures_table(folder, rows), ground)
     return sheets, dict(zip(summary["risk"], summary["trial"], strict=True))

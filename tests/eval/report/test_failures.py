@@ -5,7 +5,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 
 from benchnav.eval.report.failures import failures_table
 from tests.eval.report import made
@@ -22,20 +21,15 @@ def steps(trial: str, instance: int, met: list[float], **changes: Any) -> pd.Dat
     return pd.DataFrame(columns | changes)
 
 
-def keep(folder: Path, *episodes: pd.DataFrame, parts: bool) -> None:
-    every = pd.concat(episodes)
-    if not parts:
-        every.to_parquet(folder / "steps.parquet", index=False)
-        return
-    for trial, rows in every.groupby("trial"):
+def keep(folder: Path, *episodes: pd.DataFrame) -> None:
+    for trial, rows in pd.concat(episodes).groupby("trial"):
         place = folder / "steps" / f"trial={trial}"
         place.mkdir(parents=True)
         table = pa.Table.from_pandas(rows.drop(columns="trial"), preserve_index=False)
         pq.write_table(table, place / "0-0-00000.parquet")
 
 
-@pytest.mark.parametrize("parts", [False, True])
-def test_where_and_on_what_failures_ended(parts: bool, tmp_path: Path) -> None:
+def test_where_and_on_what_failures_ended(tmp_path: Path) -> None:
     a, b = made.trial("mppi"), made.trial("cl_rrt")
     rows = made.rows(
         made.row(a, 0), made.row(a, 1, None, outcome="immobilised", end_time_s=3.0), made.row(b, 1, None)
@@ -49,7 +43,6 @@ def test_where_and_on_what_failures_ended(parts: bool, tmp_path: Path) -> None:
         steps(names[0], 0, [0.7] * 4),
         steps(names[0], 1, [0.9, 0.8, 0.1, 0.2, 0.3, 0.4]),
         steps(names[1], 1, [0.5], x_m=7.0),
-        parts=parts,
     )
     table = failures_table(tmp_path, rows)
     assert list(table["trial"]) == names
@@ -68,7 +61,6 @@ def test_episodes_are_told_apart_by_seed_and_realisation(tmp_path: Path) -> None
     keep(
         tmp_path,
         *(steps(trial, 0, [0.1 * (2 * s + r)], seed=s, realisation=r) for s in (0, 1) for r in (0, 1)),
-        parts=False,
     )
     np.testing.assert_allclose(
         failures_table(tmp_path, rows)["end_traversability"], [0, 0.1, 0.2, 0.3], atol=1e-7
@@ -86,7 +78,7 @@ def test_without_steps_there_is_no_place(tmp_path: Path) -> None:
 
 def test_a_run_without_failures_has_an_empty_table(tmp_path: Path) -> None:
     rows = made.rows(made.row(made.trial(), 0))
-    keep(tmp_path, steps(rows["trial"][0], 0, [0.5]), parts=False)
+    keep(tmp_path, steps(rows["trial"][0], 0, [0.5]))
     table = failures_table(tmp_path, rows)
     assert table.empty
     assert {"outcome", "x_m", "last_traversability"} <= set(table.columns)

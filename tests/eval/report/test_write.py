@@ -1,5 +1,4 @@
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,12 +6,12 @@ import pandas as pd
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import write_run
 from benchnav.eval.report import write
 from benchnav.eval.report.playback.files import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
+from tests.eval.forged import forge_run
 from tests.eval.report import made
-
-VERSION_1 = Path(__file__).parent.parent.parent / "data" / "run-1"
 
 
 def episodes() -> pd.DataFrame:
@@ -43,14 +42,8 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         }
         for name, about in known.items()
     }
-    about = {
-        "format": "benchnav-run", "format_version": 2, "run_id": "r", "trials": known, "suite": {},
-        "commands": ["benchnav-eval run --seeds '[0,7]'"],
-    }  # fmt: skip
-    folder.mkdir()
-    (folder / "run.json").write_text(json.dumps(about | changes))
-    rows.to_parquet(folder / "episodes.parquet")
-    return folder
+    commands = ["benchnav-eval run --seeds '[0,7]'"]
+    return forge_run(folder, rows, known, **({"commands": commands} | changes))
 
 
 @pytest.mark.usefixtures("whole_fonts")
@@ -110,7 +103,7 @@ def test_options_of_planners_stand_in_the_header(tmp_path: Path) -> None:
     for trial in about["trials"].values():
         if trial["labels"]["planner"] == "cl_rrt":
             trial["changed"] = ["expansions = 64", "follower.speed_mps = 0.5"]
-    (folder / "run.json").write_text(json.dumps(about))
+    write_run(folder, about)
     line = "Planner options: cl_rrt expansions = 64, cl_rrt follower.speed_mps = 0.5."
     assert line in read_report(folder).header
 
@@ -185,30 +178,6 @@ def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:
         write_report(tmp_path)
 
 
-def test_a_run_of_0_1_is_reported(tmp_path: Path) -> None:
-    folder = tmp_path / "run-1"
-    shutil.copytree(VERSION_1, folder)
-    (row,) = write_report(folder).summary.to_dict("records")
-    assert (row["data"], row["model"], row["planner"], row["risk"]) == ("paper-v1", "oracle", "mppi", "mean")
-    assert (row["robot"], row["objective"], row["world"]) == (
-        "unicycle", "goal_distance", "paper time_budget_s=30"
-    )  # fmt: skip
-    assert (row["n_episodes"], row["n_maps"], row["success_rate"], row["timeout_count"]) == (2, 2, 0.5, 1)
-    assert row["total_time_mean_s"] == pytest.approx(29.75)
-    assert row["success_time_mean_s"] == pytest.approx(29.5)
-    old = pd.read_parquet(VERSION_1 / "episodes.parquet")
-    assert row["traversability_mean"] == pytest.approx(old["traversability"].mean())
-    # A change of the turn rate a step of 0.1 s, and now a second.
-    assert row["roughness_mean_radps2"] == pytest.approx(10 * old["roughness"].mean())
-    assert (row["score_n"], np.isnan(row["planning_ms_median"])) == (0, True)
-    text = (folder / "summary.md").read_text()
-    assert "- World paper time_budget_s=30: λ resampled, T = 30 s." in text
-    assert "mppi samples = 64" in text
-    assert "| std | mppi¹ | mean | 50 | 9–91 | 29.8 | 29.5 | 82.8 ± 6.6 | 1 timeout |" in text
-    assert "benchnav-eval run --model oracle" in text
-    assert (folder / "figures" / "success.png").stat().st_size > 1000
-
-
 def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_failed(tmp_path: Path) -> None:
     """Two trials met the same three draws, of which one was the third; one of a resampled world met none."""
     worlds = {"a": "frozen", "b": "frozen", "c": "resampled"}
@@ -225,7 +194,6 @@ def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_faile
     (line,) = write._redrawn(rows, trials)
     assert line.startswith("Of the draws of λ 50.0 %")
     assert write._redrawn(rows[rows["trial"] == "c"], trials) == []
-    assert write._redrawn(rows.drop(columns="redrawn"), trials) == []
 
 
 def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
@@ -237,7 +205,7 @@ def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
     for trial in about["trials"].values():
         part, _, level = trial["labels"]["risk"].partition(":")
         trial["value"]["risk"] = {"part": part, "options": {"level": float(level)}}
-    (folder / "run.json").write_text(json.dumps(about))
+    write_run(folder, about)
     write_report(folder)
     assert (folder / "figures" / "over-level.pdf").stat().st_size > 1000
     assert "![over-level](figures/over-level.png)" in (folder / "summary.md").read_text()

@@ -184,6 +184,14 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Pat
     same(tmp_path / "here", tmp_path / "run")
 
 
+def test_a_worker_is_told_all_that_its_maps_have_to_be(dataset_path: Path, tmp_path: Path) -> None:
+    suite = suite_on(dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,))
+    list(run_suite(suite, tmp_path / "run"))
+    run = open_run(tmp_path / "run")
+    (unit,) = units(run.trials, Keep())
+    assert cluster._subset(run.about, unit)["datasets"] == provenance.describe_maps(run.trials)
+
+
 def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

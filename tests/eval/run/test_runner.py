@@ -88,7 +88,7 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     assert set(episodes["planner"]) == set(PLANNERS)
     assert set(episodes[episodes["planner"] == "straight"]["risk"]) == {"–"}
     about = json.loads((folder / "run.json").read_text())
-    assert (about["format"], about["format_version"]) == ("benchnav-run", 3)
+    assert (about["format"], about["format_version"]) == ("benchnav-run", 4)
     assert about["code"]["versions"]["torch"] == torch.__version__.split("+")[0]
     (data,) = about["datasets"].values()
     assert [len(digests) for digests in data["maps"].values()] == [2, 2]
@@ -388,12 +388,6 @@ def test_overwrite_drops_run_folders_alone(dataset_path: Path, tmp_path: Path) -
     with pytest.raises(ConfigError, match="something else"):
         finish(quick(dataset_path), tmp_path / "run")
     assert precious.read_text() == "years"
-
-
-def test_a_run_of_the_first_format_is_not_gone_on_with(dataset_path: Path, tmp_path: Path) -> None:
-    shutil.copytree(Path(__file__).parents[2] / "data" / "run-1", tmp_path / "run")
-    with pytest.raises(ConfigError, match="version 1"):
-        finish(quick(dataset_path), tmp_path / "run")
 
 
 def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:

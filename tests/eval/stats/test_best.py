@@ -191,8 +191,7 @@ def test_a_yardstick_is_known_by_its_part_and_not_by_its_name() -> None:
         "b": about("checkpoints/mine", "oracle"),
         "c": about("oracle", "–"),
     }
-    old = {"d": {"value": {}, "labels": {}}}  # as format version 1 had it
-    assert told_the_truth(trials | old) == {"a": "oracle"}
+    assert told_the_truth(trials) == {"a": "oracle"}
 
 
 def test_yardsticks_are_not_compared() -> None:

@@ -5,6 +5,8 @@ Letters in shapes: N steps, H×W cells, S state and A action dimensions.
 """
 
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +16,6 @@ import numpy as np
 from benchnav.errors import ConfigError
 from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, join_plans, split_plans, thinned
 from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S, Snapshot
-from benchnav.eval.report.recorded.version2 import DAMAGE, is_snapshot, read_snapshot
 from benchnav.files import replacing
 from benchnav.grid import Grid
 
@@ -23,6 +24,8 @@ _ARRAYS = (
     *("goal_m", "states", "actions", "traversability"),
 )
 _PLANS = "plans:"
+# What reading a damaged archive raises.
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +158,7 @@ class Recording:
                 plans=split_plans(plans),
                 **arrays,
             )
-        except DAMAGE as error:
+        except _DAMAGE as error:
             raise ConfigError(f"{path} is damaged: {error}. Remove it; `replay` makes it again.") from error
 
 
@@ -184,8 +187,5 @@ def take_snapshot(recording: Recording, time_s: float | None = None) -> Snapshot
 
 
 def read_snapshots(folder: Path) -> list[Snapshot]:
-    """Takes every recorded episode of a run at the moment of figures, those of format version 2 too."""
-    paths = sorted((folder / "playback").glob("*.npz"))
-    return [
-        read_snapshot(path) if is_snapshot(path) else take_snapshot(Recording.load(path)) for path in paths
-    ]
+    """Takes every recorded episode of a run at the moment of figures."""
+    return [take_snapshot(Recording.load(path)) for path in sorted((folder / "playback").glob("*.npz"))]

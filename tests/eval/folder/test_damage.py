@@ -1,0 +1,71 @@
+"""A file of a run that is not what it has to be is said to be damaged, with how."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import EPISODES, SEAL, open_run, read_table
+from benchnav.eval.run.runner import run_suite
+from benchnav.eval.suite import Suite
+
+
+@pytest.fixture(scope="module")
+def made(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("schema") / "run"
+    suite = Suite(
+        data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty",), risks=("mean", "cvar:0.5"),
+        scenarios=("std",), instances=2, seeds=(0, 3), time_budget_s=2.0, record="none", steps="none",
+    )  # fmt: skip
+    list(run_suite(suite, folder))
+    return folder
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", "null", '{"format": "benchnav-run"}', "[" * 100000])
+def test_an_empty_or_truncated_file_is_damaged_and_a_missing_one_is_none(text: str, run: Path) -> None:
+    (run / "run.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"run\.json is damaged: "):
+        open_run(run)
+    (run / "run.json").unlink()
+    with pytest.raises(ConfigError, match=r"Expected a run folder with run\.json"):
+        open_run(run)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 5])
+def test_runs_of_other_formats_are_refused_with_what_reads_them(version: int, run: Path) -> None:
+    about = (
+        {"command": "benchnav-eval"} if version == 1 else {**open_run(run).about, "format_version": version}
+    )
+    (run / "run.json").write_text(json.dumps(about))
+    reader = "a newer benchnav" if version == 5 else r"benchnav 0\.7"
+    with pytest.raises(
+        ConfigError, match=rf"format version 4, got .* of version {version}\. Read it with {reader}"
+    ):
+        open_run(run)
+
+
+def test_a_seal_that_does_not_fit_is_damage(run: Path) -> None:
+    text = (run / "run.json").read_text()
+    (run / "run.json").write_text(text.replace('"compiles": ', '"compiles":  '))
+    assert open_run(run).about["code"]  # as JSON it is the same
+    (run / "run.json").write_text(text.replace('"date": "2', '"date": "3'))
+    with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
+        open_run(run)
+
+
+def test_a_table_or_a_seal_that_was_changed_or_taken_away_is_damage(run: Path) -> None:
+    pd.read_parquet(run / EPISODES).iloc[:-1].to_parquet(run / EPISODES)
+    with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
+        read_table(run, EPISODES)
+    about = open_run(run).about
+    (run / "run.json").write_text(json.dumps({name: value for name, value in about.items() if name != SEAL}))
+    with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
+        open_run(run)
