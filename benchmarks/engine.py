@@ -69,8 +69,8 @@ def problem_of(episodes: int) -> Problem:
 def plan_ms(planner: Any, problem: Problem) -> float:
     """Time of a step of a planner that has begun, an episode."""
     state = planner.init(problem, torch.Generator().manual_seed(0))
-    felt = torch.full((len(problem),), torch.nan)
-    step = Step(state=problem.start, felt=felt, time_s=0.0)
+    observed = torch.full((len(problem),), torch.nan)
+    step = Step(state=problem.start, traversability=observed, time_s=0.0)
     _, state, _ = planner.plan(step, state)
     return milliseconds(lambda: planner.plan(step, state)) / len(problem)
 

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import track
 
 from benchnav import registry, rng
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.run.episode import build, simulate
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Unit
 from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
@@ -46,7 +46,7 @@ def on_open_ground(planner: Planner[object], objective: str, seed: int) -> float
     plan_state, state = planner.init(problem, rng.generator(seed)), problem.start
     time_s = torch.full((3,), BUDGET_S)
     for count in range(1, round(BUDGET_S / robot.dt_s) + 1):
-        step = Step(state=state, felt=torch.full((3,), torch.nan), time_s=(count - 1) * robot.dt_s)
+        step = Step(state=state, traversability=torch.full((3,), torch.nan), time_s=(count - 1) * robot.dt_s)
         action, plan_state, _ = planner.plan(step, plan_state)
         state = robot(state, action, torch.full((3,), 0.9))
         arrived = distance(state, GOAL_M) < rules.goal_radius_m
@@ -63,8 +63,8 @@ def on_maps(options: dict[str, object], objective: str, scenario: str, seed: int
         data="paper-v1-test", planners=(planner,), risks=("mean", "cvar:0.9"), objectives=(objective,)
     )
     times = []
-    for trial in trials_of(suite, lambda data: [scenario]):
-        unit = Unit(trial=trial, seed=seed, realisation=0, instances=tuple(range(maps)))
+    for condition in conditions_of(suite, lambda data: [scenario]):
+        unit = Unit(condition=condition, seed=seed, realisation=0, maps=tuple(range(maps)))
         problem, simulation = build(unit, "sweep")
         episodes, _ = simulate(unit, problem, simulation)
         arrived = episodes.outcome == int(Outcome.SUCCESS)

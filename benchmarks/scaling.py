@@ -48,7 +48,7 @@ def problem_of(episodes: int, size: int) -> Problem:
 def plan_ms(planner: Planner[object], problem: Problem) -> float:
     """Time of a step, an episode."""
     state = planner.init(problem, torch.Generator().manual_seed(0))
-    step = Step(state=problem.start, felt=torch.full((len(problem),), torch.nan), time_s=0.0)
+    step = Step(state=problem.start, traversability=torch.full((len(problem),), torch.nan), time_s=0.0)
     _, state, _ = planner.plan(step, state)
     return milliseconds(lambda: planner.plan(step, state), 11) / len(problem)
 

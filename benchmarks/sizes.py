@@ -123,7 +123,7 @@ def main() -> None:
             lines += [
                 run(folder, f"benchnav-datagen {LARGE_MAP}"),
                 run(folder, "benchnav-train evaluate paper-v1 --data wide.h5"),
-                run(folder, f"benchnav-eval {RUN} --instances 1 --out large"),
+                run(folder, f"benchnav-eval {RUN} --maps 1 --out large"),
             ]
         if given.only in (None, "many"):
             lines += [many_maps(folder), run(folder, "benchnav-datagen validate big")]

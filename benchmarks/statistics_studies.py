@@ -60,11 +60,11 @@ def chances(
 
 
 def outcomes(generator: np.random.Generator, chance: np.ndarray, draws: int, common: float) -> np.ndarray:
-    """Success, bool, shape [studies, trials, maps, draws]; a share of the luck is the same for all trials."""
+    """Success, bool, shape [studies, conditions, maps, draws]; a share of the noise is the same for all conditions."""
     shape = (*chance.shape, draws)
-    luck = np.broadcast_to(generator.random((shape[0], 1, *shape[2:])), shape)
+    noise = np.broadcast_to(generator.random((shape[0], 1, *shape[2:])), shape)
     own = generator.random(shape)
-    return np.where(generator.random(shape) < common, luck, own) < chance[..., None]
+    return np.where(generator.random(shape) < common, noise, own) < chance[..., None]
 
 
 def times(generator: np.random.Generator, success: np.ndarray, hardness: np.ndarray) -> np.ndarray:

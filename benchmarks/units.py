@@ -5,7 +5,7 @@
 
 The cells are the straight line and A*+DWA, on three scenarios, under six seeds; the oracle predicts, and the risk
 setting is the mean. One process runs them one after another, as a worker of `benchnav-eval run` does. Told of each
-planner: the median time of a unit, that of its overhead (reading and predicting maps, risk maps, drawing luck, tables
+planner: the median time of a unit, that of its overhead (reading and predicting maps, risk maps, drawing noise, tables
 and files), and the most memory that the process has held. About five minutes.
 """
 
@@ -20,10 +20,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.keep import Keep
 from benchnav.eval.run import runner
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent, units
 
 SCENARIOS, PLANNERS, SEEDS, MAPS = ("std", "hg", "hs"), ("straight", "astar_dwa"), 6, 200
@@ -33,7 +33,9 @@ def main() -> None:
     data = sys.argv[1] if len(sys.argv) > 1 else "full-v1"
     suite = Suite(data=data, model="oracle", planners=PLANNERS, risks=("mean",), scenarios=SCENARIOS)
     extent = Extent.product(range(SEEDS), 1, MAPS)
-    trials = {trial.id: (trial, extent) for trial in trials_of(suite, lambda data: list(SCENARIOS))}
+    conditions = {
+        condition.id: (condition, extent) for condition in conditions_of(suite, lambda data: list(SCENARIOS))
+    }
     driving: list[float] = []
     simulate = runner.simulate
 
@@ -47,10 +49,10 @@ def main() -> None:
     whole: dict[str, list[float]] = {}
     overhead: dict[str, list[float]] = {}
     with TemporaryDirectory() as folder:
-        for unit in units(trials, Keep(record="none")):
+        for unit in units(conditions, Keep(record="none")):
             start = time.perf_counter()
             runner.run_unit(unit, Path(folder), "benchmark")
-            took, label = time.perf_counter() - start, unit.trial.labels["planner"]
+            took, label = time.perf_counter() - start, unit.condition.labels["planner"]
             whole.setdefault(label, []).append(took)
             overhead.setdefault(label, []).append(took - driving[-1])
     table = Table("planner", "units", "a unit, s", "its overhead, ms", "most memory, GiB")

@@ -10,10 +10,10 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import MappingProxyType, NoneType, UnionType
+from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from benchnav.errors import ConfigError
@@ -33,7 +33,6 @@ class Known:
         defaults: default values of flags.
         positionals: names of what is given by place.
         configs: folder of shipped YAML files; None where there is none.
-        renamed: what to say in place of settings that had other names.
     """
 
     program: str
@@ -41,7 +40,6 @@ class Known:
     defaults: Mapping[str, Any]
     positionals: tuple[str, ...] = ()
     configs: Path | None = None
-    renamed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def shipped(self) -> dict[str, Path]:
@@ -55,7 +53,6 @@ def know(
     positionals: tuple[str, ...] = (),
     settings: type | None = None,
     configs: Path | None = None,
-    renamed: Mapping[str, str] = MappingProxyType({}),
 ) -> Known:
     """Tells what a subcommand knows; arguments as of `benchnav.command.Command`."""
     hints = {name: kind for name, kind in get_type_hints(function).items() if name != "return"}
@@ -77,7 +74,6 @@ def know(
         defaults=defaults,
         positionals=positionals,
         configs=configs,
-        renamed=renamed,
     )
 
 
@@ -219,7 +215,7 @@ def _known_name(flag: str, known: Known) -> tuple[str, tuple[str, ...]]:
     names = [f"--{other}" for other in known.kinds]
     raise ConfigError(
         f"Expected flags that `{known.program}` has, got {flag}."
-        f"{_renamed(name, known) or hint('--' + name, names)} "
+        f"{hint('--' + name, names)} "
         f"See `{known.program} --help`."
     )
 
@@ -326,7 +322,7 @@ def _check_keys(content: Mapping[str, Any], path: Path, known: Known, prefix: st
             here = [other for other in known.kinds if other.startswith(prefix) and other not in _ALONE]
             raise ConfigError(
                 f"Expected keys that `{known.program}` has in {path}, got {name!r}."
-                f"{_renamed(name, known) or hint(name, here)} "
+                f"{hint(name, here)} "
                 f"See `{known.program} --help`."
             )
         kind = known.kinds.get(name, Any)
@@ -334,10 +330,6 @@ def _check_keys(content: Mapping[str, Any], path: Path, known: Known, prefix: st
             raise ConfigError(f"Expected `{name}` in {path} as {in_words(kind)}, got nothing.")
         if isinstance(value, dict) and dataclass_in(kind):
             _check_keys(value, path, known, f"{name}.")
-
-
-def _renamed(name: str, known: Known) -> str:
-    return f" It is now {known.renamed[name]}." if name in known.renamed else ""
 
 
 def _members(kind: Any) -> tuple[Any, ...]:

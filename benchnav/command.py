@@ -8,8 +8,8 @@ import inspect
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
@@ -33,14 +33,12 @@ class Command:
             list takes what is left.
         settings: a dataclass whose fields become flags; one of it is the function's first argument.
         configs: folder of shipped YAML files, which `--config NAME` finds where there is no such file.
-        renamed: what to say in place of settings that had other names.
     """
 
     function: Callable[..., int | None]
     positionals: tuple[str, ...] = ()
     settings: type | None = None
     configs: Path | None = None
-    renamed: Mapping[str, str] = field(default_factory=dict)
 
 
 def run(

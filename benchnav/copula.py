@@ -1,4 +1,4 @@
-"""Correlated luck: fields of standard normal numbers that are alike where they are near.
+"""Correlated noise: fields of standard normal numbers that are alike where they are near.
 
 A field is white noise passed through a kernel ∝ exp(−d²/ℓ²), whose autocorrelation is exp(−d²/2ℓ²), and
 divided by the kernel's norm, so that every cell is standard normal. It is made on twice the extent, as a

@@ -6,6 +6,7 @@ The keyword parameters of a class or function are its options; where its one par
 
 import difflib
 import inspect
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
@@ -17,6 +18,12 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from benchnav.errors import BenchnavError, ConfigError
 
 NO_DEFAULT = inspect.Parameter.empty
+
+# Names of earlier versions, with those of today.
+RENAMED = {
+    **{"instances": "maps", "instance": "map", "trials": "conditions", "slowest": "min_traversability"},
+    **{"recorded": "record", "split": "splits"},
+}
 
 _UNNAMED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -195,8 +202,13 @@ def type_name(kind: Any) -> str:
 
 
 def hint(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """A sentence with the nearest known name, beginning with a space; empty where none is near."""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    """A sentence with today's name or the nearest known one, beginning with a space; empty where none is near."""
+    known = list(known)
+    old = re.split(r"[-.]", name)[-1]
+    now = name.removesuffix(old) + RENAMED.get(old, old)
+    if now != name and now in known:
+        return f" It is now {prefix + now!r}."
+    close = difflib.get_close_matches(name, known, n=1)
     return f" Did you mean {prefix + close[0]!r}?" if close else ""
 
 

@@ -1,4 +1,4 @@
-"""Measures the ladder of shifts `shift-v1` for docs/scenarios.md: its tables and its figures.
+"""Measures the series of shifts `shift-v1` for docs/scenarios.md: its tables and its figures.
 
     .venv/bin/python docs/scenarios.py
 
@@ -44,7 +44,7 @@ PAIRS: dict[str, Any] = {
     "hs-100": {"preset": "hs"},
 }
 SLOPE_EDGES, SHARE_EDGES = np.linspace(0, 60, 6001), np.linspace(0, 1, 2001)
-COLOURS = {"std": "#222222", "hg": "#D55E00", "hs": "#0072B2"}  # of Okabe and Ito, told apart by everyone
+COLOURS = {"std": "#222222", "hg": "#D55E00", "hs": "#0072B2"}  # of Okabe and Ito, distinct for everyone
 SIZES = {
     "font.size": 8,
     "axes.titlesize": 8,
@@ -166,9 +166,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
-def by_scenario(rungs: Mapping[str, Maps], columns: Columns) -> str:
+def by_scenario(pairs: Mapping[str, Maps], columns: Columns) -> str:
     """A table with a row a scenario."""
-    rows = [[name, *(column(rung) for column in columns.values())] for name, rung in rungs.items()]
+    rows = [[name, *(column(severity) for column in columns.values())] for name, severity in pairs.items()]
     return table(["scenario", *columns], rows)
 
 
@@ -183,7 +183,7 @@ def ground_columns(steepest: float) -> Columns:
         "λ, 5 %": lambda m: show([m["lambda"]], quantile(0.05, SHARE_EDGES), digits=2),
         "stuck [%]": lambda m: show([m["stuck"]], first, 100),
         "time [s]": lambda m: show([m["time"]], first),
-        "redrawn": lambda m: f"{m['redrawn'].sum()}",
+        "rejected": lambda m: f"{m['rejected_draws'].sum()}",
     }
 
 
@@ -293,13 +293,13 @@ def draw_examples(pairs: Mapping[str, Maps], extent_m: tuple[float, float]) -> F
     return figure
 
 
-def draw_distributions(ladder: Mapping[str, Maps], steepest: float) -> Figure:
+def draw_distributions(series: Mapping[str, Maps], steepest: float) -> Figure:
     """Slope, λ and brightness of all cells in std, hg and hs."""
     figure, panels = _three_panels(2.5)
     for name, dashes in (("std", "-"), ("hg-100", "-"), ("hs-100", (0, (4, 1.5)))):
-        rung: Maps = ladder[name]
+        severity: Maps = series[name]
         look: dict[str, Any] = {"color": COLOURS[name.split("-")[0]], "ls": dashes, "lw": 1.3, "label": name}
-        counts = [rung["slope"], rung["lambda"], histogram(rung["brightness"], SHARE_EDGES)]
+        counts = [severity["slope"], severity["lambda"], histogram(severity["brightness"], SHARE_EDGES)]
         slope, traversability, light = (np.r_[0, c.sum(0).cumsum()] / c.sum() for c in counts)
         panels[0].plot(SLOPE_EDGES[slope < 1], 1 - slope[slope < 1], **look)
         panels[1].plot(SHARE_EDGES, traversability, **look)
@@ -316,35 +316,35 @@ def draw_distributions(ladder: Mapping[str, Maps], steepest: float) -> Figure:
     return figure
 
 
-def draw_ladder(ladder: Mapping[str, Maps]) -> Figure:
+def draw_series(series: Mapping[str, Maps]) -> Figure:
     """Accuracy and error over severity, and the accuracy of each map in low light over its brightness."""
     figure, panels = _three_panels(2.6)
     sources = {"none": ("no class known", "", ":"), "predicted": ("classes predicted", "o", "-")}
     sources["true"] = ("true classes", "s", "--")
     for preset, colour in list(COLOURS.items())[1:]:
-        rungs = {0.0: ladder["std"]} | {_severity(n): m for n, m in ladder.items() if n.startswith(preset)}
-        curves = [(panels[0], [estimate([100 * m["right"]], first) for m in rungs.values()], "o", "-")]
+        pairs = {0.0: series["std"]} | {_severity(n): m for n, m in series.items() if n.startswith(preset)}
+        curves = [(panels[0], [estimate([100 * m["right"]], first) for m in pairs.values()], "o", "-")]
         for source, (_, marker, dashes) in sources.items():
-            values = [estimate([m[f"square {source}"]], rms) for m in rungs.values()]
+            values = [estimate([m[f"square {source}"]], rms) for m in pairs.values()]
             curves.append((panels[1], values, marker, dashes))
         for panel, values, marker, dashes in curves:
             look = {"color": colour, "marker": marker, "ls": dashes, "label": preset, "mfc": "white"}
-            panel.errorbar(list(rungs), *zip(*values, strict=True), lw=1.2, ms=3.5, capsize=2, **look)
+            panel.errorbar(list(pairs), *zip(*values, strict=True), lw=1.2, ms=3.5, capsize=2, **look)
     keys = [
         Line2D([], [], color="0.3", mfc="white", ms=3.5, label=n, marker=m, ls=d)
         for n, m, d in sources.values()
     ]
     panels[0].legend(frameon=False, loc="lower left")
     panels[1].legend(handles=keys, frameon=False, loc="upper left", handlelength=2.6)
-    dark = [name for name in ladder if name.startswith("hs")]
+    dark = [name for name in series if name.startswith("hs")]
     shades = matplotlib.colormaps["viridis_r"](np.linspace(0.1, 1, len(dark)))
     for name, shade in zip(dark, shades, strict=True):
         light, right = (
-            np.median(ladder[name]["brightness"], axis=(1, 2)),
-            ladder[name]["right"].mean(axis=(1, 2)),
+            np.median(series[name]["brightness"], axis=(1, 2)),
+            series[name]["right"].mean(axis=(1, 2)),
         )
         panels[2].plot(light, 100 * right, "o", ms=2.4, mew=0, color=shade, label=f"{_severity(name):g}")
-    lit = np.median(ladder["std"]["brightness"], axis=(1, 2))
+    lit = np.median(series["std"]["brightness"], axis=(1, 2))
     panels[2].axvspan(lit.min(), lit.max(), color="0.88", lw=0)
     panels[2].text(lit.mean(), 4, "light\nof std", ha="center", **NOTE)
     panels[2].legend(frameon=False, loc="upper left", title="severity of hs", title_fontsize=7)
@@ -380,10 +380,10 @@ def rewrite(path: Path, tables: Mapping[str, str]) -> None:
     path.write_text(text)
 
 
-def measure_ladder(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
-    """Measures the splits of shift-v1 and, made alike, a rung beyond each end, by name of the scenario."""
+def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
+    """Measures the splits of shift-v1 and, made alike, a severity beyond each end, by name of the scenario."""
     data = recipe.to_dict()
-    ladder: dict[str, Maps] = {}
+    series: dict[str, Maps] = {}
     splits = {f"test/{name}": {"scenario": name, "maps": 100, "solvable": True} for name in BEYOND}
     data |= {"scenarios": data["scenarios"] | BEYOND, "splits": data["splits"] | splits}
     longer = recipe_from_dict(data, "of docs/scenarios.py")
@@ -391,9 +391,9 @@ def measure_ladder(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
         spec = longer.splits[split]
         unasked = replace(longer, splits={split: replace(spec, solvable=False)})
         maps, drawn_first = (generate(made, split, np.arange(spec.maps)) for made in (longer, unasked))
-        redrawn = (maps["elevation_m"] != drawn_first["elevation_m"]).any(axis=(1, 2))
-        ladder[spec.scenario] = measure(model, longer, maps) | {"redrawn": redrawn}
-    return ladder
+        rejected_draws = (maps["elevation_m"] != drawn_first["elevation_m"]).any(axis=(1, 2))
+        series[spec.scenario] = measure(model, longer, maps) | {"rejected_draws": rejected_draws}
+    return series
 
 
 def measure_pairs(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
@@ -412,14 +412,14 @@ def main() -> None:
     recipe, checkpoint = load_recipe("shift-v1"), load_checkpoint(find_checkpoint(MODEL))
     model = FusedModel.from_checkpoint(checkpoint)
     steepest = max(checkpoint.part("gp").config["steepest_deg"])
-    ladder, pairs = measure_ladder(model, recipe), measure_pairs(model, recipe)
+    series, pairs = measure_series(model, recipe), measure_pairs(model, recipe)
     changed = {name: pair for name, pair in pairs.items() if name != "std"}
     tables = {
-        "ground": by_scenario(ladder, ground_columns(steepest)),
-        "model": by_scenario(ladder, model_columns()),
-        "calibration": by_scenario(ladder, calibration_columns(recipe)),
+        "ground": by_scenario(series, ground_columns(steepest)),
+        "model": by_scenario(series, model_columns()),
+        "calibration": by_scenario(series, calibration_columns(recipe)),
         "pairs": by_scenario(changed, paired_columns(model, pairs["std"])),
-        "slopes": slope_table(ladder["std"], ladder["hg-100"]),
+        "slopes": slope_table(series["std"], series["hg-100"]),
         "colours": colour_table(recipe),
     }
     for name, lines in tables.items():
@@ -427,8 +427,8 @@ def main() -> None:
     with matplotlib.rc_context(SIZES):  # type: ignore[arg-type]
         figures = {
             "examples": draw_examples(pairs, recipe.grid.extent_m),
-            "distributions": draw_distributions(ladder, steepest),
-            "ladder": draw_ladder(ladder),
+            "distributions": draw_distributions(series, steepest),
+            "series": draw_series(series),
         }
         for name, figure in figures.items():
             figure.savefig(

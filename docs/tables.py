@@ -25,7 +25,8 @@ import pandas as pd
 from scipy.stats import fisher_exact, t, ttest_ind_from_stats
 from statsmodels.stats.multitest import multipletests
 
-from benchnav.eval.compare import read_trials
+from benchnav.eval.compare import read_conditions
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.folder.folder import EPISODES, open_run
 from benchnav.eval.report.hypotheses import hypothesis_table
 from benchnav.eval.report.rendering import to_markdown
@@ -33,7 +34,6 @@ from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Pair, find_pairs
 from benchnav.eval.stats.summary import wilson_interval
-from benchnav.eval.trial import NOT_USED
 
 # MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.
 PAPER_EPISODES = 20
@@ -78,7 +78,7 @@ def settings(run: Path) -> str:
 
 def sweep(run: Path) -> str:
     """Success of each setting under each value that was swept, and what the best gains on the worst."""
-    pairs = find_pairs(read_trials([open_run(run)]), by="risk")
+    pairs = find_pairs(read_conditions([open_run(run)]), by="risk")
     names = [name for name in _BESIDE_RISK if len({pair.shared[name] for pair in pairs}) > 1]
     variants: dict[tuple[str, ...], list[Pair]] = {}
     for pair in pairs:

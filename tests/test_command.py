@@ -57,7 +57,7 @@ class Suite:
     Args:
         planners: Names or mappings.
         risks: Names.
-        instances: How many.
+        maps: How many.
         rate: How fast.
         world: What.
         model: Which.
@@ -66,7 +66,7 @@ class Suite:
 
     planners: tuple[str | dict[str, Any], ...] = ("a",)
     risks: tuple[str, ...] = ("mean",)
-    instances: int = 20
+    maps: int = 20
     rate: float | None = None
     world: str | dict[str, Any] = "paper"
     model: str | dict[str, Any] = "shipped"
@@ -90,8 +90,8 @@ def _place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     seen.clear()
     Path("shipped").mkdir()
-    Path("shipped/demo.yaml").write_text("instances: 2\n")
-    Path("shipped/paper.yaml").write_text("instances: 36\n")
+    Path("shipped/demo.yaml").write_text("maps: 2\n")
+    Path("shipped/paper.yaml").write_text("maps: 36\n")
 
 
 def call(*argv: str) -> int:
@@ -169,17 +169,17 @@ def test_each_program_prints_its_help_when_bare(program: str) -> None:
     ("argv", "expected"),
     [
         (["wrok"], "Expected a command among work, go, got 'wrok'. Did you mean 'work'?"),
-        (["--instances", "3"], "Expected a command among work, go, got '--instances'."),
+        (["--maps", "3"], "Expected a command among work, go, got '--maps'."),
         (["go", "--planer", "a"], "got --planer. Did you mean '--planners'? See `x go --help`."),
         (["go", "--planer=a"], "got --planer. Did you mean '--planners'?"),
         (["go", "--depth.epoch", "1"], "got --depth.epoch. Did you mean '--depth.epochs'?"),
         (["go", "--depth", "{epoch: 1}"], "got 'depth.epoch'. Did you mean 'depth.epochs'?"),
-        (["go", "--instances.x", "1"], "got --instances.x. Did you mean '--instances'?"),
+        (["go", "--maps.x", "1"], "got --maps.x. Did you mean '--maps'?"),
         (["go", "-i", "1"], "got -i."),
-        (["go", "--instances", "ten"], "Expected --instances as a whole number, got 'ten'."),
-        (["go", "--instances=1.5"], "Expected --instances as a whole number, got '1.5'."),
-        (["go", "--instances"], "Expected a value after --instances (a whole number), got none."),
-        (["go", "--instances", "--rate", "1"], "Expected a value after --instances"),
+        (["go", "--maps", "ten"], "Expected --maps as a whole number, got 'ten'."),
+        (["go", "--maps=1.5"], "Expected --maps as a whole number, got '1.5'."),
+        (["go", "--maps"], "Expected a value after --maps (a whole number), got none."),
+        (["go", "--maps", "--rate", "1"], "Expected a value after --maps"),
         (["go", "--rate", "fast"], "Expected --rate as a number or null, got 'fast'."),
         (["go", "--depth.epochs", "x"], "Expected --depth.epochs as a whole number, got 'x'."),
         (
@@ -208,8 +208,8 @@ def test_mistakes_on_the_line_are_told_in_the_users_words(
     ("content", "expected"),
     [
         ("risk: mean\n", "has in s.yaml, got 'risk'. Did you mean 'risks'? See `x go --help`."),
-        ("instances: ten\n", "Expected `instances` of s.yaml as a whole number, got 'ten'."),
-        ("instances:\n", "Expected `instances` in s.yaml as a whole number, got nothing."),
+        ("maps: ten\n", "Expected `maps` of s.yaml as a whole number, got 'ten'."),
+        ("maps:\n", "Expected `maps` in s.yaml as a whole number, got nothing."),
         ("depth: {epoch: 3}\n", "got 'depth.epoch'. Did you mean 'depth.epochs'?"),
         ("depth: {epochs: x}\n", "Expected `depth.epochs` of s.yaml as a whole number, got 'x'."),
         ("- a\n", "Expected s.yaml to hold settings as `name: value`, got list."),
@@ -227,10 +227,10 @@ def test_shipped_files_are_found_by_name_where_no_such_file_is_here(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert call("go", "--config", "demo", "--rate", "2") == 0
-    assert (seen[-1][0].instances, seen[-1][0].rate) == (2, 2.0)
-    Path("demo").write_text("instances: 5\n")
+    assert (seen[-1][0].maps, seen[-1][0].rate) == (2, 2.0)
+    Path("demo").write_text("maps: 5\n")
     assert call("go", "--config", "demo") == 0
-    assert seen[-1][0].instances == 5
+    assert seen[-1][0].maps == 5
     seen.clear()
     Path("mysuite.yaml").write_text("")
     assert "Did you mean 'mysuite.yaml'?" in refused(capsys, "go", "--config", "mysuit.yaml")
@@ -239,8 +239,8 @@ def test_shipped_files_are_found_by_name_where_no_such_file_is_here(
 
 
 def test_flags_have_the_last_word_wherever_they_stand() -> None:
-    assert call("go", "--instances", "7", "--config", "demo") == 0
-    assert seen[-1][0].instances == 7
+    assert call("go", "--maps", "7", "--config", "demo") == 0
+    assert seen[-1][0].maps == 7
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from benchnav import rng
 from benchnav.copula import correlated_normal
 from benchnav.errors import ConfigError
 
-KEY = rng.stream_key(0, "luck")
+KEY = rng.stream_key(0, "noise")
 DRAWS = 3000
 
 
@@ -68,7 +68,7 @@ def test_an_element_is_the_same_in_any_batch() -> None:
         correlated_normal(KEY, np.array([1, 4, 8]), (12, 12), 2.0), whole[[1, 4, 8]]
     )
     assert not np.allclose(whole[0], whole[1])
-    other = correlated_normal(rng.stream_key(1, "luck"), np.arange(9), (12, 12), 2.0)
+    other = correlated_normal(rng.stream_key(1, "noise"), np.arange(9), (12, 12), 2.0)
     assert not np.allclose(whole, other)
 
 
@@ -80,7 +80,7 @@ def test_lengths_out_of_range_are_refused(length: float) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_the_largest_word_gives_no_infinite_luck(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_largest_word_gives_no_infinite_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = np.array([[0, 2**64 - 1]], dtype=np.uint64)
     monkeypatch.setattr(rng, "random_bits", lambda *_: ends)
     assert rng.uniform(KEY, np.arange(1), (2,)).tolist() == [[2.0**-54, 1 - 2.0**-53]]

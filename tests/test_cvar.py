@@ -143,11 +143,11 @@ def test_a_map_is_the_same_however_many_there_are_beside_it() -> None:
 
 def test_large_maps_are_worked_on_in_pieces_without_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     mixture = mixture_of(hard_cells())
-    luck = torch.randn(mixture.mean().shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise = torch.randn(mixture.mean().shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def maps() -> tuple[torch.Tensor, ...]:
         return (
-            mixture.cvar(0.7), mixture.var(0.7), mixture.mean(), mixture.harmonic_mean(0.05), mixture.from_normal(luck)
+            mixture.cvar(0.7), mixture.var(0.7), mixture.mean(), mixture.harmonic_mean(0.05), mixture.from_normal(noise)
         )  # fmt: skip
 
     whole = maps()

@@ -40,7 +40,7 @@ def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:
     """Runs `benchnav-eval run` with two jobs, as a user does, and gives the rows."""
     command = [
         Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle",
-        "--instances", "2", "--scenarios", "[std]", "--record", "none", "--jobs", "2", "--out", "run",
+        "--maps", "2", "--scenarios", "[std]", "--record", "none", "--jobs", "2", "--out", "run",
         "--time_budget_s", "60",
     ]  # fmt: skip
     done = subprocess.run(

@@ -18,7 +18,7 @@ MODELS = tuple(
 )
 # Of reports, how an episode is recorded and the map that a figure shows is kept.
 RECORDED = ("eval.report.recorded", "eval.report.playback.files", "eval.report.charts.driven")
-VALUES_OF_EVAL = ("eval.suite", "eval.trial", "eval.unit", "eval.keep", "eval.hypotheses")
+VALUES_OF_EVAL = ("eval.suite", "eval.condition", "eval.unit", "eval.keep", "eval.hypotheses")
 
 # What the modules of a drawer may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -43,11 +43,11 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval": ("eval", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/run": ("eval.run", "eval.folder", *RECORDED, *VALUES_OF_EVAL, "models", "planning", "datagen"),
-    "eval/stats": ("eval.stats", "eval.trial", "eval.hypotheses", "planning"),
+    "eval/stats": ("eval.stats", "eval.condition", "eval.hypotheses", "planning"),
     "eval/report": (
         *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
         "planning",
-        "models.quality.ladders",  # how scenarios are named that make a ladder
+        "models.quality.series",  # how scenarios are named that make a series
     ),
 }
 
@@ -122,7 +122,7 @@ def test_imports_go_one_way(place: Path) -> None:
         ("planning/world/simulation.py", "benchnav.planning.planners.planner", False),
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.planners.planner", True),
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.world.outcome", False),
-        ("planning/planners/mppi.py", "benchnav.eval.trial", False),
+        ("planning/planners/mppi.py", "benchnav.eval.condition", False),
         ("eval/run/rollout.py", "benchnav.planning.world.simulation", True),
         ("eval/run/rollout.py", "benchnav.eval.report.tables", False),
         ("eval/stats/summary.py", "benchnav.eval.run.rows", False),

@@ -17,7 +17,7 @@ from benchnav.datagen.synth.generate import generate
 from benchnav.planning import risk
 from benchnav.planning.planners import mppi
 from benchnav.planning.planners.astar import astar
-from benchnav.planning.planners.astar.dwa import DWAConfig, judge, velocity_window
+from benchnav.planning.planners.astar.dwa import DWAConfig, score, velocity_window
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, end
@@ -101,7 +101,7 @@ def test_parts_of_planners() -> None:
     velocity, config = torch.zeros(2, 2), DWAConfig()
     same_after(lambda: velocity_window(problem, velocity, config), velocity, *maps)
     window = velocity_window(problem, velocity, config)
-    same_after(lambda: judge(problem, problem.start, window, target, config), window, *maps)
+    same_after(lambda: score(problem, problem.start, window, target, config), window, *maps)
 
 
 def test_the_world() -> None:

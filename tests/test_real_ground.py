@@ -76,7 +76,7 @@ def test_a_model_is_trained_and_measured_on_ground_that_is_labelled_in_part(
         "[site]",
         "--model",
         "mine",
-        "--instances",
+        "--maps",
         "0",
     )
     assert call(monkeypatch, evaluate, "run", "--data", "real.h5", *suite, "--out", "run") == 2

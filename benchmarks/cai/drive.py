@@ -42,13 +42,13 @@ def drive(planner: MPPI, problem: Problem, traction: Tensor, generator: torch.Ge
         Time of arrival in seconds, infinite where there was none, shape [B].
     """
     arrival_s = torch.full((len(problem),), torch.inf)
-    state, felt = problem.start, torch.full((len(problem),), torch.nan)
+    state, observed = problem.start, torch.full((len(problem),), torch.nan)
     plan_state = planner.init(problem, generator)
     for step in range(STEPS):
         action, plan_state, _ = planner.plan(
-            Step(state=state, felt=felt, time_s=step * problem.dt_s), plan_state
+            Step(state=state, traversability=observed, time_s=step * problem.dt_s), plan_state
         )
-        felt = traction_at(state, traction)[:, 0]
+        observed = traction_at(state, traction)[:, 0]
         running = arrival_s.isinf()
         state = torch.where(running[:, None], move(state, action, traction, problem.dt_s), state)
         arrival_s[running & has_arrived(state)] = (step + 1) * problem.dt_s

@@ -81,14 +81,14 @@ class Setup:
         risk_map: `exact`, by our risk settings, or `histogram`, by their binning and rounding.
         objective: `theirs`, or one of ours by name.
         distance_power: of the distance in a step's cost.
-        slowest: least λ̂ that motion is given.
+        min_traversability: least λ̂ that motion is given.
     """
 
     mppi: MPPIConfig = THEIR_MPPI
     risk_map: Literal["exact", "histogram"] = "exact"
     objective: str = "theirs"
     distance_power: int = 1
-    slowest: float = 0.01
+    min_traversability: float = 0.01
 
 
 def predict(vegetation: np.ndarray) -> TraversabilityMixture:
@@ -121,7 +121,9 @@ def pose(vegetation: np.ndarray, settings: Sequence[str], setup: Setup) -> Probl
     trials = len(vegetation) * len(settings)
     flat = torch.zeros(trials, *GRID.shape)
     rules = Rules(
-        free_space=FreeSpace(by="mean", above=0.0), slowest=setup.slowest, goal_radius_m=GOAL_RADIUS_M
+        free_space=FreeSpace(by="mean", above=0.0),
+        min_traversability=setup.min_traversability,
+        goal_radius_m=GOAL_RADIUS_M,
     )
     return pose_problem(
         Task(robot=ROVER, objective=choose_objective(setup), rules=rules),

@@ -3,7 +3,7 @@
 A map has 9 × 9 cells of 1 m. Its border of one cell is dirt; a cell inside is vegetation with a given
 probability. Linear and angular traction are drawn independently for each cell, once a trial, and stay.
 
-All draws are named by (seed, map, realisation): every setting and every density meets the same luck, and more
+All draws are named by (seed, map, realisation): every setting and every density meets the same noise, and more
 vegetation is the same vegetation and more. Letters in shapes: M maps.
 """
 

@@ -268,11 +268,7 @@ def main() -> None:
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
-        "import-dem": Command(
-            import_dem,
-            ("dem", "overrides"),
-            renamed={"split": "`--splits NAME`, with shares for several"},
-        ),
+        "import-dem": Command(import_dem, ("dem", "overrides")),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),
     }

@@ -24,7 +24,7 @@ from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import TerrainClass, twins
+from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
@@ -189,7 +189,7 @@ def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.nda
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     """Colours to draw classes in, those of the table but for look-alikes: RGB in [0, 1], shape [C, 3]."""
     colours = np.array([item.colour for item in classes]) / 255
-    for alike in set(twins(tuple(classes))):
+    for alike in set(look_alike_classes(tuple(classes))):
         away = 0.0 if colours[alike[0]].mean() > 0.5 else 1.0
         for place, member in enumerate(alike):
             colours[member] += (away - colours[member]) * 0.7 * place / len(alike)

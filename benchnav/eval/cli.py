@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from benchnav.command import INTERRUPTED, Command, Device, run, tell
 from benchnav.eval.replay import other_folder, program, replay
-from benchnav.eval.suite import RENAMED, Suite
+from benchnav.eval.suite import Suite
 
 if TYPE_CHECKING:
     from benchnav.eval.report.write import Report
@@ -245,10 +245,10 @@ def _print_recorded(folder: Path) -> None:
 def _print_replay(folder: Path) -> None:
     import yaml
 
+    from benchnav.eval.condition import NOT_USED
     from benchnav.eval.folder.folder import open_run
-    from benchnav.eval.trial import NOT_USED
 
-    every = [trial.labels for trial, _ in open_run(folder).trials.values()]
+    every = [condition.labels for condition, _ in open_run(folder).conditions.values()]
     # What looks at a prediction has more to show.
     shown = next((labels for labels in every if labels["risk"] != NOT_USED), every[0])
     words = ["replay", str(folder)]
@@ -288,7 +288,7 @@ def _failed_shard(folder: Path) -> int:
 def main() -> None:
     """Entry point of `benchnav-eval`."""
     commands = {
-        "run": Command(run_command, settings=Suite, configs=SUITES, renamed=RENAMED),
+        "run": Command(run_command, settings=Suite, configs=SUITES),
         "list": Command(list_command, ("kinds",)),
         "report": Command(report, ("folder",)),
         "compare": Command(compare, ("folders",)),

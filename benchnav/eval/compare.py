@@ -13,6 +13,7 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import LABELS, NOT_USED
 from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
 from benchnav.eval.folder.provenance import code_differences, code_of
 from benchnav.eval.folder.sameness import differences
@@ -30,7 +31,6 @@ from benchnav.eval.stats.pairing import (
     find_pairs,
 )
 from benchnav.eval.stats.summary import time_budgets
-from benchnav.eval.trial import LABELS, NOT_USED
 from benchnav.files import write_text
 
 _CAPTION = (
@@ -69,12 +69,12 @@ def compare_runs(
     if not 0 < difference <= 1:
         raise ConfigError(f"Expected `points` in (0, 100], got {100 * difference:g}.")
     runs = [open_run(folder) for folder in folders]
-    trials = _chosen(read_trials(runs), asked)
-    check_one_value_each(trials)
-    by = by_what(trials, by, against)
+    conditions = _chosen(read_conditions(runs), asked)
+    check_one_value_each(conditions)
+    by = by_what(conditions, by, against)
     if by != "run":
-        trials = _once_each(trials)
-    pairs = find_pairs(trials, by, against)
+        conditions = _once_each(conditions)
+    pairs = find_pairs(conditions, by, against)
     unlike = [_unlike_code(pair.members) for pair in pairs]
     # Versions and machines may differ between rows; what a label names may not.
     lines = _in_words(
@@ -89,7 +89,7 @@ def compare_runs(
         different_code=["; ".join(_in_words(found)) for found in unlike]
     )
     shown = comparison_table(table, difference)
-    notes = (*_about(pairs, table), *_left_out(pairs), *_no_partner(trials, pairs), *shown.notes)
+    notes = (*_about(pairs, table), *_left_out(pairs), *_no_partner(conditions, pairs), *shown.notes)
     notes += tuple(f"Different code: {line}." for line in lines)
     notes += tuple(dict.fromkeys(line for run in runs for line in caveats(run.about)))
     return table, ResultTable(headings=shown.headings, labels=shown.labels, rows=shown.rows, notes=notes)
@@ -124,26 +124,26 @@ def print_comparison(shown: ResultTable) -> None:
     print(to_terminal(shown, width).rstrip())
 
 
-def read_trials(runs: Sequence[Run]) -> list[Compared]:
-    """Reads the trials of runs, each with its episodes.
+def read_conditions(runs: Sequence[Run]) -> list[Compared]:
+    """Reads the conditions of runs, each with its episodes.
 
     Raises:
         ConfigError: a run is not finished, or there twice.
     """
     names = _names([run.folder for run in runs])
-    shared = Counter(trial for run in runs for trial in run.trials)
+    shared = Counter(condition for run in runs for condition in run.conditions)
     found = []
     for run, name in zip(runs, names, strict=True):
-        episodes = dict(list(read_table(run.folder, EPISODES).groupby("trial", sort=False)))
-        for trial, about in run.about["trials"].items():
-            labels, value, rows = about["labels"], about["value"], episodes[trial]
+        episodes = dict(list(read_table(run.folder, EPISODES).groupby("condition", sort=False)))
+        for condition, about in run.about["conditions"].items():
+            labels, value, rows = about["labels"], about["value"], episodes[condition]
             found.append(
                 Compared(
-                    labels={**labels, "run": name if shared[trial] > 1 else NOT_USED},
+                    labels={**labels, "run": name if shared[condition] > 1 else NOT_USED},
                     value=value,
                     maps=run.about["datasets"][labels["data"]]["maps"][value["split"]],
                     episodes=rows.assign(time_budget_s=time_budgets(rows, value["world"])),
-                    code={name: code_of(run.about, run.trials[trial][0])},
+                    code={name: code_of(run.about, run.conditions[condition][0])},
                 )
             )
     return found
@@ -158,25 +158,27 @@ def _names(folders: Sequence[Path]) -> list[str]:
     return ["/".join(path.parts[-parts:]) for path in paths]
 
 
-def _chosen(trials: Iterable[Compared], asked: Mapping[str, str]) -> list[Compared]:
-    chosen = list(trials)
+def _chosen(conditions: Iterable[Compared], asked: Mapping[str, str]) -> list[Compared]:
+    chosen = list(conditions)
     for name, values in asked.items():
-        known = list(dict.fromkeys(trial.labels[name] for trial in chosen))
+        known = list(dict.fromkeys(condition.labels[name] for condition in chosen))
         for value in values.split(","):
             if value not in known:
                 raise ConfigError(
                     f"Expected `{name}` among {', '.join(known)}, got {value!r}.{registry.hint(value, known)}"
                 )
-        chosen = [trial for trial in chosen if trial.labels[name] in values.split(",")]
+        chosen = [condition for condition in chosen if condition.labels[name] in values.split(",")]
     return chosen
 
 
-def _unlike_code(trials: Iterable[Compared], parts_alone: bool = False) -> dict[tuple[str, str], list[str]]:
+def _unlike_code(
+    conditions: Iterable[Compared], parts_alone: bool = False
+) -> dict[tuple[str, str], list[str]]:
     """What of the code that made conditions differs, by the two runs; of parts and our own sources alone, or of all."""
     held = [
         (run, {name: value for name, value in code.items() if isinstance(value, Mapping) or not parts_alone})
-        for trial in trials
-        for run, code in trial.code.items()
+        for condition in conditions
+        for run, code in condition.code.items()
     ]
     found: dict[tuple[str, str], list[str]] = {}
     for (first, earlier), (second, now) in combinations(sorted(held, key=lambda one: one[0]), 2):
@@ -197,25 +199,25 @@ def _in_words(*found: Mapping[tuple[str, str], Sequence[str]]) -> list[str]:
     ]
 
 
-def _once_each(trials: Iterable[Compared]) -> list[Compared]:
+def _once_each(conditions: Iterable[Compared]) -> list[Compared]:
     """Makes one of each condition that several runs hold, with the episodes of all.
 
     Raises:
         ConfigError: an episode came out differently in two runs.
     """
     found: dict[str, Compared] = {}
-    for trial in trials:
-        name = json.dumps(trial.value, sort_keys=True)
-        earlier = found.setdefault(name, trial)
-        if earlier is not trial:
-            found[name] = _joined(earlier, trial)
+    for condition in conditions:
+        name = json.dumps(condition.value, sort_keys=True)
+        earlier = found.setdefault(name, condition)
+        if earlier is not condition:
+            found[name] = _joined(earlier, condition)
     return list(found.values())
 
 
 def _joined(one: Compared, other: Compared) -> Compared:
     runs = " and ".join([*one.code, *other.code])
     check_maps(one, other, f"{_words(one)} in {runs}")
-    first, second = (trial.episodes.drop(columns=list(LABELS)) for trial in (one, other))
+    first, second = (condition.episodes.drop(columns=list(LABELS)) for condition in (one, other))
     unlike = [difference for difference in differences(first, second) if difference.columns]
     if unlike:
         both = len(first.merge(second, on=DRAW))
@@ -231,8 +233,8 @@ def _joined(one: Compared, other: Compared) -> Compared:
     return replace(one, labels=labels, episodes=rows, maps=longer, code={**one.code, **other.code})
 
 
-def _words(trial: Compared, names: Iterable[str] = LABELS[1:]) -> str:
-    return " ".join(trial.labels[name] for name in names if trial.labels[name] != NOT_USED)
+def _words(condition: Compared, names: Iterable[str] = LABELS[1:]) -> str:
+    return " ".join(condition.labels[name] for name in names if condition.labels[name] != NOT_USED)
 
 
 def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
@@ -259,43 +261,45 @@ def _left_out(pairs: Sequence[Pair]) -> list[str]:
     lines: dict[str, None] = {}
     for pair in pairs:
         paired = pd.MultiIndex.from_frame(pair.episodes[DRAW])
-        for trial, own, partner in zip(
+        for condition, own, partner in zip(
             pair.members, (pair.one, pair.other), (pair.other, pair.one), strict=True
         ):
-            drawn = pd.MultiIndex.from_frame(trial.episodes[DRAW])
-            rows = trial.episodes.loc[~drawn.isin(paired), DRAW]
+            drawn = pd.MultiIndex.from_frame(condition.episodes[DRAW])
+            rows = condition.episodes.loc[~drawn.isin(paired), DRAW]
             if len(rows):
                 seeds = {
                     f"seed {seed}" + (f", realisation {realisation}" if realisation else ""): sorted(
-                        group["instance"]
+                        group["map"]
                     )
                     for (seed, realisation), group in rows.groupby(["seed", "realisation"])
                 }
                 where = "; ".join(f"{name} on {_maps(maps)}" for name, maps in list(seeds.items())[:_NAMED])
                 more = f" and {len(seeds) - _NAMED} more draws" if len(seeds) > _NAMED else ""
                 line = (
-                    f"Left out: {len(rows)} of {len(trial.episodes)} episodes of {own}, on which {partner} was not run "
-                    f"({where}{more})."
+                    f"Left out: {len(rows)} of {len(condition.episodes)} episodes of {own}, on which {partner} was not "
+                    f"run ({where}{more})."
                 )
                 lines[line] = None
     return _first_of(list(lines), "pairs with episodes left out")
 
 
-def _maps(instances: Sequence[int]) -> str:
+def _maps(maps: Sequence[int]) -> str:
     """Numbers of maps in words; runs of them by their ends."""
-    whole = len(instances) > 1 and instances[-1] - instances[0] == len(instances) - 1
+    whole = len(maps) > 1 and maps[-1] - maps[0] == len(maps) - 1
     if whole:
-        return f"maps {instances[0]} to {instances[-1]}"
-    listed = ", ".join(map(str, instances[:_NAMED])) + (", …" if len(instances) > _NAMED else "")
-    return f"map {listed}" if len(instances) == 1 else f"{len(instances)} maps ({listed})"
+        return f"maps {maps[0]} to {maps[-1]}"
+    listed = ", ".join(map(str, maps[:_NAMED])) + (", …" if len(maps) > _NAMED else "")
+    return f"map {listed}" if len(maps) == 1 else f"{len(maps)} maps ({listed})"
 
 
-def _no_partner(trials: Sequence[Compared], pairs: Sequence[Pair]) -> list[str]:
+def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair]) -> list[str]:
     """Names the conditions that are in no pair."""
     paired = {member for pair in pairs for member in pair.members}
-    alone = [trial for trial in trials if trial not in paired]
-    varying = [name for name in (*LABELS, "run") if len({trial.labels[name] for trial in trials}) > 1]
-    names = [_words(trial, varying) for trial in alone]
+    alone = [condition for condition in conditions if condition not in paired]
+    varying = [
+        name for name in (*LABELS, "run") if len({condition.labels[name] for condition in conditions}) > 1
+    ]
+    names = [_words(condition, varying) for condition in alone]
     return [f"Without a partner, so in no row: {'; '.join(_first_of(names, 'conditions'))}."] if names else []
 
 

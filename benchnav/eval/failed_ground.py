@@ -1,4 +1,4 @@
-"""The ground on which episodes of a finished run failed: what the planner was told of it, and what it was."""
+"""The ground on which episodes of a finished run failed: what was predicted of it, and what it was."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,24 +9,24 @@ import pandas as pd
 
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.errors import BenchnavError
+from benchnav.eval.condition import Condition
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import Run, open_run
 from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.failure_choice import GroundOf
 from benchnav.eval.run.episode import build, one_thread
-from benchnav.eval.trial import Trial
 from benchnav.eval.unit import Unit
 from benchnav.sources import digest_of
 
 
 def ground_of_run(folder: Path) -> GroundOf:
-    """Gives a function that reads and predicts the ground of some failures of one trial again.
+    """Gives a function that reads and predicts the ground of some failures of one condition again.
 
     Args:
         folder: a finished run.
 
     Returns:
-        From rows of `failures.failures_table`, of one trial, the ground of each. It raises a `BenchnavError`
+        From rows of `failures.failures_table`, of one condition, the ground of each. It raises a `BenchnavError`
         that says why where the ground cannot be had.
     """
     run = open_run(folder)
@@ -40,7 +40,7 @@ def ground_of_run(folder: Path) -> GroundOf:
         grounds = [ground for _, ground in parts]
         return FailedGround(
             predicted=np.concatenate([one.predicted for one in grounds])[back],
-            holding=np.concatenate([one.holding for one in grounds])[back],
+            immobilising=np.concatenate([one.immobilising for one in grounds])[back],
             resolution_m=grounds[0].resolution_m,
             goal_m=np.concatenate([one.goal_m for one in grounds])[back],
         )
@@ -50,42 +50,42 @@ def ground_of_run(folder: Path) -> GroundOf:
 
 def _ground(run: Run, rows: pd.DataFrame) -> FailedGround:
     """The ground under one seed and realisation."""
-    trial_id = rows["trial"].iloc[0]
-    trial, extent = run.trials[trial_id]
-    instances = tuple(int(i) for i in rows["instance"])
-    _check_maps(run, trial, instances)
-    for part, about in provenance.describe_parts({trial_id: (trial, extent)}).items():
+    condition_id = rows["condition"].iloc[0]
+    condition, extent = run.conditions[condition_id]
+    maps = tuple(int(i) for i in rows["map"])
+    _check_maps(run, condition, maps)
+    for part, about in provenance.describe_parts({condition_id: (condition, extent)}).items():
         if _identity(run.about["parts"].get(part)) != _identity(about):
             raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
     unit = Unit(
-        trial=trial,
+        condition=condition,
         seed=int(rows["seed"].iloc[0]),
         realisation=int(rows["realisation"].iloc[0]),
-        instances=instances,
+        maps=maps,
     )
     with one_thread():
         problem, simulation = build(unit, run.about["run_id"])
     return FailedGround(
         predicted=problem.risk_map.cpu().numpy(),
-        holding=simulation.holding.cpu().numpy(),
+        immobilising=simulation.immobilising.cpu().numpy(),
         resolution_m=problem.grid.resolution_m,
         goal_m=problem.goal_m.cpu().numpy(),
     )
 
 
-def _check_maps(run: Run, trial: Trial, instances: Sequence[int]) -> None:
+def _check_maps(run: Run, condition: Condition, maps: Sequence[int]) -> None:
     """Refuses other maps than those that the run was on."""
-    dataset = TerrainDataset(find_dataset(trial.data))
-    count = dataset.map_count(trial.split)
-    if count <= max(instances):
+    dataset = TerrainDataset(find_dataset(condition.data))
+    count = dataset.map_count(condition.split)
+    if count <= max(maps):
         raise BenchnavError(
-            f"Expected {trial.data} with the {max(instances) + 1} maps of {trial.split} or more that the run was on, "
-            f"got {count}. Make them with `benchnav-datagen create`."
+            f"Expected {condition.data} with the {max(maps) + 1} maps of {condition.split} or more that the run was "
+            f"on, got {count}. Make them with `benchnav-datagen create`."
         )
-    digests = run.about["datasets"][trial.data]["maps"][trial.split]
-    now = [digest_of([entry.tobytes()])[:16] for entry in dataset.entry_digests(trial.split, instances)]
-    if now != [digests[i] for i in instances]:
-        raise BenchnavError(f"Expected {trial.data} with the maps that {run.folder} was on, got others.")
+    digests = run.about["datasets"][condition.data]["maps"][condition.split]
+    now = [digest_of([entry.tobytes()])[:16] for entry in dataset.entry_digests(condition.split, maps)]
+    if now != [digests[i] for i in maps]:
+        raise BenchnavError(f"Expected {condition.data} with the maps that {run.folder} was on, got others.")
 
 
 def _identity(about: Any) -> Any:

@@ -1,30 +1,30 @@
-"""Which episodes of a run are meant, by what tables call their trials."""
+"""Which episodes of a run are meant, by what tables call their conditions."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import NOT_USED, Condition
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.keep import Keep
-from benchnav.eval.trial import NOT_USED, Trial
 from benchnav.eval.unit import Extent, Unit, units
 
 _COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
 
 
 def find_episodes(
-    folder: Path, labels: Mapping[str, Sequence[str]], seed: int | None, realisation: int, instance: int
+    folder: Path, labels: Mapping[str, Sequence[str]], seed: int | None, realisation: int, map_index: int
 ) -> list[tuple[Unit, int]]:
-    """Finds an episode of each trial that is asked for, all of them on one map.
+    """Finds an episode of each condition that is asked for, all of them on one map.
 
     Args:
         folder: a run.
-        labels: what tables call the trials, by column; several of a column ask for several trials, and of the
-            columns that are left out the first trial that fits is taken.
-        seed: root seed; the first trial's first when None.
-        realisation: draw of the world's luck.
-        instance: instance of the split.
+        labels: what tables call the conditions, by column; several of a column ask for several conditions, and of the
+            columns that are left out the first condition that fits is taken.
+        seed: root seed; the first condition's first when None.
+        realisation: draw of λ.
+        map_index: map of the split.
 
     Returns:
         Units, and which of their episodes.
@@ -36,49 +36,49 @@ def find_episodes(
     found: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         asked = dict(zip(labels, values, strict=True))
-        unit = _find(run.trials, asked, seed, realisation, instance)
+        unit = _find(run.conditions, asked, seed, realisation, map_index)
         if unit is None:
-            raise ConfigError(_refusal(run.trials, asked, seed, realisation, instance))
+            raise ConfigError(_refusal(run.conditions, asked, seed, realisation, map_index))
         seed = unit.seed
-        found.setdefault(unit.trial.id, (unit, unit.instances.index(instance)))
+        found.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))
     episodes = list(found.values())
-    maps = dict.fromkeys(f"{unit.trial.data} {unit.trial.scenario}" for unit, _ in episodes)
+    maps = dict.fromkeys(f"{unit.condition.data} {unit.condition.scenario}" for unit, _ in episodes)
     if len(maps) > 1:
-        raise ConfigError(f"Expected trials on one map to show together, got {', '.join(maps)}.")
+        raise ConfigError(f"Expected conditions on one map to show together, got {', '.join(maps)}.")
     return episodes
 
 
 def _find(
-    trials: Mapping[str, tuple[Trial, Extent]],
+    conditions: Mapping[str, tuple[Condition, Extent]],
     asked: Mapping[str, str],
     seed: int | None,
     realisation: int,
-    instance: int,
+    map_index: int,
 ) -> Unit | None:
-    """The unit of the first trial that fits; a trial that does not use a part fits any label where no other does."""
+    """The unit of the first condition that fits; one that does not use a part fits any label where no other does."""
     for unused_fits in (False, True):
-        for trial_id, entry in trials.items():
+        for condition_id, entry in conditions.items():
             labels = entry[0].labels
             if any(labels[n] != v and not (unused_fits and labels[n] == NOT_USED) for n, v in asked.items()):
                 continue
             wanted = entry[1].seeds[0] if seed is None else seed
-            for unit in units({trial_id: entry}, Keep()):
-                if (unit.seed, unit.realisation) == (wanted, realisation) and instance in unit.instances:
+            for unit in units({condition_id: entry}, Keep()):
+                if (unit.seed, unit.realisation) == (wanted, realisation) and map_index in unit.maps:
                     return unit
     return None
 
 
 def _refusal(
-    trials: Mapping[str, tuple[Trial, Extent]],
+    conditions: Mapping[str, tuple[Condition, Extent]],
     asked: Mapping[str, str],
     seed: int | None,
     realisation: int,
-    instance: int,
+    map_index: int,
 ) -> str:
     words = [f"{name} {label!r}" for name, label in asked.items()]
-    words += [f"realisation {realisation}", f"instance {instance}"]
+    words += [f"realisation {realisation}", f"map {map_index}"]
     words += [] if seed is None else [f"seed {seed}"]
-    known = {name: list(dict.fromkeys(t.labels[name] for t, _ in trials.values())) for name in _COLUMNS}
+    known = {name: list(dict.fromkeys(t.labels[name] for t, _ in conditions.values())) for name in _COLUMNS}
     return (
         f"Expected an episode of the run, got {', '.join(words)}. "
         f"It has {', '.join(f'{name}s {values}' for name, values in known.items())}."

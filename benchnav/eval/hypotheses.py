@@ -13,7 +13,7 @@ from typing import Any
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.eval.trial import LABELS, NOT_USED, Trial
+from benchnav.eval.condition import LABELS, NOT_USED, Condition
 
 KINDS = ("difference", "non-inferiority", "equivalence")
 DIRECTIONS = ("higher", "lower")
@@ -94,13 +94,13 @@ def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
 
 
 def fix_hypotheses(
-    given: Sequence[Mapping[str, Any]], trials: Mapping[str, Trial], episodes: Mapping[str, int]
+    given: Sequence[Mapping[str, Any]], conditions: Mapping[str, Condition], episodes: Mapping[str, int]
 ) -> dict[str, Any]:
     """Reads the hypotheses of a suite, for `run.json`.
 
     Args:
         given: as the suite lists them.
-        trials: its conditions by id.
+        conditions: its conditions by id.
         episodes: of each condition, how many are to be run.
 
     Returns:
@@ -110,22 +110,22 @@ def fix_hypotheses(
     Raises:
         ConfigError: a hypothesis names what is not there, or asks for what cannot be tested.
     """
-    tests = [test for place, one in enumerate(given, start=1) for test in _read(one, place, trials)]
+    tests = [test for place, one in enumerate(given, start=1) for test in _read(one, place, conditions)]
     if not tests:
         return {}
     plain = [{**asdict(test), "names": list(test.names), "claim": test.claim} for test in tests]
     for test in plain:
         if plain.count(test) > 1:
             raise ConfigError(f"Expected hypotheses that differ, got twice: {test['claim']}.")
-    named = dict.fromkeys(trial for test in tests for trial in (test.one, test.other))
+    named = dict.fromkeys(condition for test in tests for condition in (test.one, test.other))
     return {
         "tests": plain,
         "digest": digest_of_tests(plain),
-        "episodes": {trial: episodes[trial] for trial in named},
+        "episodes": {condition: episodes[condition] for condition in named},
     }
 
 
-def _read(given: Mapping[str, Any], place: int, trials: Mapping[str, Trial]) -> list[Hypothesis]:
+def _read(given: Mapping[str, Any], place: int, conditions: Mapping[str, Condition]) -> list[Hypothesis]:
     """A hypothesis of a suite: one test for each pair of conditions that it names."""
     where = f"hypothesis {place}"
     for key in given:
@@ -160,11 +160,14 @@ def _read(given: Mapping[str, Any], place: int, trials: Mapping[str, Trial]) -> 
         raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {direction!r}.")
     if kind == "non-inferiority":
         direction = direction or METRICS[metric].better
-    sides = _filter(given["one"], "one", where, trials), _filter(given["other"], "other", where, trials)
-    pairs = _pairs(*sides, where, trials)
+    sides = (
+        _filter(given["one"], "one", where, conditions),
+        _filter(given["other"], "other", where, conditions),
+    )
+    pairs = _pairs(*sides, where, conditions)
     if metric == "T_total":
-        _check_one_budget(pairs, where, trials)
-    named = _names(pairs, sides, trials)
+        _check_one_budget(pairs, where, conditions)
+    named = _names(pairs, sides, conditions)
     return [
         Hypothesis(
             one=one,
@@ -188,48 +191,48 @@ def _choice(value: Any, known: Sequence[str] | Mapping[str, Any], name: str, whe
     return str(value)
 
 
-def _filter(given: Any, side: str, where: str, trials: Mapping[str, Trial]) -> dict[str, str]:
+def _filter(given: Any, side: str, where: str, conditions: Mapping[str, Condition]) -> dict[str, str]:
     """Labels by which a hypothesis names conditions."""
     if not isinstance(given, Mapping) or not given:
         raise ConfigError(
             f"Expected `{side}` of {where} to name a condition by labels, such as {{planner: mppi, risk: mean}}, got "
             f"{given!r}."
         )
-    left = list(trials.values())
+    left = list(conditions.values())
     for name, value in given.items():
         if name not in LABELS:
             raise ConfigError(
                 f"Expected labels in `{side}` of {where} among {', '.join(LABELS)}, got {name!r}."
                 f"{registry.hint(str(name), LABELS)}"
             )
-        known = list(dict.fromkeys(trial.labels[name] for trial in left))
+        known = list(dict.fromkeys(condition.labels[name] for condition in left))
         if str(value) not in known:
             raise ConfigError(
                 f"Expected `{name}` of `{side}` of {where} among {', '.join(known)}, got {value!r}."
                 f"{registry.hint(str(value), known)}"
             )
-        left = [trial for trial in left if trial.labels[name] == str(value)]
+        left = [condition for condition in left if condition.labels[name] == str(value)]
     return {name: str(value) for name, value in given.items()}
 
 
 def _pairs(
-    one: Mapping[str, str], other: Mapping[str, str], where: str, trials: Mapping[str, Trial]
+    one: Mapping[str, str], other: Mapping[str, str], where: str, conditions: Mapping[str, Condition]
 ) -> list[tuple[str, str]]:
     """Conditions that are named, each with that which is the same in all labels that neither side names."""
     free = [name for name in LABELS if name not in one and name not in other]
     sides = [
-        [i for i, trial in trials.items() if all(trial.labels[n] == v for n, v in side.items())]
+        [i for i, condition in conditions.items() if all(condition.labels[n] == v for n, v in side.items())]
         for side in (one, other)
     ]
     pairs = []
     for place, (own, others) in enumerate((sides, sides[::-1])):
         for first in own:
-            partners = [i for i in others if i != first and _agree(trials[first], trials[i], free)]
+            partners = [i for i in others if i != first and _agree(conditions[first], conditions[i], free)]
             if len(partners) > 1:
-                name = next(n for n in LABELS if len({trials[i].labels[n] for i in partners}) > 1)
+                name = next(n for n in LABELS if len({conditions[i].labels[n] for i in partners}) > 1)
                 raise ConfigError(
                     f"Expected {where} to name one condition to compare with another, got {len(partners)} that differ "
-                    f"in {name} ({', '.join(trials[i].labels[name] for i in partners)}). Name the {name} in "
+                    f"in {name} ({', '.join(conditions[i].labels[name] for i in partners)}). Name the {name} in "
                     f"`{('other', 'one')[place]}`."
                 )
             pairs += [(first, i) for i in partners] if place == 0 else []
@@ -239,7 +242,7 @@ def _pairs(
             "none. Name in each what the other names."
         )
     for first, second in pairs:
-        a, b = trials[first], trials[second]
+        a, b = conditions[first], conditions[second]
         for name, of_a, of_b in (
             ("data", a.data, b.data), ("scenario", a.scenario, b.scenario), ("world", a.world, b.world)
         ):  # fmt: skip
@@ -251,7 +254,7 @@ def _pairs(
     return pairs
 
 
-def _agree(one: Trial, other: Trial, free: Sequence[str]) -> bool:
+def _agree(one: Condition, other: Condition, free: Sequence[str]) -> bool:
     """Whether two conditions have the same labels; one that is not used goes with any."""
     return all(
         one.labels[name] == other.labels[name] or NOT_USED in (one.labels[name], other.labels[name])
@@ -259,9 +262,11 @@ def _agree(one: Trial, other: Trial, free: Sequence[str]) -> bool:
     )
 
 
-def _check_one_budget(pairs: Sequence[tuple[str, str]], where: str, trials: Mapping[str, Trial]) -> None:
+def _check_one_budget(
+    pairs: Sequence[tuple[str, str]], where: str, conditions: Mapping[str, Condition]
+) -> None:
     for first, second in pairs:
-        one, other = trials[first], trials[second]
+        one, other = conditions[first], conditions[second]
         if one.robot != other.robot and "time_budget_ratio" in one.world.to_dict():
             raise ConfigError(
                 f"Expected {where} to compare T_total of conditions with one time budget, got robots whose T differs, "
@@ -270,19 +275,19 @@ def _check_one_budget(pairs: Sequence[tuple[str, str]], where: str, trials: Mapp
 
 
 def _names(
-    pairs: Sequence[tuple[str, str]], sides: Sequence[Mapping[str, str]], trials: Mapping[str, Trial]
+    pairs: Sequence[tuple[str, str]], sides: Sequence[Mapping[str, str]], conditions: Mapping[str, Condition]
 ) -> list[tuple[str, str]]:
     """What text calls the conditions: by the labels that name them, and by what else differs between the pairs."""
     several = {
         name
         for name in LABELS
         if not any(name in side for side in sides)
-        and len({trials[i].labels[name] for pair in pairs for i in pair} - {NOT_USED}) > 1
+        and len({conditions[i].labels[name] for pair in pairs for i in pair} - {NOT_USED}) > 1
     }
 
-    def name_of(trial: Trial, side: Mapping[str, str]) -> str:
-        words = [trial.labels[name] for name in LABELS if name in side or name in several]
+    def name_of(condition: Condition, side: Mapping[str, str]) -> str:
+        words = [condition.labels[name] for name in LABELS if name in side or name in several]
         return ", ".join(word for word in words if word != NOT_USED)
 
     one, other = sides
-    return [(name_of(trials[first], one), name_of(trials[second], other)) for first, second in pairs]
+    return [(name_of(conditions[first], one), name_of(conditions[second], other)) for first, second in pairs]

@@ -15,8 +15,8 @@ class Keep:
     """Which episodes are recorded, and of which the steps are stored.
 
     Args:
-        record: `failures` are episodes that did not succeed; `first` is the first instance of each trial,
-            under its first seed and draw of luck.
+        record: `failures` are episodes that did not succeed; `first` is the first map of each condition,
+            under its first seed and draw of λ.
         steps: `recorded` stores the steps of recorded episodes alone.
     """
 
@@ -68,7 +68,7 @@ class Keep:
 
 
 def _chosen(rule: str, succeeded: Sequence[bool]) -> list[int]:
-    """Which episodes of a unit a rule means; the unit is the first of its trial where it says `first`."""
+    """Which episodes of a unit a rule means; the unit is the first of its condition where it says `first`."""
     every = range(len(succeeded))
     if rule == "failures":
         return [member for member in every if not succeeded[member]]

@@ -31,7 +31,7 @@ def replay(
     data: tuple[str, ...] = (),
     seed: int | None = None,
     realisation: int = 0,
-    instance: int = 0,
+    map: int = 0,
     view: bool = True,
     web: bool = False,
     video: str = "",
@@ -39,7 +39,7 @@ def replay(
 ) -> int:
     """Play an episode back, or several on one map, recording first what was not recorded.
 
-    Several labels of a column, such as --risk mean,cvar:0.9, show their trials together.
+    Several labels of a column, such as --risk mean,cvar:0.9, show their conditions together.
 
     Args:
         folder: Run folder.
@@ -52,11 +52,11 @@ def replay(
         world: World.
         data: Dataset.
         seed: Root seed; the run's first when not given.
-        realisation: Draw of the world's luck.
-        instance: Instance of the scenario.
+        realisation: Draw of λ.
+        map: Number of the map in the scenario.
         view: Open the viewer; false only makes the recording.
         web: Serve the viewer to a browser on this machine until Ctrl-C.
-        video: Write a video to this file, .mp4, in place of opening the viewer; trials stand side by side.
+        video: Write a video to this file, .mp4, in place of opening the viewer; conditions stand side by side.
         out: Folder that recordings are written to, such as for a run that cannot be written; the run's own when not
             given.
     """
@@ -72,7 +72,7 @@ def replay(
     }
     asked = {name: labels for name, labels in columns.items() if labels}
     run, place = Path(folder), other_folder(folder, out)
-    found = find_episodes(run, asked, seed, realisation, instance)
+    found = find_episodes(run, asked, seed, realisation, map)
     if video:
         from benchnav.command import show_progress
         from benchnav.eval.report.playback.video import write_video
@@ -80,10 +80,10 @@ def replay(
         show_progress(write_video(_recordings(run, found, place), Path(video)), "frames")
         print(f"video:   {video}")
         return 0
-    worlds = dict.fromkeys(unit.trial.labels["world"] for unit, _ in found)
-    if len({repr(unit.trial.world) for unit, _ in found}) > 1:
+    worlds = dict.fromkeys(unit.condition.labels["world"] for unit, _ in found)
+    if len({repr(unit.condition.world) for unit, _ in found}) > 1:
         raise ConfigError(
-            f"Expected trials in one world to show on one map, got {', '.join(worlds)}. A video shows them side by "
+            f"Expected conditions in one world to show on one map, got {', '.join(worlds)}. A video shows them side by "
             "side: --video FILE.mp4."
         )
     path = _viewer_file(run, found, place)
@@ -143,14 +143,16 @@ def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Pa
     unit, member = found[0]
     stem = unit.stem(member)
     if len(found) > 1:
-        trials = hashlib.sha256("".join(other.trial.id for other, _ in found).encode()).hexdigest()[:8]
+        conditions = hashlib.sha256("".join(other.condition.id for other, _ in found).encode()).hexdigest()[
+            :8
+        ]
         words = (
             "together",
-            unit.trial.scenario,
-            trials,
+            unit.condition.scenario,
+            conditions,
             unit.seed,
             unit.realisation,
-            f"{unit.instances[member]:05d}",
+            f"{unit.maps[member]:05d}",
         )
         stem = "+".join(map(str, words))
     path = playback_path(out, stem)

@@ -1,6 +1,6 @@
 """Evaluation suites as users write them: what is to be compared, as plain data.
 
-`benchnav.eval.trial` makes trials of a suite. This module imports nothing heavy, so that the command's help
+`benchnav.eval.condition` makes conditions of a suite. This module imports nothing heavy, so that the command's help
 is quick.
 """
 
@@ -14,13 +14,10 @@ PartSpec = str | dict[str, Any]
 
 _SEEDS = 2**63  # what a table's column of whole numbers holds
 
-# What to say in place of settings that had other names.
-RENAMED = {"recorded": "`record`: none, failures, first or all"}
-
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """What is evaluated: the product of everything listed, or of each mapping in `trials`.
+    """What is evaluated: the product of everything listed, or of each mapping in `conditions`.
 
     A planner, model, risk measure, robot or objective is given as NAME, package.module:Name,
     path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}.
@@ -37,18 +34,18 @@ class Suite:
         world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
             frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
             time_budget_ratio: T over the map's reference time}; or a list of several.
-        task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, slowest: 0.3,
+        task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
             goal_radius_m: 1.0}.
         noise: Short for `world.noise`.
         time_budget_s: Short for `world.time_budget_s`; 0 takes the world's.
         planner_options: Options of planners by name, as {planner: {option: value}}.
-        instances: Instances a scenario, the first ones of the split; 0 takes all.
-        seed: Root seed of all luck.
+        maps: Maps a scenario, the first ones of the split; 0 takes all.
+        seed: Root seed of all draws.
         seeds: Several root seeds in place of `seed`.
-        realisations: How often the luck of the world is drawn for each instance and seed.
-        record: Episodes that are recorded for playback: none, failures, the first instance of each trial, or all.
+        realisations: How often λ is drawn for each map and seed.
+        record: Episodes that are recorded for playback: none, failures, the first map of each condition, or all.
         steps: Episodes whose steps are stored: none, those that are recorded, or all.
-        trials: Several products: mappings of the keys above, each taking what it leaves out from there.
+        conditions: Several products: mappings of the keys above, each taking what it leaves out from there.
         hypotheses: What the run is to show, fixed before its first unit: mappings of `one` and `other`, conditions by
             their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
             path_length; `kind`: difference, non-inferiority or equivalence; `direction`: higher or lower; `margin`.
@@ -67,13 +64,13 @@ class Suite:
     noise: str = ""
     time_budget_s: float = 0.0
     planner_options: dict[str, dict[str, Any]] = field(default_factory=dict)
-    instances: int = 20
+    maps: int = 20
     seed: int = 0
     seeds: tuple[int, ...] = ()
     realisations: int = 1
     record: Record = "first"
     steps: Steps = "all"
-    trials: tuple[dict[str, Any], ...] = ()
+    conditions: tuple[dict[str, Any], ...] = ()
     hypotheses: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -81,8 +78,8 @@ class Suite:
         for name in ("planners", "risks", "robots", "objectives", "world"):
             if not getattr(self, name):
                 raise ConfigError(f"Expected one or more `{name}`, got none.")
-        if self.instances < 0:
-            raise ConfigError(f"Expected `instances` ≥ 0, got {self.instances}.")
+        if self.maps < 0:
+            raise ConfigError(f"Expected `maps` ≥ 0, got {self.maps}.")
         if self.realisations < 1:
             raise ConfigError(f"Expected `realisations` ≥ 1, got {self.realisations}.")
         for seed in self.all_seeds:

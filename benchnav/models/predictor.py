@@ -93,7 +93,7 @@ class Privileged(Protocol):
 
 
 class Oracle:
-    """Knows the true distribution of each cell's own class; what is left is luck."""
+    """Knows the true distribution of each cell's own class; what is left is noise."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
         """Gives the true distribution of every cell."""

@@ -54,8 +54,8 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Reward
     Without `objective`: metres gained toward the goal, −0.1 a second, +10 on arrival and −10 off the map or
-    where the ground holds the robot for good. With one: minus its stage cost, read at the state before the
-    step and the λ met there. A step that loses the robot in one of these ways costs as much again for each
+    where the ground immobilises the robot for good. With one: minus its stage cost, read at the state before the
+    step and the observed λ there. A step that loses the robot in one of these ways costs as much again for each
     step that is left, as if the robot stood there until T.
 
     ## World
@@ -67,17 +67,17 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
 
     ## Start and end
     An episode starts at the start of a map of the split, drawn at random or given by
-    `options={"instance": i}`, heading at the goal. It terminates at the goal, off the map, or
-    where the world says that the ground holds the robot for good; and is truncated after T.
+    `options={"map": i}`, heading at the goal. It terminates at the goal, off the map, or
+    where the world says that the ground immobilises the robot for good; and is truncated after T.
 
     ## Info
 
     | key              | type  | meaning                                                    |
     |------------------|-------|------------------------------------------------------------|
-    | `instance`       | int   | number of the map in its split                             |
+    | `map`       | int   | number of the map in its split                             |
     | `outcome`        | str   | `running`, `success`, `timeout`, `immobilised` or `out_of_bounds` |
     | `is_success`     | bool  | the goal was reached                                       |
-    | `traversability` | float | λ met in the step; 1 after a reset                         |
+    | `traversability` | float | observed λ in the step; 1 after a reset                         |
     | `distance_m`     | float | to the goal                                                |
 
     ## Version history
@@ -108,7 +108,7 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     ) -> tuple[Observations, dict[str, Any]]:
         """Starts an episode; see the class."""
         super().reset(seed=seed)
-        chosen = (options or {}).get("instance")
+        chosen = (options or {}).get("map")
         self._batch.reset([self.np_random], np.array([True]), chosen)
         return _first(self._batch.observe()), self._info(np.ones(1, np.float32))
 
@@ -169,7 +169,7 @@ class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if seed is not None or not self._generators:
             _, root = seeding.np_random(seed)
             self._generators = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
-        self._batch.reset(self._generators, np.ones(self.num_envs, bool), (options or {}).get("instance"))
+        self._batch.reset(self._generators, np.ones(self.num_envs, bool), (options or {}).get("map"))
         self._ended = np.zeros(self.num_envs, dtype=bool)
         return self._batch.observe(), self._batch.info(np.ones(self.num_envs, np.float32))
 

@@ -87,34 +87,34 @@ class EnvBatch:
         self._low, self._high = (
             torch.tensor(bound, dtype=torch.float32) for bound in (made.action_low, made.action_high)
         )
-        self._instance = np.zeros(size, dtype=np.int64)
-        self._luck = np.zeros(size, dtype=np.int64)
+        self._map = np.zeros(size, dtype=np.int64)
+        self._noise_seed = np.zeros(size, dtype=np.int64)
         self._simulation: Simulation | None = None
         self._now: SimulationState | None = None
         self.action_space = spaces.Box(self._low.numpy(), self._high.numpy())
         self.observation_space = self._observation_space()
 
     def reset(
-        self, generators: Sequence[np.random.Generator], chosen: np.ndarray, instance: int | None
+        self, generators: Sequence[np.random.Generator], chosen: np.ndarray, map_index: int | None
     ) -> None:
         """Starts new episodes in the chosen sub-environments, bool, shape [B].
 
         Raises:
-            ConfigError: there is no such instance.
+            ConfigError: there is no such map.
         """
-        if instance is not None and not 0 <= instance < len(self._maps):
-            raise ConfigError(f"Expected option `instance` in 0–{len(self._maps) - 1}, got {instance}.")
+        if map_index is not None and not 0 <= map_index < len(self._maps):
+            raise ConfigError(f"Expected option `map` in 0–{len(self._maps) - 1}, got {map_index}.")
         members = np.flatnonzero(chosen)
         for i in members.tolist():
             # Both are drawn always, so that naming the map changes nothing else.
             drawn = generators[i].integers(len(self._maps))
-            self._instance[i] = drawn if instance is None else instance
-            self._luck[i] = generators[i].integers(2**48)
+            self._map[i] = drawn if map_index is None else map_index
+            self._noise_seed[i] = generators[i].integers(2**48)
         fresh, start = self._begin(members)
         if self._simulation is None or self._now is None or len(members) == len(chosen):
             self._simulation, self._now = fresh, start
             return
-        # Only what began anew is built: the others keep their maps and luck.
+        # Only what began anew is built: the others keep their maps and noise.
         index = torch.from_numpy(members)
         self._simulation.exchange_(index, fresh)
         self._now = _each(self._now, lambda name, value: value.index_copy(0, index, getattr(start, name)))
@@ -129,15 +129,15 @@ class EnvBatch:
             hold: bool, shape [B]; none when not given.
 
         Returns:
-            Reward, terminated, truncated, and λ met, each of shape [B].
+            Reward, terminated, truncated, and observed λ, each of shape [B].
 
         Raises:
             ConfigError: the actions are of another shape.
         """
         simulation, now = self._current()
         given = torch.as_tensor(actions, dtype=torch.float32)
-        if given.shape != (len(self._instance), *self._low.shape):
-            expected = [len(self._instance), *self._low.shape]
+        if given.shape != (len(self._map), *self._low.shape):
+            expected = [len(self._map), *self._low.shape]
             raise ConfigError(f"Expected actions of shape {expected}, got {list(given.shape)}.")
         waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
         action = given.clamp(self._low, self._high)
@@ -160,16 +160,16 @@ class EnvBatch:
         return {
             "state": now.state.numpy().copy(),
             "goal": self._goal_m().numpy(),
-            "rgb": self._maps.rgb[self._instance].numpy(),
-            "elevation_m": self._maps.elevation_m[self._instance].numpy(),
-            "slope_deg": self._maps.slope_deg[self._instance].numpy(),
+            "rgb": self._maps.rgb[self._map].numpy(),
+            "elevation_m": self._maps.elevation_m[self._map].numpy(),
+            "slope_deg": self._maps.slope_deg[self._map].numpy(),
         }
 
     def info(self, met: np.ndarray) -> dict[str, np.ndarray]:
         """Diagnostics, each of shape [B]."""
         _, now = self._current()
         return {
-            "instance": self._instance.copy(),
+            "map": self._map.copy(),
             "outcome": now.outcome.numpy().copy(),
             "is_success": (now.outcome == Outcome.SUCCESS).numpy(),
             "traversability": met,
@@ -178,17 +178,17 @@ class EnvBatch:
 
     def _begin(self, members: np.ndarray) -> tuple[Simulation, SimulationState]:
         """A simulation of some sub-environments alone, and its start."""
-        instances = torch.from_numpy(self._instance[members])
+        maps = torch.from_numpy(self._map[members])
         # What is made under inference mode could not be changed in place outside of it.
         with torch.inference_mode(False):
-            places = self._places.select(instances)
+            places = self._places.select(maps)
             simulation = Simulation(
-                self._maps.select(instances),
+                self._maps.select(maps),
                 self._task,
                 self._world,
                 places,
                 rng.stream_key(0, "environment"),
-                self._luck[members].tolist(),
+                self._noise_seed[members].tolist(),
             )
             pose = heading_to(places.start_m, places.goal_m)
             return simulation, simulation.init(self._task.robot.initial_state(pose))
@@ -228,7 +228,7 @@ class EnvBatch:
         return self._simulation, self._now
 
     def _goal_m(self) -> Tensor:
-        return self._places.goal_m[self._instance]
+        return self._places.goal_m[self._map]
 
     def _distance_m(self, now: SimulationState) -> Tensor:
         return distance(now.state, self._goal_m())

@@ -1,9 +1,9 @@
 """Ground that is not free: one rule for every planner.
 
 S_free is where a map exceeds a threshold, and around the goal. A planner may cross other ground at a high
-finite price, so that all planners face the same question and there is a way where no free way is
+finite penalty, so that all planners face the same question and there is a way where no free way is
 predicted. A planner that looks no farther than a horizon, as MPPI does, may still wait before such ground.
-The λ̂ that motion and path costs are given is at least `slowest`, so that a robot on ground predicted to hold
+The λ̂ that motion and path costs are given is at least `min_traversability`, so that a robot on ground predicted to hold
 it can plan its way out. Beyond the paper, whose equation 2e forbids such ground.
 """
 
@@ -18,7 +18,7 @@ from benchnav.mixture import TraversabilityMixture
 
 # Of a step, and of a metre, on ground that is not free; the paper's penalty a step. Higher than what any
 # way over free ground costs.
-PRICE = 1e4
+PENALTY = 1e4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,18 +51,18 @@ class Rules:
 
     Args:
         free_space: which ground is free.
-        slowest: least λ̂ that motion and path costs are given.
+        min_traversability: least λ̂ that motion and path costs are given.
         goal_radius_m: a robot this near to the goal has arrived.
     """
 
     free_space: FreeSpace = FreeSpace()
-    slowest: float = 0.3
+    min_traversability: float = 0.3
     goal_radius_m: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuses rules under which nothing moves or arrives."""
-        if not 0 < self.slowest <= 1:
-            raise ConfigError(f"Expected `slowest` in (0, 1], got {self.slowest}.")
+        if not 0 < self.min_traversability <= 1:
+            raise ConfigError(f"Expected `min_traversability` in (0, 1], got {self.min_traversability}.")
         if not 0 < self.goal_radius_m < float("inf"):
             raise ConfigError(f"Expected `goal_radius_m` > 0 and finite, got {self.goal_radius_m}.")
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
-from benchnav.planning.free_space import PRICE, Rules, cells_at_goal
+from benchnav.planning.free_space import PENALTY, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
 from benchnav.terrain import Observation
@@ -99,7 +99,7 @@ class Problem:
 
     @property
     def objective(self) -> Objective:
-        """J, without the price of ground that is not free: see `stage_cost`."""
+        """J, without the penalty of ground that is not free: see `stage_cost`."""
         return self.task.objective
 
     @property
@@ -114,17 +114,17 @@ class Problem:
 
     @cached_property
     def traversability(self) -> Tensor:
-        """The λ̂ that motion and path costs are given: at least `slowest`, shape [B, H, W].
+        """The λ̂ that motion and path costs are given: at least `min_traversability`, shape [B, H, W].
 
         J is given `risk_map` itself, so that a cost of low λ̂ is not lost.
         """
-        return self.risk_map.clamp(min=self.task.rules.slowest)
+        return self.risk_map.clamp(min=self.task.rules.min_traversability)
 
     @cached_property
     def padded_ground(self) -> Tensor:
         """λ̂ and free space in one map framed for lookups: λ̂ where free, −λ̂ where not, −0 off the map.
 
-        One lookup a step serves motion, J and the price of ground that is not free; see `motion_traversability`,
+        One lookup a step serves motion, J and the penalty of ground that is not free; see `motion_traversability`,
         `stage_cost` and `free_at`.
         """
         magnitude = self.risk_map.clamp(min=_ZERO)
@@ -144,14 +144,14 @@ class Problem:
 
     def traversability_at(self, state: Tensor) -> Tensor:
         """λ̂ of motion where the robots stand, 0 off the map; shapes as for `ground_at`."""
-        return motion_traversability(self.ground_at(state), self.task.rules.slowest)
+        return motion_traversability(self.ground_at(state), self.task.rules.min_traversability)
 
     def free_at(self, state: Tensor) -> Tensor:
         """Tells which robots stand on free ground, bool; shapes as for `ground_at`."""
         return self.ground_at(state) > 0
 
     def stage_cost(self, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
-        """J of a step, and the price of ground that is not free.
+        """J of a step, and the penalty of ground that is not free.
 
         Args:
             state: shape [B, *K, S].
@@ -165,7 +165,7 @@ class Problem:
         return stage_cost(self.objective, state, action, ground, target)
 
     def terminal_cost(self, state: Tensor, target: Tensor) -> Tensor:
-        """J of the last state, and the price of ground that is not free; shapes as for `stage_cost`."""
+        """J of the last state, and the penalty of ground that is not free; shapes as for `stage_cost`."""
         return terminal_cost(self.objective, state, self.ground_at(state), target)
 
     def select(self, members: Tensor) -> "Problem":
@@ -185,17 +185,17 @@ class Problem:
         return with_tensors(self, lambda value: value.to(device))
 
 
-def motion_traversability(ground: Tensor, slowest: float) -> Tensor:
-    """λ̂ that motion is given: at least `slowest` on the map, 0 off it.
+def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
+    """λ̂ that motion is given: at least `min_traversability` on the map, 0 off it.
 
     Args:
         ground: read from `Problem.padded_ground`, any shape.
-        slowest: of the task's rules.
+        min_traversability: of the task's rules.
 
     Returns:
         Shape of `ground`.
     """
-    return torch.where(ground == 0, 0, ground.abs().clamp(min=slowest))
+    return torch.where(ground == 0, 0, ground.abs().clamp(min=min_traversability))
 
 
 def predicted_traversability(ground: Tensor) -> Tensor:
@@ -205,13 +205,13 @@ def predicted_traversability(ground: Tensor) -> Tensor:
 
 
 def stage_cost(objective: Objective, state: Tensor, action: Tensor, ground: Tensor, target: Tensor) -> Tensor:
-    """J of a step and the price of ground that is not free; see `Problem.stage_cost`."""
-    return objective.stage(state, action, predicted_traversability(ground), target) + PRICE * (ground <= 0)
+    """J of a step and the penalty of ground that is not free; see `Problem.stage_cost`."""
+    return objective.stage(state, action, predicted_traversability(ground), target) + PENALTY * (ground <= 0)
 
 
 def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: Tensor) -> Tensor:
-    """J of the last state and the price of ground that is not free; see `Problem.terminal_cost`."""
-    return objective.terminal(state, predicted_traversability(ground), target) + PRICE * (ground <= 0)
+    """J of the last state and the penalty of ground that is not free; see `Problem.terminal_cost`."""
+    return objective.terminal(state, predicted_traversability(ground), target) + PENALTY * (ground <= 0)
 
 
 def pose_problem(

@@ -47,7 +47,7 @@ def expected_time(mixture: TraversabilityMixture, floor: float = 0.05) -> Tensor
     """1 / E[1 / max(λ, floor)], by which a path's length gives its expected time.
 
     What a risk-neutral robot plans with where λ stays what it is at a place: it holds against the mean that
-    time is lost on slow ground, and looks at no tail. A lower floor makes ground that holds a robot dearer.
+    time is lost on slow ground, and looks at no tail. A lower floor makes ground that immobilises a robot dearer.
 
     Args:
         mixture: distribution a cell.

@@ -134,7 +134,7 @@ def test_each_command_uses_the_device_that_it_is_given(
         asked.append(device)
         raise Enough
 
-    for module in ("classifiers", "mdn"):  # a trial of the network would ask the GPU that is not there
+    for module in ("classifiers", "mdn"):  # a condition of the network would ask the GPU that is not there
         monkeypatch.setattr(f"benchnav.models.training.{module}.check_network", lambda *_: None)
     for module in ("classifiers", "gps", "mdn"):
         name = "fit" if module == "gps" else "fit_network"

@@ -15,13 +15,13 @@ from benchnav import mixture
 from benchnav.cvar import Cells
 from benchnav.device import DeviceError, find_device, gpu_failed
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.folder.folder import open_run, write_run
 from benchnav.eval.keep import Keep
 from benchnav.eval.run import episode, recorder, runner
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite, run_unit
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Unit, units
 from benchnav.models.predictor import Oracle, predict
 from benchnav.planning.planners.planner import Plan, Step
@@ -50,8 +50,8 @@ def unit_of(data: Path | str, **changes: Any) -> Unit:
         "data": str(data), "model": "oracle", "planners": ("straight",), "risks": ("cvar:0.9",),
         "scenarios": ("std",), "time_budget_s": 1.2,
     } | changes  # fmt: skip
-    (trial,) = trials_of(Suite(**given), lambda data: ["std"])
-    return Unit(trial=trial, seed=0, realisation=0, instances=(0, 1), keep=Keep(record="all", steps="all"))
+    (condition,) = conditions_of(Suite(**given), lambda data: ["std"])
+    return Unit(condition=condition, seed=0, realisation=0, maps=(0, 1), keep=Keep(record="all", steps="all"))
 
 
 def made(folder: Path) -> dict[str, Any]:
@@ -191,19 +191,19 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=("straight",), risks=("mean",), scenarios=("std",),
-        instances=1, time_budget_s=2.0, record="none",
+        maps=1, time_budget_s=2.0, record="none",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     about = json.loads((tmp_path / "run" / "run.json").read_text())
     write_run(tmp_path / "run", {**about, "device": "cuda"})
-    (unit,) = units(open_run(tmp_path / "run").trials, Keep())
+    (unit,) = units(open_run(tmp_path / "run").conditions, Keep())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU, on which this run was computed"):
         recorder.find_recording(tmp_path / "run", unit, 0)
     with elsewhere() as device:
         monkeypatch.setattr(recorder, "device_of_run", lambda about: device)
-        assert recorder.find_recording(tmp_path / "run", unit, 0).about["instance"] == "0"
+        assert recorder.find_recording(tmp_path / "run", unit, 0).about["map"] == "0"
         assert waits
 
 

@@ -19,13 +19,13 @@ def forge_rows(folder: Path, rows: pd.DataFrame) -> None:
 
 
 def forge_run(
-    folder: Path, rows: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]], **changes: Any
+    folder: Path, rows: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]], **changes: Any
 ) -> Path:
-    """Makes a finished run of a table; `trials` are its trials as `run.json` has them, and `changes` other keys."""
+    """Makes a finished run of a table; `conditions` are as `run.json` has them, and `changes` other keys."""
     notes: dict[str, Any] = {"follows": "", "remarks": [], "changed": []}
     about: dict[str, Any] = {
         "format": "benchnav-run", "format_version": FORMAT_VERSION, "run_id": "r", "suite": {}, "commands": [],
-        "trials": {name: notes | dict(entry) for name, entry in trials.items()}, "datasets": {}, "code": CODE,
+        "conditions": {name: notes | dict(entry) for name, entry in conditions.items()}, "datasets": {}, "code": CODE,
         "planner_limit_s": 0.0, "device": "cpu", "gpu": None, "parts": {}, "warnings": [], "dropped": [],
         "history": [], "machine": {"processor": "AMD", "cores": 2, "host": "here"},
     }  # fmt: skip

@@ -42,11 +42,11 @@ class Spy:
         return note, []
 
     def plan(self, step: Step, plan_state):  # type: ignore[no-untyped-def]
-        note, felt = plan_state
-        felt = [*felt, step.felt]
-        if len(felt) == 4:
-            torch.save({**note, "felt": torch.stack(felt[1:])}, self.log / f"{uuid.uuid4().hex}.pt")
-        return torch.zeros(len(step.state), 2), (note, felt), Plan.empty(len(step.state))
+        note, observed = plan_state
+        observed = [*observed, step.traversability]
+        if len(observed) == 4:
+            torch.save({**note, "observed": torch.stack(observed[1:])}, self.log / f"{uuid.uuid4().hex}.pt")
+        return torch.zeros(len(step.state), 2), (note, observed), Plan.empty(len(step.state))
 
 
 class TwoModes:
@@ -79,7 +79,7 @@ class Faulty:
             return action, plan_state, Plan.empty(batch, device)
         if self.fault == "write":
             step.state[:, :2] = plan_state.goal_m
-            step.felt.zero_()
+            step.traversability.zero_()
         if self.fault == "nan":
             action[0] = torch.nan
         if self.fault == "shape":

@@ -83,10 +83,12 @@ def test_worlds_are_listed_by_the_names_that_flags_and_suites_have() -> None:
     paper, stakes = list_entries("world")
     assert (paper.name, stakes.name) == ("paper", "stakes")
     assert "drawn anew" in paper.purpose
-    assert "holds" in stakes.purpose
-    assert {'world.noise = "resampled"', "world.time_budget_s = 100.0", "task.slowest = 0.3"} <= set(
-        paper.options
-    )
+    assert "immobilises" in stakes.purpose
+    assert {
+        'world.noise = "resampled"',
+        "world.time_budget_s = 100.0",
+        "task.min_traversability = 0.3",
+    } <= set(paper.options)
     assert not any("immobile" in option for option in paper.options)
     assert {
         'world.noise = "frozen"',

@@ -10,12 +10,12 @@ import pytest
 from benchnav.errors import ConfigError
 from benchnav.eval import cli
 from benchnav.eval.compare import compare_runs
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.rendering import latex
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, find_pairs
-from benchnav.eval.trial import NOT_USED
 from tests.eval.forged import CODE, forge_run
-from tests.eval.report.made import row, rows, trial
+from tests.eval.report.made import condition, row, rows
 from tests.eval.stats.test_pairing import value_of
 
 MAPS = 12
@@ -24,14 +24,14 @@ MAPS = 12
 def settings(shift: int = 0) -> pd.DataFrame:
     """Two planners under three settings, of which the cautious ones arrive more often, and `straight`."""
     generator = np.random.default_rng(5)
-    luck = generator.random(MAPS)
+    noise = generator.random(MAPS)
     made = []
     for planner in ("mppi", "cl_rrt"):
         for risk, rate in (("mean", 0.3), ("cvar", 0.6), ("var", 0.9)):
-            labels = trial(planner, risk)
+            labels = condition(planner, risk)
             late = {"mean": 0, "cvar": 3, "var": 7}[risk] + shift
-            made.append([row(labels, i, 30.0 + i + late if luck[i] < rate else None) for i in range(MAPS)])
-    made.append([row(trial("straight", NOT_USED, model=NOT_USED), i, None) for i in range(MAPS)])
+            made.append([row(labels, i, 30.0 + i + late if noise[i] < rate else None) for i in range(MAPS)])
+    made.append([row(condition("straight", NOT_USED, model=NOT_USED), i, None) for i in range(MAPS)])
     return rows(*made)
 
 
@@ -46,8 +46,8 @@ def run_folder(
 ) -> Path:
     """A finished run with what a comparison reads of it; `values` are what is told of conditions by their label."""
     known = {}
-    for name, group in episodes.groupby("trial", sort=False):
-        labels = {label: group[label].iloc[0] for label in trial()}
+    for name, group in episodes.groupby("condition", sort=False):
+        labels = {label: group[label].iloc[0] for label in condition()}
         own = {
             key: value for label in labels.values() for key, value in (values or {}).get(label, {}).items()
         }
@@ -77,16 +77,16 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 def test_the_numbers_are_those_of_the_pairs_of_the_run(tmp_path: Path) -> None:
     episodes = settings()
     table, _ = compare_runs([run_folder(tmp_path / "run", episodes)], "", "mean", {"planner": "mppi"}, 0.05)
-    trials = [
+    conditions = [
         Compared(
-            labels={**trial("mppi", risk), "run": NOT_USED},
-            value=value_of(trial("mppi", risk)), maps=["m"] * MAPS,
+            labels={**condition("mppi", risk), "run": NOT_USED},
+            value=value_of(condition("mppi", risk)), maps=["m"] * MAPS,
             episodes=episodes[(episodes["planner"] == "mppi") & (episodes["risk"] == risk)].assign(time_budget_s=100.0),
         )
         for risk in ("mean", "cvar", "var")
     ]  # fmt: skip
     pd.testing.assert_frame_equal(
-        table.drop(columns="different_code"), compare(find_pairs(trials, against="mean"))
+        table.drop(columns="different_code"), compare(find_pairs(conditions, against="mean"))
     )
     assert (table["different_code"] == "").all()
     assert list(table["one"]) == ["cvar", "var"]
@@ -174,11 +174,11 @@ def test_a_planner_that_was_edited_is_not_compared_with_another_either(tmp_path:
     assert len(compare_runs([first, second], "planner", "", {}, 0.05)[0]) == 1
     # Of two scenarios each in a run of its own each pair has one code, and the label of a row two.
     moved = episodes[episodes["planner"] == "mppi"].assign(
-        scenario="hg", trial=lambda rows: rows["trial"] + "hg"
+        scenario="hg", condition=lambda rows: rows["condition"] + "hg"
     )
     cautious = settings()[lambda rows: (rows["risk"] == "cvar") & (rows["planner"] == "mppi")]
     here = run_folder(tmp_path / "c", pd.concat([episodes[episodes["planner"] == "mppi"], cautious]))
-    two = pd.concat([moved, cautious.assign(scenario="hg", trial=lambda rows: rows["trial"] + "hg")])
+    two = pd.concat([moved, cautious.assign(scenario="hg", condition=lambda rows: rows["condition"] + "hg")])
     maps = {"paper-v1": {"maps": {"test/hg": ["m"] * MAPS}}}
     there = run_folder(tmp_path / "d", two, parts=parts, datasets=maps)
     with pytest.raises(ConfigError, match="d differs from c in planner mppi"):
@@ -191,9 +191,7 @@ def test_a_condition_that_two_runs_hold_counts_once(tmp_path: Path) -> None:
     mean = episodes["risk"] == "mean"
     first = run_folder(tmp_path / "a", episodes[mean | (episodes["risk"] == "cvar")])
     # The second run holds `mean` again, on fewer maps and timed anew.
-    again = episodes[(mean & (episodes["instance"] < 9)) | (episodes["risk"] == "var")].assign(
-        planning_ms=77.0
-    )
+    again = episodes[(mean & (episodes["map"] < 9)) | (episodes["risk"] == "var")].assign(planning_ms=77.0)
     second = run_folder(tmp_path / "b", again)
     table, shown = compare_runs([first, second], "risk", "", {}, 0.05)
     pd.testing.assert_frame_equal(table.drop(columns="run"), whole.drop(columns="run"))
@@ -206,7 +204,7 @@ def test_a_condition_that_two_runs_hold_counts_once(tmp_path: Path) -> None:
 def test_rows_of_one_condition_that_disagree_are_refused(tmp_path: Path) -> None:
     episodes = settings()[lambda rows: rows["planner"] == "mppi"]
     mean, late = episodes["risk"] == "mean", episodes.copy()
-    late.loc[mean & (late["instance"] < 2), "total_time_s"] += 1
+    late.loc[mean & (late["map"] < 2), "total_time_s"] += 1
     first = run_folder(tmp_path / "a", episodes[mean | (episodes["risk"] == "cvar")])
     parts = {"planner mppi": {"origin": "file mppi.py", "digest": "2"}}
     second = run_folder(tmp_path / "b", late[mean | (late["risk"] == "var")], parts=parts)
@@ -243,7 +241,7 @@ def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
 
 def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tmp_path: Path) -> None:
     def drawn(risk: str, *draws: tuple[int, int]) -> pd.DataFrame:
-        return rows([row(trial("mppi", risk), i, seed=seed) for seed, maps in draws for i in range(maps)])
+        return rows([row(condition("mppi", risk), i, seed=seed) for seed, maps in draws for i in range(maps)])
 
     uneven = run_folder(
         tmp_path / "a", pd.concat([drawn("mean", (0, 12), (1, 5)), drawn("cvar", (0, 12), (1, 5))])
@@ -266,7 +264,7 @@ def test_maps_of_unequally_many_draws_all_count_and_what_is_left_out_is_named(tm
 
 def test_groups_of_maps_are_the_unit(tmp_path: Path) -> None:
     episodes = settings()
-    folder = run_folder(tmp_path / "run", episodes.assign(group=episodes["instance"] // 3))
+    folder = run_folder(tmp_path / "run", episodes.assign(group=episodes["map"] // 3))
     table, shown = compare_runs([folder], "risk", "", {}, 0.05)
     assert set(zip(table["n_maps"], table["n_groups"], strict=True)) == {(12, 4)}
     assert "The maps are in 4 groups that overlap or share a site; the group is the unit." in shown.notes
@@ -274,7 +272,7 @@ def test_groups_of_maps_are_the_unit(tmp_path: Path) -> None:
 
 def test_robots_under_unlike_budgets_are_compared_in_shares(tmp_path: Path) -> None:
     """T is thrice the reference time at each robot's top speed, 1 and 2 m/s: a failure of the slow one costs 75 s."""
-    slow, fast = (trial(robot=name) for name in ("slow", "fast"))
+    slow, fast = (condition(robot=name) for name in ("slow", "fast"))
     times = {"slow": [30.0, 45.0, None], "fast": [15.0, 20.0, 20.0]}
     made = [
         row(
@@ -296,7 +294,7 @@ def test_robots_under_unlike_budgets_are_compared_in_shares(tmp_path: Path) -> N
     assert "Δ T_total [% of T]" in shown.headings
 
 
-def test_runs_with_trials_of_their_own_are_compared_across(tmp_path: Path) -> None:
+def test_runs_with_conditions_of_their_own_are_compared_across(tmp_path: Path) -> None:
     episodes = settings()
     cautious = run_folder(tmp_path / "a", episodes[episodes["risk"] == "cvar"])
     plain = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"])

@@ -15,7 +15,7 @@ from benchnav.eval.run.runner import run_suite
 from benchnav.share import Share
 
 SMALL = (
-    "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--instances", "1",
+    "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--maps", "1",
     "--model", "oracle", "--time_budget_s", "10", "--planner_options", '{"mppi": {"samples": 64}}',
 )  # fmt: skip
 
@@ -49,7 +49,7 @@ def test_run_report_and_replay(dataset_path: Path, tmp_path: Path, monkeypatch, 
     assert "2 of 4 units were there already" in capsys.readouterr().err
     # A suite that cannot be run drops nothing.
     monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)  # a report takes longer than a run
-    assert evaluate(monkeypatch, *again, "--overwrite", "true", "--instances", "99") == 2
+    assert evaluate(monkeypatch, *again, "--overwrite", "true", "--maps", "99") == 2
     assert (out / "episodes.parquet").exists()
     assert evaluate(monkeypatch, *again, "--overwrite") == 0
     assert "already" not in capsys.readouterr().err
@@ -61,17 +61,17 @@ def test_world_and_task_are_set_field_by_field(dataset_path: Path, tmp_path: Pat
     arguments += (
         "--world.noise",
         "stored",
-        "--task.slowest",
+        "--task.min_traversability",
         "0.05",
         "--task.free_space",
         "{by: mean, above: 0.1}",
     )
     monkeypatch.setattr(eval_cli, "_finish", eval_cli._failed)
     assert evaluate(monkeypatch, *arguments) == 0
-    for trial, _ in open_run(out).trials.values():
-        assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 10.0)
-        assert trial.rules.slowest == 0.05
-        assert (trial.rules.free_space.by, trial.rules.free_space.above) == ("mean", 0.1)
+    for condition, _ in open_run(out).conditions.values():
+        assert (condition.world.noise, condition.world.time_budget_s) == ("stored", 10.0)
+        assert condition.rules.min_traversability == 0.05
+        assert (condition.rules.free_space.by, condition.rules.free_space.above) == ("mean", 0.1)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_shipped_suites_are_found_by_name_and_have_the_blind_baseline(monkeypatc
     for name in names:
         assert evaluate(monkeypatch, "run", "--config", name, "--print_config") == 0
         printed = yaml.safe_load(capsys.readouterr().out)
-        listed = [printed, *(printed["trials"] or [])]
+        listed = [printed, *(printed["conditions"] or [])]
         assert any("straight" in (product.get("planners") or []) for product in listed)
     assert evaluate(monkeypatch, "run", "--config", "dmo") == 2
     assert "Did you mean" in capsys.readouterr().err
@@ -177,7 +177,7 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monk
     [
         ("run", "--data", "no-such"),
         ("run", "--model", "no-such"),
-        ("run", "--instances", "some"),
+        ("run", "--maps", "some"),
         ("run", "--jobs", "0"),
         ("run", "--planers", "[mppi]"),
         ("run", "--planners", "[mppi,nowhere.py:Mine]", "--model", "oracle"),

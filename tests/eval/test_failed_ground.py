@@ -31,7 +31,7 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     }
     suite = Suite(
         data=str(dataset_path), scenarios=("std",), model="oracle", planners=("tests.eval.parts:Faulty",),
-        risks=("cvar",), world=world, instances=2, seeds=(0, 1), realisations=2,
+        risks=("cvar",), world=world, maps=2, seeds=(0, 1), realisations=2,
         record="none",
     )  # fmt: skip
     for _ in run_suite(suite, made):
@@ -39,30 +39,30 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return made
 
 
-def test_the_ground_is_that_of_each_episode_under_its_own_luck(folder: Path) -> None:
+def test_the_ground_is_that_of_each_episode_under_its_own_noise(folder: Path) -> None:
     rows = read_table(folder, "episodes.parquet")  # whether they failed does not matter here
     assert len(rows) == 8
-    mixed = rows.sort_values("instance")
+    mixed = rows.sort_values("map")
     ground = ground_of_run(folder)(mixed)
-    (trial, _) = next(iter(open_run(folder).trials.values()))
+    (condition, _) = next(iter(open_run(folder).conditions.values()))
     for place, row in enumerate(mixed.to_dict("records")):
-        luck = {name: row[name] for name in ("seed", "realisation")}
-        unit = Unit(trial=trial, instances=(row["instance"],), **luck)
+        noise = {name: row[name] for name in ("seed", "realisation")}
+        unit = Unit(condition=condition, maps=(row["map"],), **noise)
         problem, simulation = build(unit, "again")
         np.testing.assert_array_equal(ground.predicted[place], problem.risk_map[0].numpy())
         assert simulation.field is not None
-        np.testing.assert_array_equal(ground.holding[place], (simulation.field[0] < BELOW).numpy())
+        np.testing.assert_array_equal(ground.immobilising[place], (simulation.field[0] < BELOW).numpy())
         np.testing.assert_array_equal(ground.goal_m[place], problem.goal_m[0].numpy())
     # Each is held elsewhere, so that no ground passes for another's.
-    assert ground.holding.any(axis=(1, 2)).all()
-    assert len({holding.tobytes() for holding in ground.holding}) == 8
+    assert ground.immobilising.any(axis=(1, 2)).all()
+    assert len({immobilising.tobytes() for immobilising in ground.immobilising}) == 8
 
 
 def test_the_report_shows_it_and_says_what_the_planner_was_told(folder: Path) -> None:
     report = write_report(folder, ground_of_run(folder))
     assert (folder / "figures" / "failures.png").stat().st_size > 5000
     assert "![failures](figures/failures.png)" in (folder / "summary.md").read_text()
-    assert any("the planner had been told λ̂ = " in said for said in report.findings[0].sentences)
+    assert any("the predicted λ̂ was " in said for said in report.findings[0].sentences)
     assert report.warnings == () or "No sheet" not in report.warnings[-1]
 
 

@@ -5,27 +5,27 @@ from typing import Any
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.folder import FORMAT, FORMAT_VERSION, write_run
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent
 
 DRAWS = ((4, 0, 60), (4, 1, 60), (9, 0, 2))
 
 
 def made(path: Path, **draws: tuple[tuple[int, int, int], ...]) -> Path:
-    """What a run is about, without its rows; by planner the draws of luck that are not those of all."""
+    """What a run is about, without its rows; by planner the draws of noise that are not those of all."""
     suite = Suite(
         model="oracle", planners=("straight", "astar_dwa", "mppi"), risks=("mean", "cvar:0.5", "cvar")
     )
     entries = {}
-    for trial in trials_of(suite, lambda data: ["std", "hs"]):
-        extent = Extent(draws=draws.get(trial.labels["planner"], DRAWS))
-        entries[trial.id] = {"value": trial.value, "labels": trial.labels, **extent.to_dict()}
+    for condition in conditions_of(suite, lambda data: ["std", "hs"]):
+        extent = Extent(draws=draws.get(condition.labels["planner"], DRAWS))
+        entries[condition.id] = {"value": condition.value, "labels": condition.labels, **extent.to_dict()}
     maps = {f"test/{scenario}": ["m"] * 60 for scenario in ("std", "hs")}
     about = {
-        "format": FORMAT, "format_version": FORMAT_VERSION, "run_id": "r", "suite": {}, "trials": entries,
+        "format": FORMAT, "format_version": FORMAT_VERSION, "run_id": "r", "suite": {}, "conditions": entries,
         "datasets": {suite.data: {"id": "d", "maps": maps}}, "parts": {}, "commands": [], "machine": {},
         "code": {"sources": "s", "versions": {}, "processor": "", "compiles": False}, "device": "cpu",
         "planner_limit_s": 0.0,
@@ -41,18 +41,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def found(
-    folder: Path, seed: int | None = None, realisation: int = 0, instance: int = 0, **labels: Any
+    folder: Path, seed: int | None = None, realisation: int = 0, map_index: int = 0, **labels: Any
 ) -> list[Any]:
-    episodes = find_episodes(folder, {n: list(v) for n, v in labels.items()}, seed, realisation, instance)
+    episodes = find_episodes(folder, {n: list(v) for n, v in labels.items()}, seed, realisation, map_index)
     for unit, member in episodes:
-        assert unit.instances[member] == instance
+        assert unit.maps[member] == map_index
         assert unit.realisation == realisation
     return [
-        (u.trial.labels["planner"], u.trial.labels["risk"], u.trial.scenario, u.seed) for u, _ in episodes
+        (u.condition.labels["planner"], u.condition.labels["risk"], u.condition.scenario, u.seed)
+        for u, _ in episodes
     ]
 
 
-def test_the_first_trial_that_fits_is_taken(folder: Path) -> None:
+def test_the_first_condition_that_fits_is_taken(folder: Path) -> None:
     assert found(folder) == [("straight", "–", "std", 4)]
     assert found(folder, planner=["mppi"]) == [("mppi", "mean", "std", 4)]
     assert found(folder, risk=["cvar"]) == [("astar_dwa", "cvar", "std", 4)]
@@ -61,19 +62,19 @@ def test_the_first_trial_that_fits_is_taken(folder: Path) -> None:
     ]
 
 
-def test_seed_realisation_and_instance_are_those_asked_for(folder: Path) -> None:
-    assert found(folder, seed=9, instance=1)[0][3] == 9
-    assert found(folder, realisation=1, instance=59) == [("straight", "–", "std", 4)]
+def test_seed_realisation_and_map_are_those_asked_for(folder: Path) -> None:
+    assert found(folder, seed=9, map_index=1)[0][3] == 9
+    assert found(folder, realisation=1, map_index=59) == [("straight", "–", "std", 4)]
 
 
-def test_several_labels_give_several_trials_in_their_order(folder: Path) -> None:
+def test_several_labels_give_several_conditions_in_their_order(folder: Path) -> None:
     assert found(folder, planner=["mppi"], risk=["cvar", "mean"]) == [
         ("mppi", "cvar", "std", 4), ("mppi", "mean", "std", 4)
     ]  # fmt: skip
     assert len(found(folder, planner=["mppi", "astar_dwa"], risk=["cvar", "mean"])) == 4
 
 
-def test_trials_that_begin_with_other_seeds_are_shown_under_one(tmp_path: Path) -> None:
+def test_conditions_that_begin_with_other_seeds_are_shown_under_one(tmp_path: Path) -> None:
     """Of a run that was extended for one planner: all the others are looked for under the first's seed."""
     folder = made(tmp_path / "run", straight=((7, 0, 2), (9, 0, 2)), mppi=((9, 0, 2), (4, 0, 2)))
     assert found(folder, planner=["mppi", "astar_dwa"], risk=["cvar"]) == [
@@ -82,7 +83,7 @@ def test_trials_that_begin_with_other_seeds_are_shown_under_one(tmp_path: Path) 
     assert found(folder, planner=["astar_dwa", "mppi"], risk=["cvar"]) == [
         ("astar_dwa", "cvar", "std", 4), ("mppi", "cvar", "std", 4)
     ]  # fmt: skip
-    with pytest.raises(ConfigError, match=r"got planner 'mppi', realisation 0, instance 0, seed 7\."):
+    with pytest.raises(ConfigError, match=r"got planner 'mppi', realisation 0, map 0, seed 7\."):
         found(folder, planner=["straight", "mppi"])
     assert [seed for *_, seed in found(folder, seed=9, planner=["straight", "mppi"])] == [9, 9]
 
@@ -94,13 +95,13 @@ def test_a_blind_planner_stands_once_under_any_risk_setting(folder: Path) -> Non
 
 
 def test_other_maps_do_not_stand_together(folder: Path) -> None:
-    with pytest.raises(ConfigError, match="trials on one map"):
+    with pytest.raises(ConfigError, match="conditions on one map"):
         found(folder, scenario=["std", "hs"])
 
 
 @pytest.mark.parametrize(
     "asked",
-    [{"planner": ["no"]}, {"planner": ["mppi", "no"]}, {"instance": 60}, {"seed": 7}, {"seed": 9, "instance": 2},
+    [{"planner": ["no"]}, {"planner": ["mppi", "no"]}, {"map_index": 60}, {"seed": 7}, {"seed": 9, "map_index": 2},
      {"realisation": 2}, {"seed": 9, "realisation": 1}],
 )  # fmt: skip
 def test_what_is_not_there_is_refused_with_what_is(asked: dict[str, Any], folder: Path) -> None:

@@ -36,7 +36,7 @@ def call(*words: str) -> int:
 def words_on(dataset: Path, *more: str) -> tuple[str, ...]:
     return (
         "run", "--data", str(dataset), "--model", "oracle", "--planners", "[tests.eval.parts:Faulty]", "--risks",
-        "[mean]", "--scenarios", "[std]", "--instances", "1", "--time_budget_s", "4", "--record", "none", *more,
+        "[mean]", "--scenarios", "[std]", "--maps", "1", "--time_budget_s", "4", "--record", "none", *more,
     )  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def run(made: Path, tmp_path: Path) -> Path:
 def quick(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": ("tests.eval.parts:Faulty",), "risks": ("mean",),
-        "scenarios": ("std",), "instances": 1, "record": "none", "steps": "none", "time_budget_s": 2.0,
+        "scenarios": ("std",), "maps": 1, "record": "none", "steps": "none", "time_budget_s": 2.0,
     }  # fmt: skip
     return Suite(**(given | changes))
 
@@ -221,8 +221,8 @@ def test_one_condition_has_one_label_for_good(dataset_path: Path, tmp_path: Path
     assert json.loads((out / "run.json").read_text()) == before
     list(run_suite(suite("cautious", 0.5), out))
     rows = pd.read_parquet(out / "episodes.parquet")
-    labels = {i: entry["labels"]["risk"] for i, entry in open_run(out).about["trials"].items()}
-    assert dict(zip(rows["trial"], rows["risk"], strict=True)) == labels
+    labels = {i: entry["labels"]["risk"] for i, entry in open_run(out).about["conditions"].items()}
+    assert dict(zip(rows["condition"], rows["risk"], strict=True)) == labels
     assert set(labels.values()) == {"careful", "cautious"}
 
 
@@ -231,7 +231,7 @@ def test_rows_have_the_group_of_their_map(
 ) -> None:
     rows = pd.read_parquet(run / "episodes.parquet")
     assert rows["group"].dtype == "int64"
-    assert (rows["group"] == rows["instance"]).all()
+    assert (rows["group"] == rows["map"]).all()
 
     class Grouped(TerrainDataset):
         field_names = ("group",)
@@ -244,5 +244,5 @@ def test_rows_have_the_group_of_their_map(
     monkeypatch.setattr(episode, "TerrainDataset", Grouped)
     block = episode.read_maps(Grouped(dataset_path), "test/std", [0, 1])
     assert (block.groups.tolist(), block.groups.dtype) == ([40, 40], np.int64)
-    list(run_suite(quick(dataset_path, instances=2), tmp_path / "grouped"))
+    list(run_suite(quick(dataset_path, maps=2), tmp_path / "grouped"))
     assert read_table(tmp_path / "grouped", EPISODES)["group"].tolist() == [40, 40]

@@ -15,7 +15,7 @@ from benchnav.eval.report.playback.video import frame_times
 
 SMALL = (
     "--planners", "[straight,'tests.eval.parts:Faulty']", "--risks", "[mean,cvar:0.5]", "--scenarios", "[std]",
-    "--instances", "2", "--model", "oracle", "--time_budget_s", "5", "--noise", "stored",
+    "--maps", "2", "--model", "oracle", "--time_budget_s", "5", "--noise", "stored",
 )  # fmt: skip
 
 
@@ -45,7 +45,7 @@ def shown(printed: str) -> Path:
 
 
 def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    asked = ("--planner", "Faulty", "--risk", "cvar:0.5", "--instance", "1")
+    asked = ("--planner", "Faulty", "--risk", "cvar:0.5", "--map", "1")
     assert call("replay", str(folder), *asked, "--view", "no") == 0
     printed = capsys.readouterr().out
     path = shown(printed)
@@ -56,16 +56,16 @@ def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("risks", ["mean,cvar:0.5", "[mean, 'cvar:0.5']"])
-def test_several_labels_show_their_trials_together(risks: str, folder: Path, capsys: Any) -> None:
+def test_several_labels_show_their_conditions_together(risks: str, folder: Path, capsys: Any) -> None:
     assert call("replay", str(folder), "--planner", "Faulty", "--risk", risks, "--view", "false") == 0
     path = shown(capsys.readouterr().out)
     assert path.name.startswith("together-std")
-    assert {"/world/trials/mean/robot", "/world/trials/cvar\\:0.5/robot"} <= entities(path)
+    assert {"/world/conditions/mean/robot", "/world/conditions/cvar\\:0.5/robot"} <= entities(path)
 
 
 def test_other_episodes_together_are_another_file(folder: Path, capsys: Any) -> None:
     paths = []
-    for more in ((), ("--instance", "1"), ("--planner", "straight,Faulty")):
+    for more in ((), ("--map", "1"), ("--planner", "straight,Faulty")):
         assert (
             call(
                 "replay", str(folder), "--planner", "Faulty", "--risk", "mean,cvar:0.5", *more, "--view=false"
@@ -81,13 +81,13 @@ def test_each_option_asks_for_what_it_names(seed: str, folder: Path, capsys: Any
     """Of an episode that the run does not have, the refusal tells what was looked for."""
     columns = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
     words = [word for name in columns for word in (f"--{name}", f"some {name}")]
-    words += ["--seed", seed, "--realisation", "3", "--instance", "4"]
+    words += ["--seed", seed, "--realisation", "3", "--map", "4"]
     assert call("replay", str(folder), *words) == 2
     labels = ", ".join(f"{name} 'some {name}'" for name in columns)
-    assert f"got {labels}, realisation 3, instance 4, seed {seed}." in capsys.readouterr().err
+    assert f"got {labels}, realisation 3, map 4, seed {seed}." in capsys.readouterr().err
 
 
-def test_a_video_shows_trials_side_by_side(folder: Path, tmp_path: Path, capsys: Any) -> None:
+def test_a_video_shows_conditions_side_by_side(folder: Path, tmp_path: Path, capsys: Any) -> None:
     widths = []
     for name, risk in (("one", "mean"), ("two", "mean,cvar:0.5")):
         path = tmp_path / f"{name}.mp4"
@@ -134,8 +134,11 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
         (("replay", "RUN", "--video", "a.mp4", "--web"), "Expected `video` or `web`, got both."),
         (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
         (("replay", "RUN", "--planner", "mpi"), "planners ['straight', 'Faulty']"),
-        (("run", "--recorded", "4"), "It is now `record`: none, failures, first or all."),
-        (("run", "--config", "old.yaml"), "It is now `record`: none, failures, first or all."),
+        (("run", "--recorded", "4"), "It is now '--record'."),
+        (("run", "--instances", "4"), "It is now '--maps'."),
+        (("replay", "RUN", "--instance", "4"), "It is now '--map'."),
+        (("run", "--task.slowest", "0.2"), "It is now 'min_traversability'."),
+        (("run", "--config", "old.yaml"), "It is now 'record'."),
         (("run", "--record", "some"), "'none' or 'failures' or 'first' or 'all'"),
         (("run", "--steps", "first"), "'none' or 'recorded' or 'all'"),
     ],

@@ -43,29 +43,29 @@ STRAIGHT = [(25.1, 21.664, 0.8631), (29.0, 21.662, 0.7470), (26.4, 21.642, 0.819
 
 
 def test_golden_rows_of_the_blind_straight_line(tmp_path: Path) -> None:
-    suite = Suite(model="oracle", planners=("straight",), scenarios=("std",), instances=4, record="none")
+    suite = Suite(model="oracle", planners=("straight",), scenarios=("std",), maps=4, record="none")
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
     measures = rows[["total_time_s", "path_length_m", "traversability"]].to_numpy()
     assert (np.abs(measures - STRAIGHT) < [1e-6, 1e-3, 1e-4]).all()
     assert rows["outcome"].tolist() == ["success"] * 4
-    np.testing.assert_allclose(measures, [drive_straight(instance) for instance in range(4)], atol=1e-3)
+    np.testing.assert_allclose(measures, [drive_straight(map_index) for map_index in range(4)], atol=1e-3)
 
 
-def drive_straight(instance: int) -> tuple[float, float, float]:
+def drive_straight(map_index: int) -> tuple[float, float, float]:
     """The same episode in a loop of its own: who heads at the goal moves 0.1 λ m a step along the line."""
     dataset = TerrainDataset(find_dataset("paper-v1"))
-    terrain = dataset.terrain("test/std", [instance])
-    places = dataset.read("test/std", [instance], ["start_m", "goal_m"])
+    terrain = dataset.terrain("test/std", [map_index])
+    places = dataset.read("test/std", [map_index], ["start_m", "goal_m"])
     start, goal = (places[name][0].astype(float) for name in ("start_m", "goal_m"))
-    key = rng.stream_key(rng.stream_key(0, "simulation", "test/std"), instance)
-    luck = rng.normal(key, np.zeros(1, np.int64), (1000,))[0]
+    key = rng.stream_key(rng.stream_key(0, "simulation", "test/std"), map_index)
+    noise = rng.normal(key, np.zeros(1, np.int64), (1000,))[0]
     direction, place, met = (goal - start) / np.linalg.norm(goal - start), start, []
     while np.linalg.norm(goal - place) >= 1:
         column, row = (place // 0.5).astype(int)
         mean, std = (float(t[0, 0, row, column]) for t in (terrain.truth.means, terrain.truth.stds))
-        met.append(float(np.clip(mean + std * luck[len(met)], 0, 1)))
+        met.append(float(np.clip(mean + std * noise[len(met)], 0, 1)))
         place = place + 0.1 * met[-1] * direction
     return 0.1 * len(met), 0.1 * sum(met), float(np.mean(met))
 
@@ -109,10 +109,10 @@ IN_STAKES = [
 ]  # fmt: skip
 
 
-def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_mission(tmp_path: Path) -> None:
+def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_episode(tmp_path: Path) -> None:
     suite = Suite(
         data="stakes-v1", world="stakes", model="oracle", planners=("straight",), scenarios=("std",),
-        instances=8, record="none",
+        maps=8, record="none",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass
@@ -120,18 +120,18 @@ def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_mission
     assert rows["outcome"].tolist() == [outcome for outcome, *_ in IN_STAKES]
     measures = rows[["path_length_m", "traversability"]].to_numpy()
     assert (np.abs(measures - [numbers for _, *numbers in IN_STAKES]) < [1e-3, 1e-4]).all()
-    driven = [drive_straight_on_frozen_ground(instance) for instance in range(8)]
+    driven = [drive_straight_on_frozen_ground(map_index) for map_index in range(8)]
     assert rows["outcome"].tolist() == [outcome for outcome, *_ in driven]
     np.testing.assert_allclose(measures, [numbers for _, *numbers in driven], atol=1e-3)
 
 
-def drive_straight_on_frozen_ground(instance: int) -> tuple[str, float, float]:
+def drive_straight_on_frozen_ground(map_index: int) -> tuple[str, float, float]:
     """The same episode in a loop of its own, on a field by scipy's filter and root finder."""
     dataset = TerrainDataset(find_dataset("stakes-v1"))
-    terrain = dataset.terrain("test/std", [instance])
-    places = dataset.read("test/std", [instance], ["start_m", "goal_m", "reference_time_s"])
+    terrain = dataset.terrain("test/std", [map_index])
+    places = dataset.read("test/std", [map_index], ["start_m", "goal_m", "reference_time_s"])
     start, goal = (places[name][0].astype(float) for name in ("start_m", "goal_m"))
-    field = frozen_field(terrain.truth, instance)
+    field = frozen_field(terrain.truth, map_index)
     direction, place, met, held = (goal - start) / np.linalg.norm(goal - start), start, [], 0
     for _ in range(round(3 * float(places["reference_time_s"][0]) / 0.1)):
         column, row = (place // 0.5).astype(int)
@@ -144,9 +144,9 @@ def drive_straight_on_frozen_ground(instance: int) -> tuple[str, float, float]:
     return "timeout", 0.1 * sum(met), float(np.mean(met))
 
 
-def frozen_field(truth: TraversabilityMixture, instance: int) -> Callable[[int, int], float]:
+def frozen_field(truth: TraversabilityMixture, map_index: int) -> Callable[[int, int], float]:
     """λ of a cell of the first draw, by sums over the white noise and bisection in the cell's own CDF."""
-    key = rng.stream_key(rng.stream_key(0, "simulation", "test/std"), instance, "field", 0)
+    key = rng.stream_key(rng.stream_key(0, "simulation", "test/std"), map_index, "field", 0)
     white = rng.normal(key, np.zeros(1, np.int64), (128, 128))[0]
     away = np.minimum(np.arange(128), 128 - np.arange(128))
     weights, means, stds = (t[0].double().numpy() for t in (truth.weights, truth.means, truth.stds))

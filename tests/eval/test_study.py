@@ -11,10 +11,10 @@ import pytest
 import yaml
 from scipy.stats import t
 
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.hypotheses import fix_hypotheses
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
-from tests.eval.report.made import row, rows, trial
+from tests.eval.report.made import condition, row, rows
 from tests.eval.test_compare import run_folder
 
 ROOT = Path(__file__).parents[2]
@@ -34,21 +34,23 @@ SUITES = [*STUDY.glob("*.yaml"), *(ROOT / "benchnav" / "eval" / "suites").glob("
 
 
 @pytest.mark.parametrize("path", sorted(SUITES), ids=lambda path: path.stem)
-def test_each_suite_makes_trials_and_names_them_in_its_hypotheses(
+def test_each_suite_makes_conditions_and_names_them_in_its_hypotheses(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
     suite = Suite(**yaml.safe_load(path.read_text()))
-    trials = {trial.id: trial for trial in trials_of(suite, lambda data: ["std", "hg", "hs"])}
-    assert len(trials) >= 6
-    tests = fix_hypotheses(suite.hypotheses, trials, dict.fromkeys(trials, 1)).get("tests", [])
+    conditions = {
+        condition.id: condition for condition in conditions_of(suite, lambda data: ["std", "hg", "hs"])
+    }
+    assert len(conditions) >= 6
+    tests = fix_hypotheses(suite.hypotheses, conditions, dict.fromkeys(conditions, 1)).get("tests", [])
     assert len(tests) >= len(suite.hypotheses)
 
 
 def made(**success: Sequence[bool]) -> pd.DataFrame:
     """Episodes on the same maps under settings."""
     return rows(
-        row(trial("mppi", risk), i, 30.0 if won else None)
+        row(condition("mppi", risk), i, 30.0 if won else None)
         for risk, each in success.items()
         for i, won in enumerate(each)
     )
@@ -77,17 +79,19 @@ def test_the_gain_has_the_sign_of_the_best(tmp_path: Path) -> None:
 
 def test_each_variant_has_a_row(tmp_path: Path) -> None:
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
-    other = episodes.assign(model="oracle", trial=episodes["trial"] + "o", success=True, outcome="success")
+    other = episodes.assign(
+        model="oracle", condition=episodes["condition"] + "o", success=True, outcome="success"
+    )
     lines = sweep(run_folder(tmp_path / "run", pd.concat([episodes, other])))
     assert [line.split(" |")[0] for line in lines[2:4]] == ["| paper-v1", "| oracle"]
     assert "| 100.0 | 50.0 |" in lines[2]
     assert "| 100.0 | 100.0 |" in lines[3]
 
 
-def test_variants_are_told_apart_by_the_whole_label(tmp_path: Path) -> None:
+def test_variants_are_distinguished_by_the_whole_label(tmp_path: Path) -> None:
     episodes = made(mean=[True] * 12, cvar=[True, False] * 6)
     worlds = [
-        episodes.assign(world=label, trial=episodes["trial"] + label, success=won, outcome=outcome)
+        episodes.assign(world=label, condition=episodes["condition"] + label, success=won, outcome=outcome)
         for label, won, outcome in (
             ("stakes immobile=0.05/2s", True, "success"),
             ("stakes immobile=0.2/2s", False, "timeout"),

@@ -3,9 +3,9 @@ from typing import Any
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import Condition, conditions_of
 from benchnav.eval.suite import Suite
 from benchnav.eval.sweep import each_mapping, each_part
-from benchnav.eval.trial import Trial, trials_of
 from benchnav.registry import complete, read_part
 
 
@@ -13,8 +13,8 @@ def parts(kind: str, given: Any) -> list[tuple[str, dict[str, Any]]]:
     return [(part.label, dict(part.options)) for part in each_part(kind, read_part(kind, given))]
 
 
-def trials(**settings: Any) -> list[Trial]:
-    return trials_of(Suite(model="oracle", **settings), lambda data: ["std"])
+def conditions(**settings: Any) -> list[Condition]:
+    return conditions_of(Suite(model="oracle", **settings), lambda data: ["std"])
 
 
 def test_a_list_of_levels_is_a_part_each_labelled_as_on_the_command_line() -> None:
@@ -60,19 +60,20 @@ def test_mappings_are_expanded_at_any_depth() -> None:
 
 
 def test_a_suite_sweeps_levels_planners_worlds_and_tasks() -> None:
-    found = trials(
+    found = conditions(
         planners=[{"part": "mppi", "options": {"horizon_s": [1.0, 2.0]}}],
         risks=["mean", {"part": "cvar", "options": {"level": [0.5, 0.9]}}],
         world={"preset": "stakes", "correlation_m": [1.0, 2.0]},
-        task={"slowest": [0.05, 0.1]},
+        task={"min_traversability": [0.05, 0.1]},
     )
     assert len(found) == 2 * 3 * 2 * 2
     values = {
-        (t.planner.options["horizon_s"], t.risk.label, t.world.correlation_m, t.rules.slowest) for t in found
+        (t.planner.options["horizon_s"], t.risk.label, t.world.correlation_m, t.rules.min_traversability)
+        for t in found
     }
     assert len(values) == len(found)
     assert {t.world_label for t in found} == {
-        f"stakes correlation_m={ell}{rest}" for ell in (1, 2) for rest in ("", " slowest=0.1")
+        f"stakes correlation_m={ell}{rest}" for ell in (1, 2) for rest in ("", " min_traversability=0.1")
     }
 
 
@@ -81,13 +82,13 @@ def test_a_sweep_in_one_of_several_products_is_its_own() -> None:
         "planners": [{"part": "mppi", "options": {"samples": [8, 16]}}],
         "world": [{"preset": "stakes", "time_budget_ratio": [2, 3]}],
     }
-    found = trials(planners=["straight"], risks=["mean"], trials=[{}, swept])
+    found = conditions(planners=["straight"], risks=["mean"], conditions=[{}, swept])
     assert [t.labels["planner"] for t in found] == ["straight"] + ["mppi samples=8", "mppi samples=16"] * 2
     assert [t.world.time_budget_ratio for t in found[1:]] == [2, 2, 3, 3]
 
 
 def test_options_of_a_planner_given_apart_are_swept_too() -> None:
-    found = trials(planners=["mppi"], risks=["mean"], planner_options={"mppi": {"samples": [8, 16]}})
+    found = conditions(planners=["mppi"], risks=["mean"], planner_options={"mppi": {"samples": [8, 16]}})
     assert [t.planner.options["samples"] for t in found] == [8, 16]
 
 
@@ -106,4 +107,4 @@ def test_options_of_a_planner_given_apart_are_swept_too() -> None:
 )
 def test_bad_sweeps_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        trials(**{"planners": ["mppi"], **settings})
+        conditions(**{"planners": ["mppi"], **settings})

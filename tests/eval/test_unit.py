@@ -4,18 +4,19 @@ from dataclasses import replace
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.keep import Keep
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent, Unit, units
 from benchnav.share import Share, read_share
 
 
-def some_units(risks: tuple[str, ...] = ("mean", "var"), instances: int = 120, **draws: object) -> list[Unit]:
+def some_units(risks: tuple[str, ...] = ("mean", "var"), maps: int = 120, **draws: object) -> list[Unit]:
     suite = Suite(model="oracle", planners=("astar_dwa",), risks=risks)
-    extent = Extent.product(**{"seeds": (0, 1), "realisations": 2, "instances": instances} | draws)  # type: ignore[arg-type]
+    extent = Extent.product(**{"seeds": (0, 1), "realisations": 2, "maps": maps} | draws)  # type: ignore[arg-type]
     return units(
-        {trial.id: (trial, extent) for trial in trials_of(suite, lambda data: ["std", "hg"])}, Keep()
+        {condition.id: (condition, extent) for condition in conditions_of(suite, lambda data: ["std", "hg"])},
+        Keep(),
     )
 
 
@@ -33,7 +34,7 @@ def test_a_unit_stays_in_its_share_whatever_else_is_run() -> None:
     # A last block that is not full, another setting, another order, recordings.
     more = [
         replace(unit, keep=Keep(record="all"))
-        for unit in reversed(some_units(risks=("cvar", "var", "mean"), instances=110))
+        for unit in reversed(some_units(risks=("cvar", "var", "mean"), maps=110))
     ]
     after = {unit.path: unit.share(5) for unit in more}
     assert {path: after[path] for path in before} == before
@@ -43,19 +44,19 @@ def test_a_unit_stays_in_its_share_whatever_else_is_run() -> None:
 @pytest.mark.parametrize(
     "draws",
     [
-        {"seeds": (0,), "realisations": 1, "instances": 200},
-        {"seeds": (0,), "realisations": 4, "instances": 50},
-        {"seeds": (3, 4, 5, 6), "realisations": 1, "instances": 50},
+        {"seeds": (0,), "realisations": 1, "maps": 200},
+        {"seeds": (0,), "realisations": 4, "maps": 50},
+        {"seeds": (3, 4, 5, 6), "realisations": 1, "maps": 50},
     ],
 )
-def test_blocks_realisations_and_seeds_of_a_trial_go_round(draws: dict[str, object]) -> None:
+def test_blocks_realisations_and_seeds_of_a_condition_go_round(draws: dict[str, object]) -> None:
     every = some_units(risks=("mean",), **draws)
-    counts = Counter((unit.trial.id, unit.share(4).index) for unit in every)
+    counts = Counter((unit.condition.id, unit.share(4).index) for unit in every)
     assert len(every) == 8
     assert set(counts.values()) == {1}
 
 
-def test_trials_do_not_all_begin_in_one_share() -> None:
+def test_conditions_do_not_all_begin_in_one_share() -> None:
     risks = tuple(f"cvar:{0.01 * level:g}" for level in range(1, 50))
     counts = Counter(unit.share(3).index for unit in some_units(risks, 50, seeds=(0,), realisations=1))
     # Of 98 units a third is 33; four standard deviations are 19.
@@ -74,14 +75,15 @@ def test_a_shard_is_read_as_it_is_written() -> None:
 
 def test_units_that_predict_nothing_come_last_of_their_block() -> None:
     suite = Suite(model="oracle", planners=("straight", "astar_dwa"), risks=("mean", "var"))
-    extent = Extent.product(seeds=(0, 1), realisations=1, instances=100)
+    extent = Extent.product(seeds=(0, 1), realisations=1, maps=100)
     made = units(
-        {trial.id: (trial, extent) for trial in trials_of(suite, lambda data: ["std", "hg"])}, Keep()
+        {condition.id: (condition, extent) for condition in conditions_of(suite, lambda data: ["std", "hg"])},
+        Keep(),
     )
     by_block: dict[tuple[str, int], list[bool]] = {}
     for unit in made:
-        by_block.setdefault((unit.trial.scenario, unit.block), []).append(unit.trial.blind)
-    # Two risk settings and one blind trial, each under two seeds.
+        by_block.setdefault((unit.condition.scenario, unit.block), []).append(unit.condition.blind)
+    # Two risk settings and one blind condition, each under two seeds.
     assert by_block == {(s, b): [False] * 4 + [True] * 2 for s in ("std", "hg") for b in (0, 1)}
     # What is of one block stands together.
-    assert [*dict.fromkeys((unit.trial.scenario, unit.block) for unit in made)] == list(by_block)
+    assert [*dict.fromkeys((unit.condition.scenario, unit.block) for unit in made)] == list(by_block)

@@ -148,7 +148,7 @@ def test_the_simulation(robot: str, noise: str, monkeypatch: pytest.MonkeyPatch)
 
 
 def step_of(problem: Problem) -> Step:
-    return Step(state=problem.start, felt=gpu(BATCH), time_s=0.0)
+    return Step(state=problem.start, traversability=gpu(BATCH), time_s=0.0)
 
 
 def test_the_boundary_and_the_blind_planner() -> None:

@@ -94,7 +94,7 @@ def test_each_vector_member_is_the_single_environment_with_its_seed(
                 assert gained == pytest.approx(reward[i])
                 assert one["traversability"] == info["traversability"][i]
                 assert one["is_success"] == info["is_success"][i]
-                assert one["instance"] == info["instance"][i]
+                assert one["map"] == info["map"][i]
                 ended[i] = over or cut
             for name, value in alone[i].items():
                 np.testing.assert_array_equal(value, batch[name][i])
@@ -119,8 +119,8 @@ def test_members_that_end_apart_begin_anew_alone(dataset_path: Path, monkeypatch
 
 def test_reward_is_progress_less_time_and_arrival_ends(dataset_path: Path) -> None:
     env = make(dataset_path, world={"noise": "stored"})
-    observation, info = env.reset(seed=0, options={"instance": 1})
-    assert info["instance"] == 1
+    observation, info = env.reset(seed=0, options={"map": 1})
+    assert info["map"] == 1
     assert info["is_success"] is False
     distance = info["distance_m"]
     for _ in range(1000):
@@ -209,8 +209,8 @@ def test_a_robot_is_taken_by_name_and_its_state_and_actions_are_seen(dataset_pat
         assert observation["state"][3:].tolist() == pytest.approx([0.1, 0.2])
 
 
-def shown(env: Any, instance: int) -> np.ndarray:
-    return env.reset(seed=0, options={"instance": instance})[0]["rgb"]
+def shown(env: Any, map_index: int) -> np.ndarray:
+    return env.reset(seed=0, options={"map": map_index})[0]["rgb"]
 
 
 def test_the_split_is_train_wherever_there_is_one(tmp_path: Path) -> None:
@@ -242,14 +242,14 @@ def test_time_budget_and_goal_radius_end_episodes(dataset_path: Path) -> None:
     assert env.step(AHEAD)[4]["is_success"] is True
 
 
-def test_each_episode_has_luck_of_its_own_and_stored_noise_has_none(dataset_path: Path) -> None:
+def test_each_episode_has_noise_of_its_own_and_stored_noise_has_none(dataset_path: Path) -> None:
     kinds = {}
     for noise in ("resampled", "stored", "frozen"):
         env = make(dataset_path, world={"noise": noise})
         env.reset(seed=0)
         met = []
         for _ in range(6):
-            env.reset(options={"instance": 0})
+            env.reset(options={"map": 0})
             met.append(env.step(np.zeros(2, np.float32))[4]["traversability"])
         kinds[noise] = len(set(met))
     assert min(kinds["resampled"], kinds["frozen"]) > 2
@@ -294,8 +294,8 @@ def test_settings_that_mean_nothing_are_named(
 
 
 def test_misuse_is_named(dataset_path: Path) -> None:
-    with pytest.raises(ConfigError, match="instance"):
-        make(dataset_path).reset(options={"instance": 99})
+    with pytest.raises(ConfigError, match="map"):
+        make(dataset_path).reset(options={"map": 99})
     vector = make_vector(dataset_path, 3)
     with pytest.raises(gymnasium.error.ResetNeeded):
         vector.step(np.tile(AHEAD, (3, 1)))
@@ -304,7 +304,7 @@ def test_misuse_is_named(dataset_path: Path) -> None:
         vector.step(AHEAD)
 
 
-def test_the_world_with_stakes_holds_a_robot_for_good(dataset_path: Path) -> None:
+def test_the_world_with_stakes_immobilises_a_robot(dataset_path: Path) -> None:
     # On ground of λ under 1, so everywhere; a frozen world would see to it that the start is no such ground.
     held = {"noise": "stored", "time_budget_ratio": 3.0, "immobile": {"below": 1.0, "for_s": 0.4}}
     env = make(dataset_path, split="test/std", world=held, objective="goal_distance")
@@ -318,7 +318,7 @@ def test_the_world_with_stakes_holds_a_robot_for_good(dataset_path: Path) -> Non
             assert not cut
         assert info["outcome"] == "immobilised"
         assert steps == 4
-        reference = float(env._batch._places.reference_time_s[info["instance"]])
+        reference = float(env._batch._places.reference_time_s[info["map"]])
         left = round(3 * reference / 0.1) - steps
         assert reward == pytest.approx(-info["distance_m"] * (1 + left), rel=1e-4)
         shaped = make(dataset_path, split="test/std", world=held)

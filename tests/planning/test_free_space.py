@@ -7,9 +7,9 @@ from torch import Tensor
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
 from benchnav.mixture import TraversabilityMixture
-from benchnav.planning.free_space import PRICE, FreeSpace, Rules, cells_at_goal
+from benchnav.planning.free_space import PENALTY, FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.astar.dwa import DWAConfig, held_paths, judge
+from benchnav.planning.planners.astar.dwa import DWAConfig, held_paths, score
 from benchnav.planning.planners.mppi import rollout_cost, rollout_path
 from benchnav.planning.problem import Problem
 from tests import factories
@@ -75,10 +75,10 @@ def test_the_goals_disc_is_free_whatever_is_predicted() -> None:
     assert cost.tolist() == [0.0]
 
 
-def test_the_slowest_clamps_motion_alone() -> None:
+def test_min_traversability_clamps_motion_alone() -> None:
     ground = torch.full((1, 16, 16), 0.8)
     ground[0, 2, 2], ground[0, 2, 3], ground[0, 2, 4] = 0.0, 0.4, 0.05
-    rules = Rules(free_space=FreeSpace(above=0.1), slowest=0.5)
+    rules = Rules(free_space=FreeSpace(above=0.1), min_traversability=0.5)
     problem = factories.problem(ground, rules=rules)
     state = torch.tensor([[[1.25, 1.25, 0.0], [1.75, 1.25, 0.0], [2.25, 1.25, 0.0], [4.0, 4.0, 0.0]]])
     assert problem.traversability_at(state)[0].tolist() == pytest.approx([0.5, 0.5, 0.5, 0.8])
@@ -87,20 +87,20 @@ def test_the_slowest_clamps_motion_alone() -> None:
     assert problem.traversability.min() == 0.5
 
 
-def test_ground_that_is_not_free_costs_its_price_a_step_beside_j() -> None:
+def test_ground_that_is_not_free_costs_its_penalty_a_step_beside_j() -> None:
     ground = torch.full((2, 16, 16), 0.8)
     ground[:, 2] = 0.1
     problem = factories.problem(ground, goal=(1.25, 5.25))
     state = torch.tensor([[[1.25, 1.25, 0.0], [1.25, 2.25, 0.0], [-1.0, 2.25, 0.0]]]).expand(2, 3, 3)
     action, target = torch.zeros(2, 3, 2), problem.goal_m[:, None]
     distances = torch.tensor([4.0, 3.0, (2.25**2 + 9) ** 0.5])
-    expected = distances + PRICE * torch.tensor([1.0, 0.0, 1.0])
+    expected = distances + PENALTY * torch.tensor([1.0, 0.0, 1.0])
     cost = problem.stage_cost(state, action, problem.ground_at(state), target)
     torch.testing.assert_close(cost, expected.expand(2, 3))
     torch.testing.assert_close(problem.terminal_cost(state, target), expected.expand(2, 3))
 
 
-def test_a_users_objective_is_given_the_risk_map_and_the_price_is_added_to_it() -> None:
+def test_a_users_objective_is_given_the_risk_map_and_the_penalty_is_added_to_it() -> None:
     class Ground(GoalDistance):
         def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
             return traversability
@@ -110,14 +110,14 @@ def test_a_users_objective_is_given_the_risk_map_and_the_price_is_added_to_it() 
 
     ground = torch.full((1, 16, 16), 0.8)
     ground[0, 2], ground[0, 3] = 0.1, 0.0
-    problem = factories.problem(ground, objective=Ground(), rules=Rules(slowest=0.2))
+    problem = factories.problem(ground, objective=Ground(), rules=Rules(min_traversability=0.2))
     # On bad ground, on ground of λ̂ = 0, on good ground, off the map.
     state = torch.tensor([[[1.25, 1.25, 0.0], [1.25, 1.75, 0.0], [1.25, 2.25, 0.0], [-1.0, 2.25, 0.0]]])
     stage = problem.stage_cost(state, torch.zeros(1, 4, 2), problem.ground_at(state), problem.goal_m[:, None])
-    low = float(torch.tensor(PRICE) + 0.1)
-    assert stage[0].tolist() == [low, PRICE, pytest.approx(0.8), PRICE]
+    low = float(torch.tensor(PENALTY) + 0.1)
+    assert stage[0].tolist() == [low, PENALTY, pytest.approx(0.8), PENALTY]
     terminal = problem.terminal_cost(state, problem.goal_m[:, None])[0].tolist()
-    assert terminal == [float(torch.tensor(PRICE) + 0.2), PRICE, pytest.approx(1.6), PRICE]
+    assert terminal == [float(torch.tensor(PENALTY) + 0.2), PENALTY, pytest.approx(1.6), PENALTY]
 
 
 class DreadsLowGround(GoalDistance):
@@ -128,7 +128,7 @@ class DreadsLowGround(GoalDistance):
 
 
 def low_field(objective: GoalDistance) -> Problem:
-    """A field of λ̂ = 0.1 that is free by the mean, so that no price adds to J; the robot stands in it."""
+    """A field of λ̂ = 0.1 that is free by the mean, so that no penalty adds to J; the robot stands in it."""
     ground = torch.full((1, 16, 16), 0.9)
     ground[0, 1:4, 1:4] = 0.1
     problem = factories.problem(ground, objective=objective)
@@ -146,7 +146,7 @@ def test_dwa_minimises_a_cost_of_ground_below_the_least_traversability_of_motion
     plain, dread = low_field(GoalDistance()), low_field(DreadsLowGround())
     pairs = torch.tensor([[[0.0, 0.0], [0.5, 0.0], [1.0, 0.0], [1.0, 0.4]]])
     paths = held_paths(plain, plain.start, pairs, 50)
-    extra = judge(dread, dread.start, pairs, dread.goal_m, config) - judge(
+    extra = score(dread, dread.start, pairs, dread.goal_m, config) - score(
         plain, plain.start, pairs, plain.goal_m, config
     )
     low = steps_on_low_ground(plain, paths, 50)
@@ -177,7 +177,7 @@ def test_ground_that_is_free_by_the_mean_is_free_where_the_risk_map_is_0() -> No
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({"by": "luck"}, "'risk' or 'mean', got 'luck'"),
+        ({"by": "noise"}, "'risk' or 'mean', got 'noise'"),
         ({"above": 1.0}, "free_space.above"),
         ({"above": -0.1}, "free_space.above"),
         ({"above": float("nan")}, "free_space.above"),
@@ -191,8 +191,8 @@ def test_free_space_that_means_nothing_is_refused(settings: dict[str, object], e
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({"slowest": 0.0}, "slowest"),
-        ({"slowest": 1.1}, "slowest"),
+        ({"min_traversability": 0.0}, "min_traversability"),
+        ({"min_traversability": 1.1}, "min_traversability"),
         ({"goal_radius_m": 0.0}, "goal_radius_m"),
         ({"goal_radius_m": float("inf")}, "goal_radius_m"),
     ],

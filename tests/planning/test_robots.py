@@ -99,7 +99,7 @@ def test_a_bicycle_does_not_turn_while_it_stands() -> None:
 
 
 @EACH
-def test_ground_of_no_traversability_holds_a_robot(robot: Any) -> None:
+def test_ground_of_no_traversability_immobilises_a_robot(robot: Any) -> None:
     states = run(robot, [1.0, 0.5], 20, traversability=0.0)
     assert torch.equal(states[-1, :3], states[0, :3])
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import TerrainClass, twins
+from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
 from benchnav.mixture import TraversabilityMixture
@@ -21,7 +21,7 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
         recipe: by which they were made.
     """
     slope = maps["slope_deg"].astype(np.float64)
-    alike = max(len(own) for own in twins(recipe.classes)) > 1
+    alike = max(len(own) for own in look_alike_classes(recipe.classes)) > 1
     return Terrain(
         rgb=torch.from_numpy(maps["rgb"]),
         class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),

@@ -9,7 +9,7 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 
 import numpy as np
 
-from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, twins
+from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
@@ -71,7 +71,7 @@ def look_alikes(
     Returns:
         As `truth`, with a component for each of the most classes that look alike; None where no two do.
     """
-    alike = twins(classes)
+    alike = look_alike_classes(classes)
     most = max(len(own) for own in alike)
     if most == 1:
         return None

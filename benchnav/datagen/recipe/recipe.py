@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from benchnav.datagen.recipe.classes import TerrainClass, twins
+from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units
 from benchnav.datagen.recipe.places import PlacesRule
 from benchnav.datagen.recipe.plain_data import parse, plain
@@ -63,7 +63,7 @@ class Recipe:
         stuck_threshold: λ_stuck; a cell is truly free when E[λ] exceeds it.
         synthesis: how maps are made: 1 as by version 0.1, bit for bit, or 2, which knows soft spots, classes
             that look alike, drawn places and correlated λ, and makes the same ground at any size.
-        correlation_m: ℓ of stored λ: at distance d the luck of two cells has the correlation exp(−d²/2ℓ²);
+        correlation_m: ℓ of stored λ: at distance d the noise of two cells has the correlation exp(−d²/2ℓ²);
             at 0, as in synthesis 1, each cell's is its own.
         environments: number of environments; each shows its own choice of classes.
         occupancy: share of the cells that each class of an environment covers, summing to 1.
@@ -112,7 +112,7 @@ class Recipe:
         """Classes that are shown together: in synthesis 2 those of one colour, in the table's order."""
         if self.synthesis == 1:
             return tuple((number,) for number in range(len(self.classes)))
-        return tuple(dict.fromkeys(twins(self.classes)))
+        return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     def environment_classes(self, environment: int) -> np.ndarray:
         """The classes an environment shows.

@@ -71,7 +71,7 @@ def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
 def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     """Grid reference time: least time from start to goal over truly free cells at a commanded 1 m/s.
 
-    A yardstick, not a bound: the grid has eight headings, and noise is at its mean.
+    A reference, not a bound: the grid has eight headings, and noise is at its mean.
 
     Returns:
         Seconds, infinite where no free path joins start and goal, shape [B].
@@ -167,8 +167,8 @@ def _realised(
         noise *= latent.latent_std(class_id, recipe.classes)
         return np.minimum(np.maximum(mean + noise, 0), 1)
     correlation_cells = recipe.correlation_m / recipe.resolution_m
-    luck = copula.correlated_normal(key, indices, recipe.grid.shape, correlation_cells)
-    return latent.quantile_of(latent.truth(class_id, slope_deg, recipe.classes), luck)
+    noise = copula.correlated_normal(key, indices, recipe.grid.shape, correlation_cells)
+    return latent.quantile_of(latent.truth(class_id, slope_deg, recipe.classes), noise)
 
 
 def _places(recipe: Recipe, key: int, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

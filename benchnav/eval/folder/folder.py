@@ -1,6 +1,6 @@
 """Run folders, format version 4: what lies where, and how it is read.
 
-A run folder holds `run.json` (trials, and where everything came from), `units/` (what is finished: one
+A run folder holds `run.json` (conditions, and where everything came from), `units/` (what is finished: one
 Parquet file a unit, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
 when all is done, `episodes.parquet`, `errors.txt` where a planner or model failed, and the report. Every file
 is written under another name first. `run.json` ends in a seal, the digest of all else in it, and holds the digests
@@ -21,8 +21,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import Condition, condition_from
 from benchnav.eval.keep import Keep
-from benchnav.eval.trial import Trial, trial_from
 from benchnav.eval.unit import Extent, Unit
 from benchnav.files import replacing, write_text
 from benchnav.options import one_line
@@ -31,11 +31,11 @@ from benchnav.share import Share
 FORMAT, FORMAT_VERSION = "benchnav-run", 4
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
 SEAL = "seal"
-KEYS = ["trial", "seed", "realisation", "instance"]  # of a row
+KEYS = ["condition", "seed", "realisation", "map"]  # of a row
 
 _METADATA = b"benchnav"
 
-# What reading a damaged file raises: of a trial's rules and world what refuses a suite, of a table its library's.
+# What reading a damaged file raises: of a condition's rules and world what refuses a suite, of a table its library's.
 _DAMAGE = (
     *(ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError, OSError),
     *(ConfigError, pa.ArrowException),
@@ -53,13 +53,13 @@ class Run:
     Args:
         folder: where.
         about: all of `run.json`.
-        trials: by id, with how often each is run.
+        conditions: by id, with how often each is run.
         shard: which share of the run the folder holds; None where it holds all.
     """
 
     folder: Path
     about: dict[str, Any]
-    trials: dict[str, tuple[Trial, Extent]]
+    conditions: dict[str, tuple[Condition, Extent]]
     shard: Share | None = None
 
 
@@ -87,9 +87,11 @@ def open_run(folder: Path) -> Run:
     with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
         if _sealed(about) != about:
             raise DamageError("it was changed after benchnav wrote it")
-        trials = {i: (trial_from(entry), Extent.from_dict(entry)) for i, entry in about["trials"].items()}
+        conditions = {
+            i: (condition_from(entry), Extent.from_dict(entry)) for i, entry in about["conditions"].items()
+        }
         shard = Share(**about["shard"]) if "shard" in about else None
-    return Run(folder=folder, about=about, trials=trials, shard=shard)
+    return Run(folder=folder, about=about, conditions=conditions, shard=shard)
 
 
 def _format_version(about: Any) -> int:
@@ -180,7 +182,7 @@ def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, An
             the unit, which copies keep.
     """
     table = pa.Table.from_pandas(rows, preserve_index=False)
-    own = {"made": secrets.token_hex(8), "instances": list(unit.instances), "keep": unit.keep.to_dict()}
+    own = {"made": secrets.token_hex(8), "maps": list(unit.maps), "keep": unit.keep.to_dict()}
     text = json.dumps({**about, **own})
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), _METADATA: text.encode()})
     with replacing(folder / unit.path) as partial:
@@ -188,13 +190,13 @@ def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, An
 
 
 def about_unit(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
-    """What is known of a unit; None where this run has not finished it for the instances it now has."""
+    """What is known of a unit; None where this run has not finished it for the maps it now has."""
     about = _about(folder, unit, run_id)
-    return about if about and about.get("instances") == list(unit.instances) else None
+    return about if about and about.get("maps") == list(unit.maps) else None
 
 
 def kept(folder: Path, unit: Unit, run_id: str) -> Keep:
-    """What this run has kept of a unit beside its rows, perhaps of fewer instances; nothing where it has not run."""
+    """What this run has kept of a unit beside its rows, perhaps of fewer maps; nothing where it has not run."""
     about = _about(folder, unit, run_id)
     return Keep(**about["keep"]) if about else Keep()
 
@@ -296,7 +298,7 @@ def _episode_table(folder: Path, unit: Unit) -> pa.Table:
 def _trace(unit: Unit, about: dict[str, Any]) -> str:
     if not about.get("traceback") and not about.get("errors"):
         return ""
-    labels = ", ".join(f"{name} {label}" for name, label in unit.trial.labels.items())
-    instances = f"instances {unit.instances[0]}–{unit.instances[-1]}"
-    heading = f"{labels}, seed {unit.seed}, realisation {unit.realisation}, {instances} ({unit.path})"
+    labels = ", ".join(f"{name} {label}" for name, label in unit.condition.labels.items())
+    maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"
+    heading = f"{labels}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({unit.path})"
     return "\n".join([heading, *about.get("errors", []), about.get("traceback", "")])

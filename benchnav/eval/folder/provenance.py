@@ -19,7 +19,7 @@ import torch
 import benchnav
 from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.trial import PART_KINDS, Trial
+from benchnav.eval.condition import PART_KINDS, Condition
 from benchnav.eval.unit import Extent
 from benchnav.models.predictor import model_identity
 from benchnav.planning.planners.compilation import can_compile
@@ -27,11 +27,11 @@ from benchnav.sources import digest_of
 
 PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
 
-Trials = Mapping[str, tuple[Trial, Extent]]
+Conditions = Mapping[str, tuple[Condition, Extent]]
 
 
 def describe_code() -> dict[str, Any]:
-    """What rows depend on beside their trial: sources, versions, arithmetic of the processor."""
+    """What rows depend on beside their condition: sources, versions, arithmetic of the processor."""
     package = Path(benchnav.__file__).parent
     files = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".yaml"))
     named = ((path.relative_to(package).as_posix().encode(), path.read_bytes()) for path in files)
@@ -98,21 +98,21 @@ def describe_command() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def describe(trials: Trials) -> dict[str, Any]:
-    """All that rows depend on beside the trials themselves."""
+def describe(conditions: Conditions) -> dict[str, Any]:
+    """All that rows depend on beside the conditions themselves."""
     return {
-        "datasets": describe_maps(trials),
-        "parts": describe_parts(trials),
+        "datasets": describe_maps(conditions),
+        "parts": describe_parts(conditions),
         "code": describe_code(),
     }
 
 
-def describe_maps(trials: Trials) -> dict[str, Any]:
+def describe_maps(conditions: Conditions) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map."""
     used: dict[str, dict[str, int]] = {}
-    for trial, extent in trials.values():
-        splits = used.setdefault(trial.data, {})
-        splits[trial.split] = max(extent.instances, splits.get(trial.split, 0))
+    for condition, extent in conditions.values():
+        splits = used.setdefault(condition.data, {})
+        splits[condition.split] = max(extent.maps, splits.get(condition.split, 0))
     datasets = {data: TerrainDataset(find_dataset(data)) for data in used}
     return {
         data: {
@@ -124,12 +124,12 @@ def describe_maps(trials: Trials) -> dict[str, Any]:
     }
 
 
-def describe_parts(trials: Trials) -> dict[str, Any]:
+def describe_parts(conditions: Conditions) -> dict[str, Any]:
     """Models by the digests of their files, parts that are not ours by origin and digest, files that options name."""
     described: dict[str, Any] = {}
-    for trial, _ in trials.values():
+    for condition, _ in conditions.values():
         for kind in PART_KINDS:
-            part = getattr(trial, kind)
+            part = getattr(condition, kind)
             name = f"{kind} {part.part}"
             if kind == "model" and name not in described:
                 described[name] = model_identity(part.part)
@@ -141,15 +141,15 @@ def describe_parts(trials: Trials) -> dict[str, Any]:
     return {name: identity for name, identity in described.items() if identity}
 
 
-def code_of(about: Mapping[str, Any], trial: Trial) -> dict[str, Any]:
-    """What rows of a trial depend on beside its value and its maps, by what people call it.
+def code_of(about: Mapping[str, Any], condition: Condition) -> dict[str, Any]:
+    """What rows of a condition depend on beside its value and its maps, by what people call it.
 
     Args:
         about: the `run.json` of its run.
-        trial: of the run.
+        condition: of the run.
     """
     used = {
-        f"{kind} {getattr(trial, kind).part}": json.dumps(dict(getattr(trial, kind).options))
+        f"{kind} {getattr(condition, kind).part}": json.dumps(dict(getattr(condition, kind).options))
         for kind in PART_KINDS
     }
 
@@ -162,7 +162,7 @@ def code_of(about: Mapping[str, Any], trial: Trial) -> dict[str, Any]:
 
 
 def _code(about: Mapping[str, Any]) -> dict[str, Any]:
-    """All that rows depend on beside trials and maps."""
+    """All that rows depend on beside conditions and maps."""
     code = about["code"]
     return {
         "benchnav's own sources": {"digest": code["sources"]},

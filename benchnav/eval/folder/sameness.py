@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-KEYS = ["trial", "seed", "realisation", "instance"]
+KEYS = ["condition", "seed", "realisation", "map"]
 _TIMING = "planning_"
 
 
@@ -18,7 +18,7 @@ class Difference:
     """One episode that is not the same in two tables.
 
     Args:
-        episode: the trial's id, seed, realisation and instance.
+        episode: the condition's id, seed, realisation and map.
         columns: by name what the first and the second table hold; empty where one has no such episode.
     """
 

@@ -1,6 +1,8 @@
-"""Steps of episodes: one Parquet file a unit, one partition a trial, `steps/trial=ID/SEED-REALISATION-BLOCK.parquet`.
+"""Steps of episodes: one Parquet file a unit, one partition a condition.
 
-Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps", filters=[("trial", "==", id)])`.
+The files are `steps/condition=ID/SEED-REALISATION-BLOCK.parquet`.
+
+Any reader of partitioned Parquet takes them: `pandas.read_parquet(run / "steps", filters=[("condition", "==", id)])`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,9 +24,9 @@ from benchnav.files import replacing
 STEPS = "steps"
 
 LAST_COLUMN = "traversability"
-_KEYS = ("seed", "realisation", "instance")
+_KEYS = ("seed", "realisation", "map")
 _VALUES = ("time_s", "x_m", "y_m", LAST_COLUMN)
-_ORDER = ["trial", *_KEYS, "step"]
+_ORDER = ["condition", *_KEYS, "step"]
 _REMEDY = "Remove the steps, which the report can do without, or run it again with another `--out`."
 
 
@@ -75,12 +77,12 @@ def open_steps(folder: Path) -> ds.Dataset | None:
         return None
     with damaged(folder / STEPS, _REMEDY):
         # By its type, since an id of digits alone would be taken for a number.
-        parts = ds.partitioning(pa.schema([("trial", pa.string())]), flavor="hive")
+        parts = ds.partitioning(pa.schema([("condition", pa.string())]), flavor="hive")
         return ds.dataset(folder / STEPS, partitioning=parts)
 
 
 def rows_of(
-    folder: Path, source: ds.Dataset, columns: Sequence[str] | None, condition: pc.Expression | None
+    folder: Path, source: ds.Dataset, columns: Sequence[str] | None, chosen: pc.Expression | None
 ) -> pd.DataFrame:
     """Reads steps.
 
@@ -88,7 +90,7 @@ def rows_of(
         folder: the run folder.
         source: its steps.
         columns: which; None for all.
-        condition: of which rows; None for all.
+        chosen: of which rows; None for all.
 
     Raises:
         ConfigError: a file of them is damaged.
@@ -101,7 +103,7 @@ def rows_of(
             fits = pa.types.is_integer if field.name in _KEYS else pa.types.is_floating
             if field.name in (*_KEYS, *_VALUES) and not fits(field.type):
                 raise DamageError(f"{field.name} holds {field.type}")
-        return source.to_table(columns=columns and list(columns), filter=condition).to_pandas()
+        return source.to_table(columns=columns and list(columns), filter=chosen).to_pandas()
 
 
 def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
@@ -109,19 +111,19 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
 
     Args:
         folder: a run folder.
-        **filters: which; `trial` by its id or by its labels (`planner="mppi"`, `risk="mean"`, …), and `seed`,
-            `realisation`, `instance`, `step`. A list takes any of several.
+        **filters: which; `condition` by its id or by its labels (`planner="mppi"`, `risk="mean"`, …), and `seed`,
+            `realisation`, `map`, `step`. A list takes any of several.
 
     Returns:
-        A row a state, in the order of trial, seed, realisation, instance and step; columns as of `step_table`,
-        and `trial`.
+        A row a state, in the order of condition, seed, realisation, map and step; columns as of `step_table`,
+        and `condition`.
 
     Raises:
         ConfigError: the run has no steps, or nothing by that filter's name.
     """
     run = open_run(folder)
     wanted = {name: _several(value) for name, value in filters.items()}
-    wanted = _by_trial({i: trial.labels for i, (trial, _) in run.trials.items()}, wanted)
+    wanted = _by_condition({i: condition.labels for i, (condition, _) in run.conditions.items()}, wanted)
     source = open_steps(folder)
     if source is None:
         raise ConfigError(
@@ -130,11 +132,11 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     unknown = [name for name in wanted if name not in source.schema.names]
     if unknown:
         raise ConfigError(f"Expected filters among {', '.join(source.schema.names)}, got {unknown[0]!r}.")
-    condition = None
+    chosen = None
     for name, values in wanted.items():
         own = ds.field(name).isin(pa.array(values, source.schema.field(name).type))
-        condition = own if condition is None else condition & own
-    rows = rows_of(folder, source, None, condition)
+        chosen = own if chosen is None else chosen & own
+    rows = rows_of(folder, source, None, chosen)
     order = [name for name in _ORDER if name in rows]
     rows = rows.sort_values(order, kind="stable", ignore_index=True)
     return rows[[*order, *(name for name in rows if name not in order)]]
@@ -144,14 +146,14 @@ def _several(value: Any) -> list[Any]:
     return list(value) if isinstance(value, list | tuple | set | range | np.ndarray) else [value]
 
 
-def _by_trial(
+def _by_condition(
     labels: Mapping[str, Mapping[str, str]], wanted: Mapping[str, list[Any]]
 ) -> dict[str, list[Any]]:
-    """Turns filters by labels into one by the trials' ids."""
+    """Turns filters by labels into one by the conditions' ids."""
     names = next(iter(labels.values()))
     asked = {name: values for name, values in wanted.items() if name in names}
     rest = {name: values for name, values in wanted.items() if name not in names}
     fitting = [i for i, own in labels.items() if all(own[name] in values for name, values in asked.items())]
     if asked:
-        rest["trial"] = [i for i in fitting if i in rest.get("trial", fitting)]
+        rest["condition"] = [i for i in fitting if i in rest.get("condition", fitting)]
     return rest

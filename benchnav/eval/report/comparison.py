@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.eval.condition import LABELS, NOT_USED
 from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
-from benchnav.eval.trial import LABELS, NOT_USED
 
 _LABELS = (*LABELS, "run")
 
@@ -33,8 +33,8 @@ def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
         "Δ [points]",
         "95 %",
         "p",
-        "told apart",
-        "shows from",
+        "significant",
+        "detectable",
         f"Δ T_total [{unit}]",
         "95 %",
         "p (ranks)",
@@ -66,7 +66,7 @@ def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
         _range(100 * row["success_low"], 100 * row["success_high"]),
         _p(row["success_p_holm"]),
         "yes" if row["success_p_holm"] < ALPHA else "no",
-        f"{100 * row['success_shown']:.0f}" if row["success_shown"] <= 1 else NOT_USED,
+        f"{100 * row['success_detectable']:.0f}" if row["success_detectable"] <= 1 else NOT_USED,
         _signed(late[0]),
         _range(*late[1:]),
         _p(row["time_p_holm"]),
@@ -95,7 +95,7 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
         "their mean, so that it may disagree with the interval, which is of the mean.",
         "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "
         f"where there are fewer than {LEAST_MAPS} maps.",
-        "shows from: smallest difference of success [points] that so many maps show with a chance of 80 %; "
+        "detectable: minimum detectable difference of success [points], at a power of 80 %; "
         "a dash where they are too few to show any. "
         f"A difference of {points} needs {maps} maps.",
     )

@@ -1,10 +1,10 @@
-"""Names and colours of trials that are shown together."""
+"""Names and colours of conditions that are shown together."""
 
 from collections.abc import Mapping, Sequence
 
-from benchnav.eval.trial import NOT_USED
+from benchnav.eval.condition import NOT_USED
 
-# Told apart by the colour-blind too (Okabe and Ito, 2008), the ones that are seen best on a map first.
+# Distinct for the colour-blind too (Okabe and Ito, 2008), the ones that are seen best on a map first.
 _COLOURS = (
     *((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167)),
     *((230, 159, 0), (86, 180, 233), (0, 0, 0), (240, 228, 66)),
@@ -12,8 +12,8 @@ _COLOURS = (
 NAMING = ("planner", "risk", "model", "robot", "objective", "world")
 
 
-def trial_colours(count: int) -> list[tuple[int, int, int]]:
-    """Colours of trials; beyond eight they begin anew.
+def condition_colours(count: int) -> list[tuple[int, int, int]]:
+    """Colours of conditions; beyond eight they begin anew.
 
     Returns:
         Red, green, blue, in [0, 255].
@@ -22,10 +22,10 @@ def trial_colours(count: int) -> list[tuple[int, int, int]]:
 
 
 def contender_names(abouts: Sequence[Mapping[str, str]]) -> list[str]:
-    """Names trials by those of their labels that tell them apart; by their planner where nothing does.
+    """Names conditions by those of their labels that tell them apart; by their planner where nothing does.
 
     Args:
-        abouts: labels of each trial.
+        abouts: labels of each condition.
     """
     used = {name: {about.get(name, NOT_USED) for about in abouts} - {NOT_USED} for name in NAMING}
     differing = [name for name, labels in used.items() if len(labels) > 1]

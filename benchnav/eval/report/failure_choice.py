@@ -8,17 +8,17 @@ import numpy as np
 import pandas as pd
 
 from benchnav.errors import BenchnavError
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.charts.failure_sheet import FailedGround, Shown, choose
 from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.failures import steps_of
-from benchnav.eval.report.figure_style import trial_name
+from benchnav.eval.report.figure_style import condition_name
 from benchnav.eval.stats.best import competing
-from benchnav.eval.trial import NOT_USED
 
 GroundOf = Callable[[pd.DataFrame], FailedGround]
 
 _MOST_BLOCKS = 6
-# Failures of one trial whose ground is predicted again.
+# Failures of one condition whose ground is predicted again.
 _MOST_FAILURES = 100
 
 
@@ -28,7 +28,7 @@ class Sheets:
 
     Args:
         shown: of each block its title and the lines of its sheet.
-        told: by trial λ̂ where its failed episodes ended, shape [N].
+        told: by condition λ̂ where its failed episodes ended, shape [N].
         left_out: why sheets are missing; empty where none is, or nothing failed.
     """
 
@@ -46,8 +46,8 @@ def collect_sheets(
         folder: the run folder.
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures.failures_table`.
-        ground_of: gives the ground of some failures of one trial; it may raise a `BenchnavError`. None where no sheet
-            is asked for.
+        ground_of: gives the ground of some failures of one condition; it may raise a `BenchnavError`. None where no
+            sheet is asked for.
     """
     placed = failures[failures["x_m"].notna()]
     if ground_of is None or placed.empty:
@@ -62,13 +62,17 @@ def collect_sheets(
         lines = []
         try:
             for row in _looked_at(rows):
-                own = placed[placed["trial"] == row["trial"]].head(_MOST_FAILURES).reset_index(drop=True)
+                own = (
+                    placed[placed["condition"] == row["condition"]]
+                    .head(_MOST_FAILURES)
+                    .reset_index(drop=True)
+                )
                 if own.empty:
                     continue
                 ground = ground_of(own)
-                told[row["trial"]] = ground.told(own[["x_m", "y_m"]].to_numpy())
-                count = int((failures["trial"] == row["trial"]).sum())
-                lines.append(_line(folder, trial_name(row, several), own, ground, count))
+                told[row["condition"]] = ground.told(own[["x_m", "y_m"]].to_numpy())
+                count = int((failures["condition"] == row["condition"]).sum())
+                lines.append(_line(folder, condition_name(row, several), own, ground, count))
         except (BenchnavError, OSError) as error:
             left_out.append(f"No sheet of failures: {error}")
             continue
@@ -80,19 +84,19 @@ def collect_sheets(
 def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
     """The best of a block and the worst, of those that look at a prediction."""
     seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
-    best = seeing.loc[seeing["trial"] == seeing["best"], "trial"]
-    worst = seeing.sort_values("success_rate", kind="stable")["trial"].head(1)
-    for trial in dict.fromkeys([*best, *worst]):
-        (row,) = rows[rows["trial"] == trial].to_dict("records")
+    best = seeing.loc[seeing["condition"] == seeing["best"], "condition"]
+    worst = seeing.sort_values("success_rate", kind="stable")["condition"].head(1)
+    for condition in dict.fromkeys([*best, *worst]):
+        (row,) = rows[rows["condition"] == condition].to_dict("records")
         yield {str(name): value for name, value in row.items()}
 
 
 def _line(folder: Path, name: str, failures: pd.DataFrame, ground: FailedGround, among: int) -> Shown:
     chosen = choose(failures)
-    steps = steps_of(folder, [chosen["trial"].iloc[0]])
+    steps = steps_of(folder, [chosen["condition"].iloc[0]])
     tracks = []
     for row in chosen.to_dict("records"):
-        own = np.logical_and.reduce([steps[key] == row[key] for key in ("seed", "realisation", "instance")])
+        own = np.logical_and.reduce([steps[key] == row[key] for key in ("seed", "realisation", "map")])
         tracks.append(steps.loc[own, ["x_m", "y_m"]].to_numpy())
     places = chosen.index.to_numpy()
     return Shown(
@@ -100,7 +104,7 @@ def _line(folder: Path, name: str, failures: pd.DataFrame, ground: FailedGround,
         failures=chosen.reset_index(drop=True),
         ground=FailedGround(
             predicted=ground.predicted[places],
-            holding=ground.holding[places],
+            immobilising=ground.immobilising[places],
             resolution_m=ground.resolution_m,
             goal_m=ground.goal_m[places],
         ),

@@ -9,7 +9,7 @@ import pyarrow.dataset as ds
 
 from benchnav.eval.folder.steps import open_steps, rows_of
 
-_KEYS = ["trial", "seed", "realisation", "instance"]
+_KEYS = ["condition", "seed", "realisation", "map"]
 _LAST_S = 2.0
 
 
@@ -21,33 +21,35 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         episodes: its rows.
 
     Returns:
-        A row a failure: `trial`, `planner`, `risk`, `model`, `scenario`, `world`, `seed`, `realisation`,
-        `instance`, `outcome`, `end_time_s`; `x_m`, `y_m`, where it ended; `end_traversability`, the λ met in the
-        last step; and `last_traversability`, the mean of λ met in the last 2 s. The last four are NaN where
+        A row a failure: `condition`, `planner`, `risk`, `model`, `scenario`, `world`, `seed`, `realisation`,
+        `map`, `outcome`, `end_time_s`; `x_m`, `y_m`, where it ended; `end_traversability`, the observed λ in the
+        last step; and `last_traversability`, the mean of observed λ in the last 2 s. The last four are NaN where
         steps were not kept.
     """
     labels = ["planner", "risk", "model", "scenario", "world"]
-    columns = ["trial", *labels, *_KEYS[1:], "outcome", "end_time_s"]
+    columns = ["condition", *labels, *_KEYS[1:], "outcome", "end_time_s"]
     failed = episodes.loc[~episodes["success"].astype(bool), columns]
-    ends = _ends(steps_of(folder, list(failed["trial"].unique())))
+    ends = _ends(steps_of(folder, list(failed["condition"].unique())))
     return failed.merge(ends, on=_KEYS, how="left").reset_index(drop=True)
 
 
-def steps_of(folder: Path, trials: list[str]) -> pd.DataFrame:
-    """Reads the steps of some trials, of one table or of one part a trial; no rows where none were kept.
+def steps_of(folder: Path, conditions: list[str]) -> pd.DataFrame:
+    """Reads the steps of some conditions, of one table or of one part a condition; no rows where none were kept.
 
     Args:
         folder: the run folder.
-        trials: ids.
+        conditions: ids.
 
     Returns:
-        `trial`, `seed`, `realisation`, `instance`, `time_s`, `x_m`, `y_m`, `traversability`, by time.
+        `condition`, `seed`, `realisation`, `map`, `time_s`, `x_m`, `y_m`, `traversability`, by time.
     """
     columns = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
     source = open_steps(folder)
     if source is None:
-        return pd.DataFrame({name: pd.Series(dtype=object if name == "trial" else float) for name in columns})
-    return rows_of(folder, source, columns, ds.field("trial").isin(pa.array(trials, pa.string())))
+        return pd.DataFrame(
+            {name: pd.Series(dtype=object if name == "condition" else float) for name in columns}
+        )
+    return rows_of(folder, source, columns, ds.field("condition").isin(pa.array(conditions, pa.string())))
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:

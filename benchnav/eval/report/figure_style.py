@@ -7,13 +7,13 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from benchnav import drawing
-from benchnav.eval.trial import NOT_USED
+from benchnav.eval.condition import NOT_USED
 from benchnav.files import replacing
 
-# As on map sheets and previews; told apart by the colour-blind too.
+# As on map sheets and previews; distinct for the colour-blind too.
 TRAVERSABILITY_COLOURS = "viridis"
 
-# Told apart by the colour-blind too; without yellow, which is lost on white. Source: Okabe and Ito (2008).
+# Distinct for the colour-blind too; without yellow, which is lost on white. Source: Okabe and Ito (2008).
 OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 # Widths of a journal's column and of a page.
@@ -54,12 +54,12 @@ def display_name(planner: str) -> str:
     return _NAMES.get(planner, planner)
 
 
-def trial_name(labels: Mapping[str, str], several: Collection[str]) -> str:
-    """What figures call a trial: its planner and its risk setting, and what else tells it from others.
+def condition_name(labels: Mapping[str, str], several: Collection[str]) -> str:
+    """What figures call a condition: its planner and its risk setting, and what else tells it from others.
 
     Args:
-        labels: of the trial; what it does not use is `NOT_USED`.
-        several: labels that differ among the trials shown, of `model` and `world`.
+        labels: of the condition; what it does not use is `NOT_USED`.
+        several: labels that differ among the conditions shown, of `model` and `world`.
     """
     told = [labels[name] for name in ("model", "world") if name in several]
     # A planner that is told λ itself has a model and no risk setting; a blind one has neither.

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from benchnav.eval.report.charts.panels import blocks, several_models
-from benchnav.eval.report.figure_style import trial_name
+from benchnav.eval.report.figure_style import condition_name
 from benchnav.eval.report.tables import rate_in_words
-from benchnav.eval.stats.best import TOLD, competing
+from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.planning.world.outcome import FAILURES
 
@@ -38,11 +38,11 @@ def findings(
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures.failures_table`.
-        told: by trial the λ̂ where its failed episodes ended, where that is known.
+        told: by condition the λ̂ where its failed episodes ended, where that is known.
     """
     several = several_models(summary)
     rows = ({str(name): value for name, value in row.items()} for row in summary.to_dict("records"))
-    names = {row["trial"]: trial_name(row, several) for row in rows}
+    names = {row["condition"]: condition_name(row, several) for row in rows}
     return [
         Finding(title=title, sentences=tuple(_sentences(block, names, failures, told or {})))
         for title, block in blocks(summary)
@@ -58,12 +58,12 @@ def _sentences(
     rows: pd.DataFrame, names: Mapping[str, str], failures: pd.DataFrame, told: Mapping[str, np.ndarray]
 ) -> Iterable[str]:
     rivals = rows[competing(rows)]
-    best = rivals[rivals["trial"] == rivals["best"].iloc[0]].to_dict("records")[0]
-    others = rivals[rivals["trial"] != best["trial"]].sort_values("best_difference", kind="stable")
+    best = rivals[rivals["condition"] == rivals["best"].iloc[0]].to_dict("records")[0]
+    others = rivals[rivals["condition"] != best["condition"]].sort_values("best_difference", kind="stable")
     shared = int((others["success_rate"] == best["success_rate"]).sum())
     also = f" and {shared} more" if shared else ""
     yield (
-        f"The highest success rate is that of {names[best['trial']]}{also}: {_rate(best)} of its episodes "
+        f"The highest success rate is that of {names[best['condition']]}{also}: {_rate(best)} of its episodes "
         f"reached the goal (95 % interval {100 * best['success_low']:.0f} to {100 * best['success_high']:.0f} %)."
     )
     common = int(best["best_episodes"])
@@ -78,12 +78,12 @@ def _sentences(
         yield (
             f"All {len(rivals)} compared settings together failed in {failed} of {count} episodes: {_shares(outcomes)}."
         )
-    yardsticks = rows[~rows["trial"].isin(rivals["trial"])]
-    for part in [part for part in reversed(TOLD) if (yardsticks["told"] == part).any()]:
-        most = yardsticks[yardsticks["told"] == part].sort_values("success_rate", kind="stable").iloc[-1]
-        yield (
-            f"With the model {most['model']}, which is told the truth, {names[most['trial']]} reached {_rate(most)}."
+    privileged = rows[~rows["condition"].isin(rivals["condition"])]
+    for part in [part for part in reversed(PRIVILEGED) if (privileged["privileged"] == part).any()]:
+        most = (
+            privileged[privileged["privileged"] == part].sort_values("success_rate", kind="stable").iloc[-1]
         )
+        yield (f"With the privileged model {most['model']} {names[most['condition']]} reached {_rate(most)}.")
 
 
 def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str]) -> Iterable[str]:
@@ -108,7 +108,7 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
         other = "The other setting is" if len(worse) == 1 else f"All {len(worse)} other settings are"
         yield f"{other} significantly worse: it is the best here."
     else:
-        listed = [names[trial] for trial in alike["trial"]]
+        listed = [names[condition] for condition in alike["condition"]]
         more = f" and {len(listed) - _MOST_NAMED} more" if len(listed) > _MOST_NAMED else ""
         verb = "1 other setting is" if len(listed) == 1 else f"{len(listed)} other settings are"
         yield f"{verb} not significantly worse (p ≥ {ALPHA}): {'; '.join(listed[:_MOST_NAMED])}{more}."
@@ -116,7 +116,7 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
     place = "The next" if alike.empty else "The next that is significantly worse"
     low, high = 100 * following["best_low"], 100 * following["best_high"]
     yield (
-        f"{place} is {names[following['trial']]} with {_rate(following)}: the difference is "
+        f"{place} is {names[following['condition']]} with {_rate(following)}: the difference is "
         f"{100 * following['best_difference']:.1f} points (95 % interval of the pair alone {low:.1f} to "
         f"{high:.1f}), {p_in_words(following['best_p'])} ({test})."
     )
@@ -131,18 +131,18 @@ def _why(
         yield "It never failed."
         return
     yield f"It failed in {int(outcomes.sum())} of {best['n_episodes']} episodes: {_shares(outcomes)}."
-    met = failures.loc[failures["trial"] == best["trial"], "last_traversability"].median()
-    known = told.get(best["trial"], np.empty(0))
+    met = failures.loc[failures["condition"] == best["condition"], "last_traversability"].median()
+    known = told.get(best["condition"], np.empty(0))
     known = known[~np.isnan(known)]  # an end outside the map has none
     if np.isnan(met):
         return
     if len(known):
         yield (
-            f"At the place where they ended, the planner had been told λ̂ = {np.median(known):.2f}, and in the last 2 s "
-            f"the robot met λ = {met:.2f} (medians)."
+            f"At the place where they ended, the predicted λ̂ was {np.median(known):.2f}, and in the last 2 s "
+            f"the robot observed λ = {met:.2f} (medians)."
         )
     else:
-        yield f"In their last 2 s the robot met λ = {met:.2f} (median)."
+        yield f"In their last 2 s the robot observed λ = {met:.2f} (median)."
 
 
 def _rate(row: Mapping[Any, Any]) -> str:

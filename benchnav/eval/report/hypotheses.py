@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.findings import Finding, p_in_words
 from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
-from benchnav.eval.trial import NOT_USED
 
 _TESTS = {
     "difference": "differences by a sign-flip test by {unit}",
@@ -116,7 +116,10 @@ def _numbers(row: Mapping[Any, Any], unit: str) -> str:
 def _extended(about: Mapping[str, Any]) -> list[str]:
     """Tells where a run was extended after its hypotheses were fixed."""
     planned = about["hypotheses"]["episodes"]
-    now = {trial: sum(count for _, _, count in about["trials"][trial]["draws"]) for trial in planned}
+    now = {
+        condition: sum(count for _, _, count in about["conditions"][condition]["draws"])
+        for condition in planned
+    }
     if now == planned:
         return []
     return [

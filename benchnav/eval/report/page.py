@@ -45,7 +45,7 @@ def write_page(
         header: lines on where the rows come from.
         warnings: lines on what went wrong.
         findings: what the run says.
-        table: a row a trial.
+        table: a row a condition.
         figures: in order.
         about: all of `run.json`.
 
@@ -87,7 +87,7 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
     for part, identity in about["parts"].items():
         lines.append((part, _identity(identity)))
-    seeds = dict.fromkeys(seed for trial in about["trials"].values() for seed in trial["seeds"])
+    seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]
 

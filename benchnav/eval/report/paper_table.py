@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.charts.panels import blocks
 from benchnav.eval.report.figure_style import display_name
 from benchnav.eval.report.rendering import latex, latex_label
 from benchnav.eval.report.tables import bold_note, maps_in_words, rate_in_words
-from benchnav.eval.trial import NOT_USED
 
 _MOST_ACROSS = 3
 _MEASURES = (r"Succ.\ [\%]", r"$T_\mathrm{total}$ [s]", r"$\bar{\lambda}$ [\%]")
@@ -52,7 +52,7 @@ def _caption(summary: pd.DataFrame) -> str:
     count = maps_in_words(*(_span(counts) for counts in (maps, groups)))
     return (
         f"Planning results on {count} a scenario: success with its 95\\,\\% interval, "
-        r"$T_\mathrm{total}$ with a failure counted as $T$ and mean traversability met $\bar{\lambda}$, "
+        r"$T_\mathrm{total}$ with a failure counted as $T$ and mean traversability observed $\bar{\lambda}$, "
         r"mean $\pm$ standard deviation over episodes."
     )
 

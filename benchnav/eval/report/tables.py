@@ -1,4 +1,4 @@
-"""The table of a run: a row a trial, as the paper's Table I formats it, with notes under it."""
+"""The table of a run: a row a condition, as the paper's Table I formats it, with notes under it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.stats.best import BLOCK, TOLD, competing
+from benchnav.eval.condition import LABELS, NOT_USED
+from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
-from benchnav.eval.trial import LABELS, NOT_USED
 from benchnav.planning.world.outcome import FAILURES
 
 # What `follows` is where a planner follows the user's objective alone.
@@ -25,19 +25,19 @@ _COLUMNS = {
     "world": "what λ does during an episode, and the rules of the task.",
     "robot": "how the robot moves.",
     "objective": "what planners are asked to minimise.",
-    "model": "what predicts λ; ideal, oracle and clairvoyant are told the truth and serve as yardsticks.",
+    "model": "what predicts λ; ideal, oracle and clairvoyant are privileged: they are given part of the truth.",
     "planner": "what chooses the actions.",
     "risk": "how the predicted distribution of λ becomes the one number λ̂ that the planner is given.",
-    "groups": "number of groups of maps that the trial was run on; the statistics take a group as one.",
-    "maps": "number of maps that the trial was run on.",
-    "episodes": "number of episodes of the trial.",
+    "groups": "number of groups of maps that the condition was run on; the statistics take a group as one.",
+    "maps": "number of maps that the condition was run on.",
+    "episodes": "number of episodes of the condition.",
     "Succ. [%]": "share of episodes that reached the goal.",
     "95 % interval": "of the success rate: Wilson's, with maps as the unit, so that episodes on one map count as fewer "
     "the more alike they end.",
     "T_total [s]": "mean time to the goal, a failure counted as T; in brackets its 95 % interval over maps, from "
     f"those of the success rate and of the time of arrival; none under {LEAST_MAPS} maps.",
     "T if success [s]": "mean ± standard deviation of the time over the episodes that reached the goal.",
-    "λ̄ [%]": "mean λ met during an episode, mean ± standard deviation over episodes.",
+    "λ̄ [%]": "mean observed λ during an episode, mean ± standard deviation over episodes.",
     ALONE: "wall time of planning one step of one robot alone on one thread, replanning included: the median, and in "
     "brackets the 95th percentile and the maximum, over at most 100 steps of one episode after its first.",
     IN_BATCH: "wall time of planning one step of a batch of at most 50 episodes on one thread over their number, which "
@@ -57,7 +57,7 @@ class ResultTable:
     Args:
         headings: one a column, those of labels first.
         labels: number of columns that are labels.
-        rows: a row a trial.
+        rows: a row a condition.
         notes: what the raised numbers behind the planners' labels refer to, beginning with the number.
         bold: cells (row, column) that are set in bold.
         bold_note: what bold means.
@@ -73,15 +73,15 @@ class ResultTable:
     explained: tuple[tuple[str, str], ...] = ()
 
 
-def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> ResultTable:
+def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> ResultTable:
     """Formats a summary: rates and λ̄ in per cent; bold what is not significantly worse than the best.
 
-    Columns of labels that are the same for all trials are left out, but for scenario, planner and risk; so
+    Columns of labels that are the same for all conditions are left out, but for scenario, planner and risk; so
     are the numbers of maps and episodes.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best` and perhaps with latencies.
-        trials: by id what `run.json` knows of them: `follows` and `remarks` become notes.
+        conditions: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
     shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
     grouped = is_grouped(summary)
@@ -89,7 +89,7 @@ def result_table(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]])
         name for name in ("n_groups", "n_maps", "n_episodes")
         if summary[name].nunique() > 1 and (grouped or name != "n_groups")
     ]  # fmt: skip
-    marks, notes = _notes(summary, trials)
+    marks, notes = _notes(summary, conditions)
     headings = (
         *shown,
         *(name.removeprefix("n_") for name in counts),
@@ -139,10 +139,12 @@ def bold_note(summary: pd.DataFrame) -> str:
         summary.loc[rows.index[~competing(rows)]]
         for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)
     ]
-    told = pd.concat(left_out).sort_values("told", key=lambda parts: parts.map(TOLD.index), kind="stable")
+    told = pd.concat(left_out).sort_values(
+        "privileged", key=lambda parts: parts.map(PRIVILEGED.index), kind="stable"
+    )
     if not told.empty:
         out = ", ".join(dict.fromkeys(told["model"]))
-        words.append(f"; what is told the truth ({out}) does not compete")
+        words.append(f"; privileged models ({out}) do not compete")
     return " ".join(words).replace(" ;", ";") + "."
 
 
@@ -162,7 +164,7 @@ def rate_in_words(row: Mapping[Any, Any]) -> str:
 
 
 def failures_in_words(row: Mapping[Any, Any]) -> str:
-    """Says how a trial's failures ended, such as `2 stuck, 1 stalled`; a dash where there are none.
+    """Says how a condition's failures ended, such as `2 stuck, 1 stalled`; a dash where there are none.
 
     Args:
         row: of the summary.
@@ -219,12 +221,12 @@ def _differs(labels: pd.Series) -> bool:
     return labels[labels != NOT_USED].nunique() > 1
 
 
-def _notes(summary: pd.DataFrame, trials: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:
-    """Raised numbers of each trial, and the notes that they refer to; equal texts share a number."""
+def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:
+    """Raised numbers of each condition, and the notes that they refer to; equal texts share a number."""
     numbers: dict[str, int] = {}
     marks = []
-    for trial in summary["trial"]:
-        about = trials[trial]
+    for condition in summary["condition"]:
+        about = conditions[condition]
         follows = about["follows"]
         texts = [] if follows in _USERS_OWN else [f"minimises, in place of the task's J: {follows}"]
         own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]

@@ -40,7 +40,7 @@ from benchnav.eval.report.tables import (
     maps_in_words,
     result_table,
 )
-from benchnav.eval.stats.best import against_best, told_the_truth
+from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
 from benchnav.files import write_text
@@ -49,7 +49,7 @@ PAGE = "report.html"
 
 _SUCCESS = (
     "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where "
-    "another is; grey: planners that look at nothing predicted."
+    "another is; grey: planners that are blind."
 )
 _HYPOTHESES = "Hypotheses that were fixed before the run, and their tests."
 _FOREST = (
@@ -57,11 +57,11 @@ _FOREST = (
     "Filled: supported; thick and thin: 90 % and 95 % intervals of one difference alone."
 )
 _OUTCOMES = "How episodes ended."
-_DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean λ met."
+_DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ."
 _SWEEP = "Success and T_total over {}, with their 95 % intervals."
 _FAILURES = (
-    "Failures of the highest success rate and of the lowest, {}: what the planner was told (colour), the path driven, "
-    "and where it ended. Of each outcome one is shown before any other twice; met λ: mean of the last 2 s."
+    "Failures of the highest success rate and of the lowest, {}: what was predicted (colour), the path driven, "
+    "and where it ended. Of each outcome one is shown before any other twice; observed λ: mean of the last 2 s."
 )
 _TRAJECTORIES = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
 _TO_THE_END = "Below, the whole driven path on λ as it was."
@@ -74,7 +74,7 @@ class Report:
     Args:
         header: lines on where the rows come from.
         findings: what the run says.
-        table: a row a trial.
+        table: a row a condition.
         warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
         tests: a row a hypothesis, from `hypotheses.test_hypotheses`; none where the suite held none.
@@ -108,22 +108,22 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     """
     run, episodes = open_run(folder), read_table(folder, "episodes.parquet")
     about = run.about
-    worlds = {trial: entry["value"]["world"] for trial, entry in about["trials"].items()}
+    worlds = {condition: entry["value"]["world"] for condition, entry in about["conditions"].items()}
     summary = summarise(episodes, worlds)
     tests = (
         test_hypotheses(about["hypotheses"], episodes, worlds) if "hypotheses" in about else pd.DataFrame()
     )
     grouped = is_grouped(summary)
-    best = against_best(episodes, summary, told_the_truth(about["trials"]))
-    summary = summary.merge(best, on="trial", how="left", validate="1:1")
-    summary = _with_latency(summary, about["trials"])
+    best = against_best(episodes, summary, privileged_models(about["conditions"]))
+    summary = summary.merge(best, on="condition", how="left", validate="1:1")
+    summary = _with_latency(summary, about["conditions"])
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(folder, summary, failures, ground_of)
     left_out = [sheets.left_out] if sheets.left_out else []
     return Report(
-        header=(*_header(summary, about), *_redrawn(episodes, about["trials"])),
+        header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
         findings=_findings(findings(summary, failures, sheets.told), tests, about, grouped),
-        table=result_table(summary, about["trials"]),
+        table=result_table(summary, about["conditions"]),
         warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
         summary=summary,
         tests=tests,
@@ -185,12 +185,12 @@ def _findings(
 def _charts(out: Path, report: Report) -> list[Drawn]:
     """Draws the figures at the width of a column."""
     summary = report.summary
-    marked = set(summary.loc[summary["best_marked"], "trial"])
+    marked = set(summary.loc[summary["best_marked"], "condition"])
     made: list[tuple[str, str, Callable[[], Figure]]] = []
     if not report.tests.empty:
         made.append(("forest", _FOREST, partial(forest_figure, report.tests)))
     made.append(("success", _SUCCESS, partial(success_figure, summary, marked)))
-    sweeps = find_sweeps(report.about["trials"])
+    sweeps = find_sweeps(report.about["conditions"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
     for sweep in sweeps:
         short = sweep_name(sweep.number)
@@ -213,7 +213,7 @@ def _charts(out: Path, report: Report) -> list[Drawn]:
 def _trajectories(folder: Path, out: Path, summary: pd.DataFrame) -> list[Drawn]:
     """Draws the trajectories of recorded episodes; none where nothing was recorded."""
     recorded = read_snapshots(folder)
-    chosen = choose(recorded, list(summary["trial"]))
+    chosen = choose(recorded, list(summary["condition"]))
     if not chosen:
         return []
     path = out / "figures" / "trajectories.png"
@@ -231,37 +231,39 @@ def _driven(folder: Path, out: Path) -> list[Drawn]:
     ]
 
 
-def _with_latency(summary: pd.DataFrame, trials: Mapping[str, Any]) -> pd.DataFrame:
+def _with_latency(summary: pd.DataFrame, conditions: Mapping[str, Any]) -> pd.DataFrame:
     """A summary with how long a step of one robot takes, where the run measured it."""
-    known = [trials[trial].get("latency", {}) for trial in summary["trial"]]
+    known = [conditions[condition].get("latency", {}) for condition in summary["condition"]]
     columns = {f"latency_{name}": [one.get(name, float("nan")) for one in known] for name in LATENCIES}
     return summary.assign(**columns)
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
-    trials = [about["trials"][trial] for trial in summary["trial"]]
-    worlds = {trial["labels"]["world"]: _world(trial["value"]) for trial in trials}
+    conditions = [about["conditions"][condition] for condition in summary["condition"]]
+    worlds = {condition["labels"]["world"]: _world(condition["value"]) for condition in conditions}
     lines = [f"World {label}: {text}." for label, text in worlds.items()]
-    seeds = dict.fromkeys(seed for trial in trials for seed in trial["seeds"])
+    seeds = dict.fromkeys(seed for condition in conditions for seed in condition["seeds"])
     lines.append(f"Data: {_list(summary['data'])}. Models: {_list(summary['model'])}. Seeds: {_list(seeds)}.")
     if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
         maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
-        lines.append(f"Each trial: {summary['n_episodes'][0]} episodes on {maps}.")
+        lines.append(f"Each condition: {summary['n_episodes'][0]} episodes on {maps}.")
     options = dict.fromkeys(
-        f"{trial['labels']['planner']} {change}" for trial in trials for change in trial["changed"]
+        f"{condition['labels']['planner']} {change}"
+        for condition in conditions
+        for change in condition["changed"]
     )
     return [*lines, f"Planner options: {', '.join(options)}."] if options else lines
 
 
-def _redrawn(episodes: pd.DataFrame, trials: Mapping[str, Any]) -> list[str]:
+def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> list[str]:
     """How often frozen λ was drawn again."""
-    frozen = [name for name, about in trials.items() if about["value"]["world"]["noise"] == "frozen"]
-    episodes = episodes[episodes["trial"].isin(frozen)]
-    if not episodes["redrawn"].any():
+    frozen = [name for name, about in conditions.items() if about["value"]["world"]["noise"] == "frozen"]
+    episodes = episodes[episodes["condition"].isin(frozen)]
+    if not episodes["rejected_draws"].any():
         return []
-    draws = ["data", "scenario", "world", "seed", "realisation", "instance"]
-    # All trials met the same; where a model failed nothing was drawn.
-    again = episodes.groupby(draws)["redrawn"].max()
+    draws = ["data", "scenario", "world", "seed", "realisation", "map"]
+    # All conditions met the same; where a model failed nothing was drawn.
+    again = episodes.groupby(draws)["rejected_draws"].max()
     share = again.sum() / (again + 1).sum()
     return [f"Of the draws of λ {100 * share:.1f} % joined start and goal by no ground and were drawn again."]
 

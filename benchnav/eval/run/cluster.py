@@ -146,14 +146,14 @@ def _make(
 
     # Names of files begin where the command was given, if this machine has that place.
     with chdir(here) if here.is_dir() else nullcontext():
-        extent = Extent(draws=((unit.seed, unit.realisation, unit.instances[-1] + 1),))
-        trials = {unit.trial.id: (unit.trial, extent)}
+        extent = Extent(draws=((unit.seed, unit.realisation, unit.maps[-1] + 1),))
+        conditions = {unit.condition.id: (unit.condition, extent)}
         worker = get_worker()
         try:
             state = {
                 **describe_worker(worker),
-                "datasets": provenance.describe_maps(trials),
-                "parts": provenance.describe_parts(trials),
+                "datasets": provenance.describe_maps(conditions),
+                "parts": provenance.describe_parts(conditions),
             }
         except BenchnavError as error:
             raise ConfigError(f"Worker {worker.address} lacks what the run needs: {error}") from error
@@ -166,16 +166,16 @@ def _make(
 
 def _subset(about: Mapping[str, Any], unit: Unit) -> dict[str, Any]:
     """What of `run.json` bears on a unit and is not told by the unit itself."""
-    trial = unit.trial
-    dataset = about["datasets"][trial.data]
-    maps = {trial.split: dataset["maps"][trial.split][: unit.instances[-1] + 1]}
+    condition = unit.condition
+    dataset = about["datasets"][condition.data]
+    maps = {condition.split: dataset["maps"][condition.split][: unit.maps[-1] + 1]}
     return {
         "code": about["code"],
         "parts": about["parts"],
         "planner_limit_s": about["planner_limit_s"],
         "device": about["device"],
         "gpu": about["gpu"],
-        "datasets": {trial.data: {"id": dataset["id"], "maps": maps, "about": dataset["about"]}},
+        "datasets": {condition.data: {"id": dataset["id"], "maps": maps, "about": dataset["about"]}},
     }
 
 

@@ -8,7 +8,7 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.folder.steps import open_steps
 from benchnav.eval.report.charts.driven import GROUND, MAP, DrivenGround, telling_map
-from benchnav.eval.run.episode import luck_key, read_maps
+from benchnav.eval.run.episode import noise_key, read_maps
 from benchnav.planning.world.simulation import Simulation
 
 
@@ -23,11 +23,11 @@ def keep_ground(folder: Path) -> None:
     rows = read_table(folder, EPISODES)
     about = telling_map(rows)
     on_map = np.logical_and.reduce([rows[name] == about[name] for name in MAP])
-    trial, _ = open_run(folder).trials[rows[on_map]["trial"].iloc[0]]
-    block = read_maps(TerrainDataset(find_dataset(trial.data)), trial.split, [about["instance"]])
-    luck = luck_key(about["seed"], trial.split, about["realisation"])
+    condition, _ = open_run(folder).conditions[rows[on_map]["condition"].iloc[0]]
+    block = read_maps(TerrainDataset(find_dataset(condition.data)), condition.split, [about["map"]])
+    noise = noise_key(about["seed"], condition.split, about["realisation"])
     simulation = Simulation(
-        block.terrain, trial.make_task(), trial.world, block.places, luck, [about["instance"]]
+        block.terrain, condition.make_task(), condition.world, block.places, noise, [about["map"]]
     )
     field = None if simulation.field is None else simulation.field[0].cpu().numpy()
     DrivenGround(
@@ -35,6 +35,6 @@ def keep_ground(folder: Path) -> None:
         resolution_m=block.terrain.grid.resolution_m,
         rgb=block.terrain.rgb[0].cpu().numpy(),
         field=field,
-        holding=simulation.holding[0].cpu().numpy(),
+        immobilising=simulation.immobilising[0].cpu().numpy(),
         goal_m=block.places.goal_m[0].cpu().numpy(),
     ).save(folder / GROUND)

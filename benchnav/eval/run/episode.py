@@ -18,9 +18,9 @@ from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.condition import Condition
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
-from benchnav.eval.trial import Trial
 from benchnav.eval.unit import Unit
 from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import Clairvoyant, predict
@@ -34,7 +34,7 @@ from benchnav.terrain import Terrain
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """What is stored of a block of instances.
+    """What is stored of a block of maps.
 
     Args:
         terrain: the true maps.
@@ -51,14 +51,14 @@ class Block:
         return replace(self, terrain=self.terrain.to(device), places=self.places.to(device))
 
 
-def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> Block:
-    """Reads some instances of a split, with starts, goals, reference times and groups; else each map is one."""
-    places = dataset.read(split, instances, ["start_m", "goal_m", "reference_time_s"])
-    groups: Any = instances
+def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block:
+    """Reads some maps of a split, with starts, goals, reference times and groups; else each map is one."""
+    places = dataset.read(split, maps, ["start_m", "goal_m", "reference_time_s"])
+    groups: Any = maps
     if "group" in dataset.field_names:
-        groups = dataset.read(split, instances, ["group"])["group"]
+        groups = dataset.read(split, maps, ["group"])["group"]
     return Block(
-        terrain=dataset.terrain(split, instances),
+        terrain=dataset.terrain(split, maps),
         places=Places(**{name: torch.from_numpy(values) for name, values in places.items()}),
         groups=np.asarray(groups, dtype=np.int64).reshape(-1),
     )
@@ -66,7 +66,7 @@ def read_maps(dataset: TerrainDataset, split: str, instances: Sequence[int]) -> 
 
 def read_block(unit: Unit, run_id: str, device: torch.device = CPU) -> Block:
     """Reads a unit's maps and places onto a device; they are kept for one run alone."""
-    return _block(run_id, unit.trial.data, unit.trial.split, unit.instances, device)
+    return _block(run_id, unit.condition.data, unit.condition.split, unit.maps, device)
 
 
 class PredictionError(BenchnavError):
@@ -86,13 +86,13 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
         DeviceError: the GPU failed.
         BenchnavError: the data cannot be read, or are not enough for the world.
     """
-    trial = unit.trial
-    block, task = read_block(unit, run_id, device), trial.make_task()
-    luck = luck_key(unit.seed, trial.split, unit.realisation)
-    simulation = Simulation(block.terrain, task, trial.world, block.places, luck, unit.instances)
+    condition = unit.condition
+    block, task = read_block(unit, run_id, device), condition.make_task()
+    noise = noise_key(unit.seed, condition.split, unit.realisation)
+    simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
         mixture = _predict(unit, run_id, device, simulation.field)
-        risk_map = risk.apply(trial.make_risk(), mixture)
+        risk_map = risk.apply(condition.make_risk(), mixture)
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
@@ -111,29 +111,29 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
 
 def time_budgets(unit: Unit, run_id: str) -> Tensor:
     """T of each episode of a unit, shape [B]."""
-    top_speed = unit.trial.make_task().robot.top_speed_mps
-    return unit.trial.world.budget_s(read_block(unit, run_id).places.reference_time_s, top_speed)
+    top_speed = unit.condition.make_task().robot.top_speed_mps
+    return unit.condition.world.budget_s(read_block(unit, run_id).places.reference_time_s, top_speed)
 
 
 def _predict(unit: Unit, run_id: str, device: torch.device, field: Tensor | None) -> TraversabilityMixture:
     """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
-    trial = unit.trial
-    model = _model(run_id, _ModelOf(trial))
+    condition = unit.condition
+    model = _model(run_id, _ModelOf(condition))
     if not isinstance(model, Clairvoyant):
-        return _prediction(run_id, _ModelOf(trial), trial.data, trial.split, unit.instances, device)
+        return _prediction(run_id, _ModelOf(condition), condition.data, condition.split, unit.maps, device)
     if field is None:
         raise ConfigError("Expected λ that stays what it is for the clairvoyant, got resampled λ.")
     return predict(model, replace(read_block(unit, run_id, device).terrain, traversability=field))
 
 
-def luck_key(seed: int, split: str, realisation: int) -> int:
-    """Key of the world's luck: the same for every trial, so that all meet the same."""
+def noise_key(seed: int, split: str, realisation: int) -> int:
+    """Key of the simulation's noise: the same for every condition (common random numbers)."""
     return rng.stream_key(seed, "simulation", *_draw(split, realisation))
 
 
 def planner_generator(unit: Unit) -> torch.Generator:
     """The planner's randomness: keyed by seed and split, never by the batch."""
-    return rng.generator(rng.stream_key(unit.seed, "planner", *_draw(unit.trial.split, unit.realisation)))
+    return rng.generator(rng.stream_key(unit.seed, "planner", *_draw(unit.condition.split, unit.realisation)))
 
 
 def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
@@ -160,14 +160,14 @@ def simulate(
         planner_limit_s: time limit of each call of the planner; 0 for none.
         **options: further arguments of `run_episodes`.
     """
-    trial = unit.trial
+    condition = unit.condition
     planner: Any
     with ExitStack() as stack:
         try:
             if planner_limit_s:
-                planner = stack.enter_context(IsolatedPlanner(trial, planner_limit_s))
+                planner = stack.enter_context(IsolatedPlanner(condition, planner_limit_s))
             else:
-                planner = trial.make_planner()
+                planner = condition.make_planner()
         except (Exception, SystemExit) as error:
             planner = _Unmade(error)
         generator = planner_generator(unit)
@@ -200,10 +200,10 @@ def one_thread() -> Iterator[None]:
 
 
 class _ModelOf:
-    """A trial's model as a key of a cache: the same for all trials of one model."""
+    """A condition's model as a key of a cache: the same for all conditions of one model."""
 
-    def __init__(self, trial: Trial) -> None:
-        self.trial, self.key = trial, repr((trial.model.part, trial.model.options))
+    def __init__(self, condition: Condition) -> None:
+        self.condition, self.key = condition, repr((condition.model.part, condition.model.options))
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -213,8 +213,8 @@ class _ModelOf:
 
 
 @lru_cache(maxsize=2)
-def _block(run_id: str, data: str, split: str, instances: tuple[int, ...], device: torch.device) -> Block:
-    return read_maps(_dataset(run_id, data), split, instances).to(device)
+def _block(run_id: str, data: str, split: str, maps: tuple[int, ...], device: torch.device) -> Block:
+    return read_maps(_dataset(run_id, data), split, maps).to(device)
 
 
 @lru_cache(maxsize=2)
@@ -224,11 +224,11 @@ def _dataset(run_id: str, data: str) -> TerrainDataset:
 
 @lru_cache(maxsize=2)
 def _prediction(
-    run_id: str, model: _ModelOf, data: str, split: str, instances: tuple[int, ...], device: torch.device
+    run_id: str, model: _ModelOf, data: str, split: str, maps: tuple[int, ...], device: torch.device
 ) -> TraversabilityMixture:
-    return predict(_model(run_id, model), _block(run_id, data, split, instances, device).terrain)
+    return predict(_model(run_id, model), _block(run_id, data, split, maps, device).terrain)
 
 
 @lru_cache(maxsize=2)
 def _model(run_id: str, model: _ModelOf) -> Any:
-    return model.trial.make_model()
+    return model.condition.make_model()

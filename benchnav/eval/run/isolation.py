@@ -13,7 +13,7 @@ import torch
 
 from benchnav.device import GPU_FAULTS, gpu_failed
 from benchnav.errors import BenchnavError
-from benchnav.eval.trial import Trial
+from benchnav.eval.condition import Condition
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
 
@@ -26,20 +26,20 @@ class TimeLimitError(BenchnavError):
 
 
 class IsolatedPlanner:
-    """A trial's planner, run in a child process; a planner like any other.
+    """A condition's planner, run in a child process; a planner like any other.
 
     Args:
-        trial: whose planner.
+        condition: whose planner.
         limit_s: time limit of each call; `init` and the first `plan` have two minutes more, to compile.
     """
 
-    def __init__(self, trial: Trial, limit_s: float) -> None:
+    def __init__(self, condition: Condition, limit_s: float) -> None:
         """Starts the child."""
         self.limit_s = limit_s
         self.compiled: bool | None = None
         context = multiprocessing.get_context("spawn")
         self._here, there = context.Pipe()
-        self._child = context.Process(target=_serve, args=(there, trial), daemon=True)
+        self._child = context.Process(target=_serve, args=(there, condition), daemon=True)
         self._child.start()
         there.close()
         try:
@@ -99,14 +99,14 @@ class ChildError(BenchnavError):
     """What a planner raised in its process: its last line, and the child's traceback as a note."""
 
 
-def _serve(connection: Connection, trial: Trial) -> None:
+def _serve(connection: Connection, condition: Condition) -> None:
     import traceback
 
     torch.set_num_threads(1)
     plan_state: Any = None
     try:
-        trial.make_task()
-        planner = trial.make_planner()
+        condition.make_task()
+        planner = condition.make_planner()
         connection.send_bytes(pickle.dumps(("started", None)))
     except (Exception, SystemExit):
         connection.send_bytes(pickle.dumps(("raised", traceback.format_exc())))

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchnav.eval.condition import Condition
 from benchnav.eval.run.episode import build, one_thread, simulate
-from benchnav.eval.trial import Trial
 from benchnav.eval.unit import Extent, Unit
 
 _MOST_STEPS = 100
@@ -22,7 +22,7 @@ _FACTORS = ("planner", "robot", "objective")
 
 
 def measure_latencies(
-    trials: Mapping[str, tuple[Trial, Extent]],
+    conditions: Mapping[str, tuple[Condition, Extent]],
     known: Mapping[str, Mapping[str, Any]],
     run_id: str,
     planner_limit_s: float,
@@ -31,35 +31,37 @@ def measure_latencies(
     """Measures what was not measured.
 
     Args:
-        trials: by id.
-        known: latencies by trial, as this gives them.
+        conditions: by id.
+        known: latencies by condition, as this gives them.
         run_id: predictions are kept for one run alone.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         device: where all is computed.
 
     Returns:
-        By trial, of those that were measured: `median_ms`, `p95_ms` and `max_ms` over `steps` steps. Trials of one
-        planner, robot and objective share one measurement, on the first map of the first of them. A planner that
+        By condition, of those that were measured: `median_ms`, `p95_ms` and `max_ms` over `steps` steps. Conditions of
+        one planner, robot and objective share one measurement, on the first map of the first of them. A planner that
         fails has none.
     """
-    found: dict[str, Any] = {_key(trials[i][0]): about for i, about in known.items() if i in trials}
-    for trial, extent in trials.values():
-        if _key(trial) not in found:
-            found[_key(trial)] = _measure(trial, extent, run_id, planner_limit_s, torch.device(device))
-    every = {trial_id: found[_key(trial)] for trial_id, (trial, _) in trials.items()}
-    return {trial_id: about for trial_id, about in every.items() if about}
+    found: dict[str, Any] = {_key(conditions[i][0]): about for i, about in known.items() if i in conditions}
+    for condition, extent in conditions.values():
+        if _key(condition) not in found:
+            found[_key(condition)] = _measure(
+                condition, extent, run_id, planner_limit_s, torch.device(device)
+            )
+    every = {condition_id: found[_key(condition)] for condition_id, (condition, _) in conditions.items()}
+    return {condition_id: about for condition_id, about in every.items() if about}
 
 
-def _key(trial: Trial) -> str:
-    value = trial.value
+def _key(condition: Condition) -> str:
+    value = condition.value
     return repr([value[name] for name in _FACTORS])
 
 
 def _measure(
-    trial: Trial, extent: Extent, run_id: str, planner_limit_s: float, device: torch.device
+    condition: Condition, extent: Extent, run_id: str, planner_limit_s: float, device: torch.device
 ) -> dict[str, Any] | None:
     seed, realisation, _ = extent.draws[0]
-    unit = Unit(trial=trial, seed=seed, realisation=realisation, instances=(0,))
+    unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=(0,))
     warm: list[float] = []
 
     def enough(step: int) -> bool:

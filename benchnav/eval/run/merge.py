@@ -46,9 +46,9 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         _check_new(folder)
         runs = [_open_shard(part) for part in parts]
         of = _check_alike(runs)
-        trials = runs[0].trials
+        conditions = runs[0].conditions
         # What is recorded is in the folders of the shards already.
-        every = in_table_order(units(trials, Keep()), trials)
+        every = in_table_order(units(conditions, Keep()), conditions)
         found = [(unit, _find(unit, runs)) for unit in every]
         _check_whole([unit for unit, run in found if run is None], runs, of)
         target = folder.resolve()
@@ -106,7 +106,7 @@ def _check_alike(runs: Sequence[Run]) -> int:
     first = runs[0]
     reasons = []
     for run in runs[1:]:
-        unlike = _unlike_trials(first, run) + provenance.differences(first.about, run.about)
+        unlike = _unlike_conditions(first, run) + provenance.differences(first.about, run.about)
         if run.about.get("hypotheses") != first.about.get("hypotheses"):
             unlike.append("hypotheses")
         if _shard(run).of != _shard(first).of:
@@ -121,24 +121,26 @@ def _check_alike(runs: Sequence[Run]) -> int:
     return _shard(first).of
 
 
-def _unlike_trials(first: Run, other: Run) -> list[str]:
-    """Names the trials that are not the same in two runs, or not run as often."""
+def _unlike_conditions(first: Run, other: Run) -> list[str]:
+    """Names the conditions that are not the same in two runs, or not run as often."""
     lines = []
     for lacking, having in ((other, first), (first, other)):
-        names = [_name(trial) for i, (trial, _) in having.trials.items() if i not in lacking.trials]
+        names = [
+            _name(condition) for i, (condition, _) in having.conditions.items() if i not in lacking.conditions
+        ]
         if names:
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-            lines.append(f"trials that {lacking.folder} lacks ({', '.join(names[:3])}{more})")
-    both = [i for i in first.trials if i in other.trials]
-    if any(first.trials[i][0].labels != other.trials[i][0].labels for i in both):
-        lines.append("labels of trials")
-    if any(set(first.trials[i][1].draws) != set(other.trials[i][1].draws) for i in both):
-        lines.append("seeds, realisations or instances")
+            lines.append(f"conditions that {lacking.folder} lacks ({', '.join(names[:3])}{more})")
+    both = [i for i in first.conditions if i in other.conditions]
+    if any(first.conditions[i][0].labels != other.conditions[i][0].labels for i in both):
+        lines.append("labels of conditions")
+    if any(set(first.conditions[i][1].draws) != set(other.conditions[i][1].draws) for i in both):
+        lines.append("seeds, realisations or maps")
     return lines
 
 
-def _name(trial: Any) -> str:
-    return " ".join(trial.labels[name] for name in ("scenario", "world", "planner", "model", "risk"))
+def _name(condition: Any) -> str:
+    return " ".join(condition.labels[name] for name in ("scenario", "world", "planner", "model", "risk"))
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Run | None:
@@ -147,7 +149,7 @@ def _find(unit: Unit, runs: Sequence[Run]) -> Run | None:
     for other in holders[1:]:
         if differences(unit_rows(holders[0].folder, unit), unit_rows(other.folder, unit)):
             raise ConfigError(
-                f"Expected the same rows wherever a unit is, but {unit.path} ({_name(unit.trial)}) differs between "
+                f"Expected the same rows wherever a unit is, but {unit.path} ({_name(unit.condition)}) differs between "
                 f"{holders[0].folder} and {other.folder}. Leave one of them out."
             )
     return holders[0] if holders else None
@@ -175,18 +177,18 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run], of: int) -> None:
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     """`run.json` of the whole: that of the first shard, with what was measured, said and commanded of all."""
     about = {name: value for name, value in runs[0].about.items() if name != "shard"}
-    trials = {i: dict(entry) for i, entry in about["trials"].items()}
+    conditions = {i: dict(entry) for i, entry in about["conditions"].items()}
     for run in runs:
-        for trial_id, entry in run.about["trials"].items():
+        for condition_id, entry in run.about["conditions"].items():
             if "latency" in entry:
-                trials[trial_id].setdefault("latency", entry["latency"])
+                conditions[condition_id].setdefault("latency", entry["latency"])
     joined: dict[str, list[Any]] = {
         name: provenance.join(*(run.about.get(name, ()) for run in runs))
         for name in ("warnings", "dropped", "history")
     }
     commands = provenance.command_lines(provenance.join(*(run.about["commands"] for run in runs)))
     history = provenance.extend_history(joined["history"], about["suite"])
-    given = {"run_id": secrets.token_hex(8), "trials": trials, "commands": commands}
+    given = {"run_id": secrets.token_hex(8), "conditions": conditions, "commands": commands}
     return {**about, **given, **joined, "history": history}
 
 

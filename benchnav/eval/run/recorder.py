@@ -68,11 +68,11 @@ class Recorder:
         """All that is played back of one episode."""
         unit, problem, steps = self.unit, self.problem, int(episodes.steps[member])
         about = {
-            "trial": unit.trial.id,
-            **unit.trial.labels,
+            "condition": unit.condition.id,
+            **unit.condition.labels,
             "seed": str(unit.seed),
             "realisation": str(unit.realisation),
-            "instance": str(unit.instances[member]),
+            "map": str(unit.maps[member]),
             "outcome": Outcome(int(episodes.outcome[member])).name.lower(),
         }
         free = problem.task.rules.free_space
@@ -102,8 +102,8 @@ class Recorder:
         soft = (truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy()
         mean = truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy()
         field = None if self.simulation.field is None else self.simulation.field[member].cpu().numpy()
-        holding = self.simulation.holding[member].cpu().numpy()
-        return {"true_mean": mean, "field": field, "soft": soft, "holding": holding}
+        immobilising = self.simulation.immobilising[member].cpu().numpy()
+        return {"true_mean": mean, "field": field, "soft": soft, "immobilising": immobilising}
 
 
 def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = None) -> Recording:
@@ -124,7 +124,7 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
         stored = playback_path(place, unit.stem(member), ".npz")
         if stored.exists():
             return Recording.load(stored)
-    row = _row(folder, unit, unit.instances[member])
+    row = _row(folder, unit, unit.maps[member])
     with one_thread():
         about = open_run(folder).about
         run_id, device = about["run_id"], device_of_run(about)
@@ -141,11 +141,11 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     return recording
 
 
-def _row(folder: Path, unit: Unit, instance: int) -> dict[str, Any]:
+def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     """What a finished run holds of an episode."""
     rows = read_table(folder, EPISODES)
-    own = (rows["trial"] == unit.trial.id) & (rows["seed"] == unit.seed)
-    own &= (rows["realisation"] == unit.realisation) & (rows["instance"] == instance)
+    own = (rows["condition"] == unit.condition.id) & (rows["seed"] == unit.seed)
+    own &= (rows["realisation"] == unit.realisation) & (rows["map"] == map_index)
     if not own.any():
         raise ConfigError(
             f"Expected a finished run, got {folder} without that episode. Run the same command again to finish it."

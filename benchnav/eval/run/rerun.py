@@ -1,6 +1,6 @@
 """Repeating a run from its provenance, and telling whether every row came out the same.
 
-What is repeated are the trials of `run.json`, each as often as it was run, whatever commands they came by.
+What is repeated are the conditions of `run.json`, each as often as it was run, whatever commands they came by.
 """
 
 from collections import Counter
@@ -16,6 +16,7 @@ from benchnav import registry
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.device import device_of_run
 from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.condition import PART_KINDS, Condition
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import EPISODES, RUN, Run, making, open_run, read_table
 from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
@@ -23,7 +24,6 @@ from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_everywhere
 from benchnav.eval.run.check_world import Say
 from benchnav.eval.run.runner import Work, Workers, run_work
-from benchnav.eval.trial import PART_KINDS, Trial
 from benchnav.eval.unit import units
 from benchnav.files import sole_writer
 
@@ -73,16 +73,16 @@ def rerun(
     if not overwrite:
         _check_no_copy(run, folder)
     _check_there(run)
-    if not overwrite and (folder / RUN).exists() and set(open_run(folder).trials) != set(run.trials):
+    if not overwrite and (folder / RUN).exists() and set(open_run(folder).conditions) != set(run.conditions):
         raise ConfigError(
-            f"Expected `out` to be new or an earlier rerun of {run_folder}, but {folder} has other trials. Choose "
+            f"Expected `out` to be new or an earlier rerun of {run_folder}, but {folder} has other conditions. Choose "
             "another `out`."
         )
     if workers.elsewhere or run.about["planner_limit_s"]:
-        check_everywhere(trial for trial, _ in run.trials.values())
+        check_everywhere(condition for condition, _ in run.conditions.values())
     work = Work(
         suite=run.about["suite"],
-        trials=run.trials,
+        conditions=run.conditions,
         dropped=tuple(run.about["dropped"]),
         warnings=tuple(run.about["warnings"]),
         hypotheses=run.about.get("hypotheses", {}),
@@ -107,8 +107,8 @@ def compare(run_folder: Path, folder: Path) -> Comparison:
     run, again = _open(run_folder), open_run(folder)
     first, second = read_table(run_folder, EPISODES), read_table(folder, EPISODES)
     different, columns = differences(first, second), differing_columns(first, second)
-    trials = {trial_id: trial for trial_id, (trial, _) in (*again.trials.items(), *run.trials.items())}
-    lines = [] if columns and not different else _verdict(trials, len(first), different)
+    conditions = {i: condition for i, (condition, _) in (*again.conditions.items(), *run.conditions.items())}
+    lines = [] if columns and not different else _verdict(conditions, len(first), different)
     lines += [f"only one of the two tables has the column {name}" for name in columns]
     lines += _environment(run.about, again.about)
     return Comparison(
@@ -124,7 +124,7 @@ def _open(folder: Path) -> Run:
 
 def _check_no_copy(run: Run, folder: Path) -> None:
     """Refuses a folder with units that were copied from the run: to compare a run with itself certifies nothing."""
-    every = units(run.trials, Keep()) if folder.is_dir() else []
+    every = units(run.conditions, Keep()) if folder.is_dir() else []
     made = [(making(run.folder, unit), making(folder, unit)) for unit in every]
     copied = sum(one is not None and one == other for one, other in made)
     if copied:
@@ -137,8 +137,8 @@ def _check_no_copy(run: Run, folder: Path) -> None:
 def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
     lacking: dict[str, str] = {}
-    for trial, extent in run.trials.values():
-        for name, find in _needs(trial, extent.instances).items():
+    for condition, extent in run.conditions.values():
+        for name, find in _needs(condition, extent.maps).items():
             if name in lacking:
                 continue
             try:
@@ -150,45 +150,45 @@ def _check_there(run: Run) -> None:
         raise ConfigError(f"{run.folder} cannot be repeated here, since something is no longer there. {told}")
 
 
-def _needs(trial: Trial, instances: int) -> Mapping[str, Callable[[], Any]]:
-    """What a trial needs, by name, each as a call that fails where it is not there."""
+def _needs(condition: Condition, maps: int) -> Mapping[str, Callable[[], Any]]:
+    """What a condition needs, by name, each as a call that fails where it is not there."""
 
-    def maps() -> None:
-        dataset = TerrainDataset(find_dataset(trial.data))
-        there = dataset.map_count(trial.split)
-        if there < instances:
-            raise ConfigError(f"Expected {instances} maps, got {there}.")
+    def splits() -> None:
+        dataset = TerrainDataset(find_dataset(condition.data))
+        there = dataset.map_count(condition.split)
+        if there < maps:
+            raise ConfigError(f"Expected {maps} maps, got {there}.")
 
     def part(kind: str) -> Callable[[], Any]:
-        return lambda: registry.find(kind, getattr(trial, kind).part)
+        return lambda: registry.find(kind, getattr(condition, kind).part)
 
-    kinds = {f"{kind} {getattr(trial, kind).part}": part(kind) for kind in PART_KINDS if kind != "model"}
-    models = {} if trial.blind else {f"model {trial.model.part}": trial.make_model}
-    return {f"maps of {trial.data} {trial.split}": maps, **models, **kinds}
+    kinds = {f"{kind} {getattr(condition, kind).part}": part(kind) for kind in PART_KINDS if kind != "model"}
+    models = {} if condition.blind else {f"model {condition.model.part}": condition.make_model}
+    return {f"maps of {condition.data} {condition.split}": splits, **models, **kinds}
 
 
-def _verdict(trials: Mapping[str, Trial], rows: int, different: list[Difference]) -> list[str]:
+def _verdict(conditions: Mapping[str, Condition], rows: int, different: list[Difference]) -> list[str]:
     if not different:
         return [f"all {rows} rows came out the same"]
     counts = Counter(difference.episode[0] for difference in different)
     lines = [
-        f"{len(different)} of {rows} rows came out differently, in {len(counts)} of {len(trials)} trials:"
+        f"{len(different)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:"
     ]
-    for trial_id, count in counts.items():
-        lines.append(f"  {_label(trials[trial_id])}: {count} rows")
+    for condition_id, count in counts.items():
+        lines.append(f"  {_label(conditions[condition_id])}: {count} rows")
     lines.append("first of them:")
     for difference in islice(different, _SHOWN):
-        trial_id, *place = difference.episode
+        condition_id, *place = difference.episode
         where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
-        lines.append(f"  {_label(trials[trial_id])}, {where}: {_by_how_much(difference)}")
+        lines.append(f"  {_label(conditions[condition_id])}, {where}: {_by_how_much(difference)}")
     greatest = _greatest(different)
     if greatest:
         lines.append(f"greatest differences: {', '.join(greatest)}")
     return lines
 
 
-def _label(trial: Trial) -> str:
-    return ", ".join(f"{name} {label}" for name, label in trial.labels.items())
+def _label(condition: Condition) -> str:
+    return ", ".join(f"{name} {label}" for name, label in condition.labels.items())
 
 
 def _by_how_much(difference: Difference) -> str:

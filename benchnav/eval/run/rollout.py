@@ -149,8 +149,8 @@ def run_episodes(
     """
     now = simulation.init(problem.start)
     log = _Log(now, problem.dt_s)
-    felt = torch.full_like(now.state[:, 0], torch.nan)
-    look_every = 1 if felt.device.type == "cpu" else _LOOK_EVERY
+    observed = torch.full_like(now.state[:, 0], torch.nan)
+    look_every = 1 if observed.device.type == "cpu" else _LOOK_EVERY
     trace = ""
     try:
         with log.clock.timed():
@@ -165,7 +165,7 @@ def run_episodes(
                     break
                 batch.drop_ended(running)
             watched = watch is not None and count % watch_every == 0
-            step = Step(state=now.state, felt=felt, time_s=count * problem.dt_s, draw=watched)
+            step = Step(state=now.state, traversability=observed, time_s=count * problem.dt_s, draw=watched)
             with log.clock.timed():
                 answer = batch.act(step)
             log.planned.append(len(batch.members))
@@ -176,8 +176,8 @@ def run_episodes(
             now = end(now, faulty, Outcome.PLANNER_ERROR)
             now = end(now, status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
             before = now.state
-            now, felt, free = _move(simulation, now, action)
-            log.add(before, now, action, felt, free)
+            now, observed, free = _move(simulation, now, action)
+            log.add(before, now, action, observed, free)
     except (RobotError, DeviceError):
         raise
     except GPU_FAULTS as error:
@@ -219,7 +219,7 @@ class _Batch:
 
     def act(self, step: Step) -> Answer:
         """Asks the planner, for the episodes that are left."""
-        given = replace(step, state=step.state[self._index], felt=step.felt[self._index])
+        given = replace(step, state=step.state[self._index], traversability=step.traversability[self._index])
         answer = act(self._planner, given, self._state, self._part)
         self._state = answer.plan_state
         return answer
@@ -241,7 +241,7 @@ class RobotError(BenchnavError):
 def _move(
     simulation: Simulation, now: SimulationState, action: Tensor
 ) -> tuple[SimulationState, Tensor, Tensor]:
-    """The next states, the λ met, and where the action would have led on ground of λ = 1."""
+    """The next states, the observed λ, and where the action would have led on ground of λ = 1."""
     try:
         free = simulation.unhindered(now, action)
         return *simulation.step(now, action), free

@@ -24,7 +24,7 @@ def episode_rows(
     problem: Problem,
     episodes: Episodes,
     reference_time_s: np.ndarray,
-    redrawn: Sequence[int],
+    rejected_draws: Sequence[int],
     compiled: bool,
 ) -> pd.DataFrame:
     """Tabulates episodes, a row each.
@@ -34,22 +34,28 @@ def episode_rows(
         problem: what was to be solved.
         episodes: what happened.
         reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
-        redrawn: how often the λ of each episode was drawn again, so that ground joins start and goal, B of
+        rejected_draws: how often the λ of each episode was drawn again, so that ground joins start and goal, B of
             them.
         compiled: the planner ran compiled.
 
     Returns:
-        The trial's id and labels, `seed`, `realisation`, `instance`; `outcome`, `success`; `total_time_s`,
+        The condition's id and labels, `seed`, `realisation`, `map`; `outcome`, `success`; `total_time_s`,
         where a failure counts as the whole time budget; `end_time_s`, when the episode ended;
-        `traversability`, the mean of the λ met; `reference_time_s`; `time_ratio`, over the reference time at
+        `traversability`, the mean of the observed λ; `reference_time_s`; `time_ratio`, over the reference time at
         the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
         `stuck_share`, share of steps with λ at most λ_stuck; `roughness_radps2`, the mean change of the
-        commanded turn rate; wall times of planning as of `planning_times`; `redrawn`; `compiled`; `error`.
+        commanded turn rate; wall times of planning as of `planning_times`; `rejected_draws`; `compiled`; `error`.
         What an episode that ended at once does not have is NaN.
     """
     top_speed, rows = problem.robot.top_speed_mps, []
-    named = {"trial": unit.trial.id, **unit.trial.labels, "seed": unit.seed, "realisation": unit.realisation}
-    for b, instance in enumerate(unit.instances):
+    condition = unit.condition
+    named = {
+        "condition": condition.id,
+        **condition.labels,
+        "seed": unit.seed,
+        "realisation": unit.realisation,
+    }
+    for b, map_index in enumerate(unit.maps):
         steps = int(episodes.steps[b])
         outcome = Outcome(int(episodes.outcome[b]))
         met = episodes.traversability[b, :steps].double().numpy()
@@ -63,7 +69,7 @@ def episode_rows(
         rows.append(
             {
                 **named,
-                "instance": instance,
+                "map": map_index,
                 "outcome": outcome.name.lower(),
                 "success": success,
                 "total_time_s": end_time_s if success else float(problem.time_budget_s[b]),
@@ -76,7 +82,7 @@ def episode_rows(
                 "stuck_share": float(stuck.double().mean()) if steps else np.nan,
                 "roughness_radps2": np.abs(np.diff(turn)).mean() / problem.dt_s if steps > 1 else np.nan,
                 **planning_times(episodes, b),
-                "redrawn": redrawn[b],
+                "rejected_draws": rejected_draws[b],
                 "compiled": compiled,
                 "error": episodes.errors[b],
             }
@@ -88,11 +94,11 @@ def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
     """Rows of episodes that could not begin, since their model or risk measure failed; T of shape [B]."""
     rows = [
         {
-            "trial": unit.trial.id,
-            **unit.trial.labels,
+            "condition": unit.condition.id,
+            **unit.condition.labels,
             "seed": unit.seed,
             "realisation": unit.realisation,
-            "instance": instance,
+            "map": map_index,
             "outcome": Outcome.MODEL_ERROR.name.lower(),
             "success": False,
             "total_time_s": budget,
@@ -107,11 +113,11 @@ def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
             "planning_ms": np.nan,
             "planning_ms_p95": np.nan,
             "planning_start_ms": np.nan,
-            "redrawn": 0,
+            "rejected_draws": 0,
             "compiled": False,
             "error": error,
         }
-        for instance, budget in zip(unit.instances, time_budget_s.tolist(), strict=True)
+        for map_index, budget in zip(unit.maps, time_budget_s.tolist(), strict=True)
     ]
     return pd.DataFrame(rows)
 
@@ -163,7 +169,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes, members: Sequen
         members: which of the unit's episodes.
 
     Returns:
-        `seed`, `realisation`, `instance`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
+        `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
         name, and `traversability` as met; actions and `traversability` are NaN at the last state.
     """
     counts = [int(episodes.steps[member]) + 1 for member in members]
@@ -180,7 +186,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes, members: Sequen
     columns: dict[str, Any] = {
         "seed": np.full(len(step), unit.seed),
         "realisation": np.full(len(step), unit.realisation, np.int32),
-        "instance": np.repeat(np.array(unit.instances, np.int32)[list(members)], counts),
+        "map": np.repeat(np.array(unit.maps, np.int32)[list(members)], counts),
         "step": step.astype(np.int32),
         "time_s": step * problem.dt_s,
     }

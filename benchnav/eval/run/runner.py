@@ -23,6 +23,7 @@ import torch
 
 from benchnav.device import find_device, gpu_name
 from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.condition import Condition, check_labels
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.changes import changed_options
 from benchnav.eval.folder.folder import (
@@ -60,7 +61,6 @@ from benchnav.eval.run.latency import measure_latencies
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import Trial, check_labels
 from benchnav.eval.unit import Extent, Unit, in_table_order, units
 from benchnav.files import sole_writer
 from benchnav.planning.planners.planner import what_it_follows
@@ -68,7 +68,7 @@ from benchnav.planning.world.outcome import Outcome
 from benchnav.share import Share
 from benchnav.workers import end_with
 
-Trials = dict[str, tuple[Trial, Extent]]
+Conditions = dict[str, tuple[Condition, Extent]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ class Work:
 
     Args:
         suite: as it was written, for `run.json`.
-        trials: by id, with how often each is to be run.
+        conditions: by id, with how often each is to be run.
         keep: what is recorded of episodes, and of which the steps are stored.
         planner_limit_s: time limit of each call of a planner; 0 for none.
         shard: which share of the units is run; None for all.
@@ -88,7 +88,7 @@ class Work:
     """
 
     suite: Mapping[str, Any]
-    trials: Trials
+    conditions: Conditions
     keep: Keep
     planner_limit_s: float = 0.0
     shard: Share | None = None
@@ -152,7 +152,7 @@ def run_suite(
             say(line)
         work = Work(
             suite=suite.to_dict(),
-            trials=checked.trials,
+            conditions=checked.conditions,
             dropped=checked.dropped,
             warnings=checked.warnings,
             hypotheses=checked.hypotheses,
@@ -176,8 +176,8 @@ def run_work(
     with reached as cluster:
         if overwrite:
             _drop(folder)
-        about, trials = _begin(work, folder, say)
-        every = units(trials, work.keep)
+        about, conditions = _begin(work, folder, say)
+        every = units(conditions, work.keep)
         own = [unit for unit in every if work.shard is None or unit.share(work.shard.of) == work.shard]
         known = [(unit, about_unit(folder, unit, about["run_id"])) for unit in own]
         # With what it has kept, so that a run is never the poorer for being asked for more.
@@ -203,13 +203,13 @@ def run_work(
             done += 1
             yield done, len(own)
     _check_unchanged(folder)
-    _measure_latencies(folder, {unit.trial.id for unit in own})
+    _measure_latencies(folder, {unit.condition.id for unit in own})
     if work.shard is None:
         align_steps(folder, every)
-        finish_run(folder, in_table_order(every, trials))
+        finish_run(folder, in_table_order(every, conditions))
         keep_ground(folder)
     else:
-        write_errors(folder, in_table_order(own, trials), about["run_id"])
+        write_errors(folder, in_table_order(own, conditions), about["run_id"])
 
 
 def run_unit(
@@ -234,7 +234,7 @@ def run_unit(
             rows = error_rows(unit, time_budgets(unit, run_id), str(error))
             write_unit(folder, unit, _grouped(rows, read_block(unit, run_id)), about)
             return
-        watched = unit.keep.watched(len(unit.instances))
+        watched = unit.keep.watched(len(unit.maps))
         recorder = Recorder(unit, problem, simulation, read_block(unit, run_id, place).terrain, watched)
         watch = recorder.watch if watched else None
         episodes, compiled = simulate(unit, problem, simulation, watch, recorder.every, planner_limit_s)
@@ -246,28 +246,28 @@ def run_unit(
     about |= {"traceback": episodes.traceback, "errors": sorted({e for e in episodes.errors if e})}
     block = read_block(unit, run_id, place)
     reference = block.places.reference_time_s.cpu().numpy()
-    redrawn = (simulation.attempts - 1).tolist()
-    rows = episode_rows(unit, problem, episodes, reference, redrawn, compiled)
+    rejected_draws = (simulation.attempts - 1).tolist()
+    rows = episode_rows(unit, problem, episodes, reference, rejected_draws, compiled)
     write_unit(folder, unit, _grouped(rows, block), about)
 
 
 def _grouped(rows: pd.DataFrame, block: Block) -> pd.DataFrame:
     """Rows of a unit with the groups of their maps."""
-    rows.insert(rows.columns.get_loc("instance") + 1, "group", block.groups)
+    rows.insert(rows.columns.get_loc("map") + 1, "group", block.groups)
     return rows
 
 
 def _measure_latencies(folder: Path, chosen: Collection[str]) -> None:
-    """Measures the planners of some trials alone and writes it into `run.json`, where it is not there yet."""
+    """Measures the planners of some conditions alone and writes it into `run.json`, where it is not there yet."""
     run = open_run(folder)
-    entries = run.about["trials"]
+    entries = run.about["conditions"]
     known = {i: entry["latency"] for i, entry in entries.items() if "latency" in entry}
-    trials = {i: entry for i, entry in run.trials.items() if i in chosen}
+    conditions = {i: entry for i, entry in run.conditions.items() if i in chosen}
     given = run.about["run_id"], run.about["planner_limit_s"], run.about["device"]
-    latencies = measure_latencies(trials, known, *given)
-    if latencies != {i: about for i, about in known.items() if i in trials}:
-        for trial_id, latency in latencies.items():
-            entries[trial_id]["latency"] = latency
+    latencies = measure_latencies(conditions, known, *given)
+    if latencies != {i: about for i, about in known.items() if i in conditions}:
+        for condition_id, latency in latencies.items():
+            entries[condition_id]["latency"] = latency
         write_run(folder, run.about)
 
 
@@ -314,16 +314,16 @@ def _drop(folder: Path) -> None:
                 os.replace(path, Path(dropped, path.name))
 
 
-def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
-    """Writes `run.json`, or extends the one that is there; gives what it holds and all trials."""
+def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Conditions]:
+    """Writes `run.json`, or extends the one that is there; gives what it holds and all conditions."""
     if not (folder / RUN).exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ConfigError(
                 f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
             )
-        about = _about({"run_id": secrets.token_hex(8)}, work, work.trials)
+        about = _about({"run_id": secrets.token_hex(8)}, work, work.conditions)
         write_run(folder, about)
-        return about, work.trials
+        return about, work.conditions
     earlier = open_run(folder)
     if earlier.shard != work.shard:
         raise ConfigError(
@@ -331,9 +331,9 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
             f"{_share(earlier.shard)}. Choose another `out`."
         )
     _check_hypotheses(work.hypotheses, earlier.about, folder)
-    check_labels(trial for trials in (earlier.trials, work.trials) for trial, _ in trials.values())
-    trials = _joined(earlier.trials, work.trials)
-    now = _about(earlier.about, work, trials)
+    check_labels(condition for known in (earlier, work) for condition, _ in known.conditions.values())
+    conditions = _joined(earlier.conditions, work.conditions)
+    now = _about(earlier.about, work, conditions)
     changed = provenance.differences(earlier.about, now)
     if changed:
         raise ConfigError(
@@ -341,15 +341,15 @@ def _begin(work: Work, folder: Path, say: Say) -> tuple[dict[str, Any], Trials]:
             f"changed: {'; '.join(changed)}. Choose another `out`{_or_its_device(earlier.about, now)}, or pass "
             "--overwrite."
         )
-    if trials != earlier.trials:
-        new = len(trials) - len(earlier.trials)
-        more = {0: "by more episodes", 1: "by 1 new trial"}.get(new, f"by {new} new trials")
+    if conditions != earlier.conditions:
+        new = len(conditions) - len(earlier.conditions)
+        more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
         say(f"{folder} is extended {more}")
         (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
         write_run(folder, now)
     elif now != {name: value for name, value in earlier.about.items() if name not in (SEAL, "tables")}:
         write_run(folder, {**now, "tables": earlier.about.get("tables", {})})
-    return now, trials
+    return now, conditions
 
 
 def _check_hypotheses(wanted: Mapping[str, Any], earlier: Mapping[str, Any], folder: Path) -> None:
@@ -372,12 +372,12 @@ def _share(shard: Share | None) -> str:
     return "a whole run" if shard is None else f"shard {shard} of one"
 
 
-def _joined(earlier: Trials, wanted: Trials) -> Trials:
-    """Every trial of both, each at the greater extent."""
+def _joined(earlier: Conditions, wanted: Conditions) -> Conditions:
+    """Every condition of both, each at the greater extent."""
     joined = dict(earlier)
-    for trial_id, (trial, extent) in wanted.items():
-        known = joined.get(trial_id)
-        joined[trial_id] = (trial, known[1].union(extent) if known else extent)
+    for condition_id, (condition, extent) in wanted.items():
+        known = joined.get(condition_id)
+        joined[condition_id] = (condition, known[1].union(extent) if known else extent)
     return joined
 
 
@@ -385,7 +385,7 @@ def _check_unchanged(folder: Path) -> None:
     """Refuses to make one table of rows of which some may be of other code than others."""
     run = open_run(folder)
     about = run.about
-    now = {**about, **provenance.describe(run.trials)}
+    now = {**about, **provenance.describe(run.conditions)}
     changed = provenance.differences(about, json.loads(json.dumps(now)))
     if changed:
         raise ConfigError(
@@ -394,15 +394,15 @@ def _check_unchanged(folder: Path) -> None:
         )
 
 
-def _about(earlier: Mapping[str, Any], work: Work, trials: Trials) -> dict[str, Any]:
+def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> dict[str, Any]:
     """What `run.json` is to hold, of which the folder may hold an earlier state; of a new run that is its id alone."""
-    known = earlier.get("trials", {})
+    known = earlier.get("conditions", {})
     entries = {
-        trial_id: {
-            **{"value": trial.value, "labels": trial.labels, **_notes(trial), **extent.to_dict()},
-            **{key: known[trial_id][key] for key in ("latency",) if key in known.get(trial_id, {})},
+        condition_id: {
+            **{"value": condition.value, "labels": condition.labels, **_notes(condition), **extent.to_dict()},
+            **{key: known[condition_id][key] for key in ("latency",) if key in known.get(condition_id, {})},
         }
-        for trial_id, (trial, extent) in trials.items()
+        for condition_id, (condition, extent) in conditions.items()
     }
     about = {
         "format": FORMAT,
@@ -411,13 +411,13 @@ def _about(earlier: Mapping[str, Any], work: Work, trials: Trials) -> dict[str, 
         **({"shard": work.shard.to_dict()} if work.shard else {}),
         "suite": dict(work.suite),
         **({"hypotheses": fixed} if (fixed := earlier.get("hypotheses", work.hypotheses)) else {}),
-        "trials": entries,
+        "conditions": entries,
         "dropped": provenance.join(earlier.get("dropped", ()), work.dropped),
         "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),
         "planner_limit_s": work.planner_limit_s,
         "device": work.device,
         "gpu": gpu_name(work.device),
-        **provenance.describe(trials),
+        **provenance.describe(conditions),
         "machine": provenance.describe_machine(),
         "commands": provenance.command_lines(earlier.get("commands", ())),
         "history": provenance.extend_history(earlier.get("history", ()), work.suite),
@@ -425,12 +425,12 @@ def _about(earlier: Mapping[str, Any], work: Work, trials: Trials) -> dict[str, 
     return json.loads(json.dumps(about))
 
 
-def _notes(trial: Trial) -> dict[str, Any]:
-    """What tables say of a trial's planner."""
-    planner = trial.make_planner()
-    task, remarks = trial.make_task(), getattr(planner, "remarks", None)
+def _notes(condition: Condition) -> dict[str, Any]:
+    """What tables say of a condition's planner."""
+    planner = condition.make_planner()
+    task, remarks = condition.make_task(), getattr(planner, "remarks", None)
     return {
         "follows": what_it_follows(planner, task),
         "remarks": list(remarks(task)) if remarks else [],
-        "changed": changed_options(trial.planner),
+        "changed": changed_options(condition.planner),
     }

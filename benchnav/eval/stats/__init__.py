@@ -1,1 +1,1 @@
-"""Statistics of trials."""
+"""Statistics of conditions."""

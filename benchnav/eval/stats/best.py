@@ -15,21 +15,21 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import sign_flips, standard_deviation, success_interval
 from benchnav.eval.stats.power import smallest_difference
 from benchnav.eval.stats.summary import units_of
-from benchnav.eval.trial import NOT_USED
 
-# Trials of a block met the same maps and the same luck, and were asked the same.
+# Conditions of a block met the same maps and the same noise, and were asked the same.
 BLOCK = ("data", "scenario", "world", "robot", "objective")
-# Models that are told the truth, the one that knows most first.
-TOLD = ("clairvoyant", "oracle", "ideal")
+# Privileged models, the one that knows most first.
+PRIVILEGED = ("clairvoyant", "oracle", "ideal")
 
-_LUCK = ["seed", "realisation", "instance"]
+_DRAW = ["seed", "realisation", "map"]
 _OF_BLOCK = ("best", "best_rivals", "best_episodes", "best_maps")
 _COLUMNS = [
-    "trial",
+    "condition",
     *_OF_BLOCK,
     "best_difference",
     "best_low",
@@ -41,36 +41,36 @@ _COLUMNS = [
 ]
 
 
-def told_the_truth(trials: Mapping[str, Any]) -> dict[str, str]:
-    """Which trials' models are told the truth.
+def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
+    """Which conditions' models are privileged: given part of the truth.
 
     Args:
-        trials: by id what `run.json` knows of them.
+        conditions: by id what `run.json` knows of them.
 
     Returns:
-        By id one of `TOLD`.
+        By id one of `PRIVILEGED`.
     """
     looking = {
-        trial: about["value"].get("model", {}).get("part")
-        for trial, about in trials.items()
+        condition: about["value"].get("model", {}).get("part")
+        for condition, about in conditions.items()
         if about["labels"].get("model") != NOT_USED
     }
-    return {trial: part for trial, part in looking.items() if part in TOLD}
+    return {condition: part for condition, part in looking.items() if part in PRIVILEGED}
 
 
 def competing(rows: pd.DataFrame) -> pd.Series:
-    """Tells which trials of a block compete for the best.
+    """Tells which conditions of a block compete for the best.
 
-    What is told the truth is a yardstick and no rival, unless nothing else is there that looks at a prediction.
+    A privileged model is a reference and no rival, unless nothing else is there that looks at a prediction.
 
     Args:
-        rows: of the summary, of one block, with `told` as of `against_best`.
+        rows: of the summary, of one block, with `privileged` as of `against_best`.
 
     Returns:
         Bool, by the index of `rows`.
     """
-    for out in (list(TOLD), list(TOLD)[:1]):
-        left = ~rows["told"].isin(out)
+    for out in (list(PRIVILEGED), list(PRIVILEGED)[:1]):
+        left = ~rows["privileged"].isin(out)
         if (left & (rows["model"] != NOT_USED)).any():
             return left
     return pd.Series(True, index=rows.index)
@@ -123,38 +123,44 @@ def against_best(
     Args:
         episodes: rows of episodes.
         summary: of them, from `summary.summarise`.
-        told: from `told_the_truth`; none where not given.
+        told: from `privileged_models`; none where not given.
 
     Returns:
-        A row a trial, in the order of the summary: `trial`; `told`, what is told the truth, of `TOLD`, empty
-        where nothing is; `best`, the trial that is the best of its block; `best_rivals`, how many others compete;
+        A row a condition, in the order of the summary: `condition`; `privileged`, of `PRIVILEGED`, empty
+        where nothing is; `best`, the condition that is the best of its block; `best_rivals`, how many others compete;
         `best_episodes`, of each of them in common, on `best_maps`, of which a group counts as one;
         `best_difference`, by how much the best's success rate is higher, with its 95 % interval `_low`, `_high`, of
         the pair alone; `best_p`, from `best_set_p`; `best_shown`, the minimum detectable difference with 80 % power;
         `best_alike`, true where it competes and is not significantly worse than the best; and `best_marked`, true
-        where it is alike and something in its block is worse. NaN where a trial does not compete, and for the best
+        where it is alike and something in its block is worse. NaN where a condition does not compete, and for the best
         itself.
     """
-    groups = dict(list(episodes.groupby("trial", sort=False)))
-    summary = summary.assign(told=summary["trial"].map(told or {}).fillna(""))
+    groups = dict(list(episodes.groupby("condition", sort=False)))
+    summary = summary.assign(privileged=summary["condition"].map(told or {}).fillna(""))
     found: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
-        compared = _compare({trial: groups[trial] for trial in rows.loc[competing(rows), "trial"]})
+        compared = _compare(
+            {condition: groups[condition] for condition in rows.loc[competing(rows), "condition"]}
+        )
         some_worse = not all(one["best_alike"] for one in compared.values())
         about = {name: value for name, value in next(iter(compared.values())).items() if name in _OF_BLOCK}
-        for trial in rows["trial"]:
-            one = compared.get(trial, about | {"best_alike": False})
-            found.append({"trial": trial, **one, "best_marked": one["best_alike"] and some_worse})
+        for condition in rows["condition"]:
+            one = compared.get(condition, about | {"best_alike": False})
+            found.append({"condition": condition, **one, "best_marked": one["best_alike"] and some_worse})
     table = pd.DataFrame(found).reindex(columns=_COLUMNS)
-    return summary[["trial", "told"]].merge(table, on="trial", how="left", validate="1:1")
+    return summary[["condition", "privileged"]].merge(table, on="condition", how="left", validate="1:1")
 
 
 def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
-    """By trial its columns of `against_best`."""
+    """By condition its columns of `against_best`."""
     common = _in_common(rivals)
     judged = common or rivals
     best, *others = sorted(
-        judged, key=lambda trial: (-judged[trial]["success"].mean(), judged[trial]["total_time_s"].mean())
+        judged,
+        key=lambda condition: (
+            -judged[condition]["success"].mean(),
+            judged[condition]["total_time_s"].mean(),
+        ),
     )
     episodes, maps = len(judged[best]), units_of(judged[best]).nunique()
     about = {
@@ -165,13 +171,13 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
         "best_alike": True,
     }
     if not common:  # nothing to compare
-        return {trial: about | ({"best_p": 1.0} if trial != best else {}) for trial in rivals}
-    wins = {trial: rows["success"].groupby(units_of(rows)).sum() for trial, rows in common.items()}
-    values = np.stack([wins[trial].to_numpy(dtype=float) for trial in (best, *others)], axis=1)
+        return {condition: about | ({"best_p": 1.0} if condition != best else {}) for condition in rivals}
+    wins = {condition: rows["success"].groupby(units_of(rows)).sum() for condition, rows in common.items()}
+    values = np.stack([wins[condition].to_numpy(dtype=float) for condition in (best, *others)], axis=1)
     draws = episodes / maps
     p, critical = best_set_p(values, sign_flips(maps))
     made = {best: about}
-    for place, trial in enumerate(others, start=1):
+    for place, condition in enumerate(others, start=1):
         gain = values[:, 0] - values[:, place]
         entry = about | {"best_p": p[place], "best_alike": bool(p[place] >= ALPHA)}
         entry["best_difference"] = gain.sum() / episodes
@@ -179,14 +185,14 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
             _, entry["best_low"], entry["best_high"] = map(float, success_interval(gain, draws))
             std = float(standard_deviation(gain, draws))
             entry["best_shown"] = smallest_difference(std, maps, 2 * norm.sf(critical))
-        made[trial] = entry
+        made[condition] = entry
     return made
 
 
-def _in_common(trials: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Episodes of trials under the draws that all of them met, in one order; none where there is no such draw."""
-    met = [set(rows[_LUCK].itertuples(index=False, name=None)) for rows in trials.values()]
-    common = pd.DataFrame(sorted(set.intersection(*met)), columns=_LUCK)
+def _in_common(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Episodes of conditions under the draws that all of them met, in one order; none where there is no such draw."""
+    met = [set(rows[_DRAW].itertuples(index=False, name=None)) for rows in conditions.values()]
+    common = pd.DataFrame(sorted(set.intersection(*met)), columns=_DRAW)
     if common.empty:
         return {}
-    return {trial: common.merge(rows, on=_LUCK) for trial, rows in trials.items()}
+    return {condition: common.merge(rows, on=_DRAW) for condition, rows in conditions.items()}

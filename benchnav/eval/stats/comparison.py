@@ -34,7 +34,7 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
         A row a pair: labels of the two, `one`, `other`; `n_maps`, `n_groups`, the statistical units, which are as many
         unless maps are grouped, and `n_episodes` of each condition; `success_one`, `success_other`;
         `success_difference` with its 95 % interval `_low`, `_high`, `success_p`
-        and, corrected, `success_p_holm`; `success_shown`, the smallest difference that so many maps show with a
+        and, corrected, `success_p_holm`; `success_detectable`, the smallest difference that so many maps show with a
         chance of 80 %, and `maps_needed` for `difference`, both at the level of the first step of Holm. The same of
         `time`, T_total in seconds, where a failure counts as T: `time_difference_s`, `time_low_s`, `time_high_s`. Where
         the two conditions of some pair have unlike T, whose difference would else be that of the penalty, all are in
@@ -110,7 +110,7 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
         **pair.shared,
         "one": pair.one,
         "other": pair.other,
-        "n_maps": rows["instance"].nunique(),
+        "n_maps": rows["map"].nunique(),
         "n_groups": len(gain),
         "n_episodes": len(rows),
         "success_one": one.mean(),
@@ -119,7 +119,7 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
         "success_low": float(low),
         "success_high": float(high),
         "success_p": sign_flip_p(gain),
-        "success_shown": smallest_difference(std, len(gain), alpha),
+        "success_detectable": smallest_difference(std, len(gain), alpha),
         "maps_needed": maps_needed(std, difference, alpha),
     }
 

@@ -6,7 +6,7 @@ Letters in shapes: N episodes; M maps; a leading `...` is any number of comparis
 """
 
 import numpy as np
-from scipy.stats import binom, t, wilcoxon
+from scipy.stats import binom, rankdata, t, wilcoxon
 
 LEAST_MAPS = 8  # for an interval of a time
 
@@ -40,16 +40,16 @@ def success_interval(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Difference of success rates, with the adjusted Wald interval for paired proportions.
 
-    To the maps two are added, on one of which one trial, on the other the other trial, arrived once more often.
+    To the maps two are added, on one of which one condition, on the other the other condition, arrived once more often.
     With one episode a map this is the interval of Bonett and Price, with the t quantile in place of the normal
-    one. Unlike a bootstrap it is no point where the two trials ended alike on every map. The difference itself
+    one. Unlike a bootstrap it is no point where the two conditions ended alike on every map. The difference itself
     is given as it was seen.
     Source: Bonett and Price (2012), "Adjusted Wald confidence interval for a difference of binomial proportions
     based on paired data".
 
     Args:
-        gain: successes of the one trial less those of the other by map, whole numbers, shape [..., M], M ≥ 2.
-        draws: episodes of a trial on each map, their mean where the numbers differ.
+        gain: successes of the one condition less those of the other by map, whole numbers, shape [..., M], M ≥ 2.
+        draws: episodes of a condition on each map, their mean where the numbers differ.
         confidence: coverage asked for.
 
     Returns:
@@ -78,7 +78,7 @@ def standard_deviation(gain: np.ndarray, draws: float) -> np.ndarray:
 
 
 def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
-    """p of no difference in success, if on each map either trial might have been the other.
+    """p of no difference in success, if on each map either condition might have been the other.
 
     The sign of each map's gain is flipped in all ways, and each way counted, however many maps there are: of
     n maps with the same size of gain the number of those kept positive is binomial, so that the sum over all maps
@@ -86,7 +86,7 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
     Source: Fisher (1935), "The Design of Experiments", 21.
 
     Args:
-        gain: successes of the one trial less those of the other by map, whole numbers, shape [M].
+        gain: successes of the one condition less those of the other by map, whole numbers, shape [M].
         direction: in which the one is thought to lie, `higher` or `lower`; two-sided when empty.
 
     Returns:
@@ -180,9 +180,18 @@ def _half_width(values: np.ndarray, freedom: np.ndarray | int, confidence: float
 
 
 def signed_rank_p(late: np.ndarray) -> float:
-    """Two-sided p of Wilcoxon's signed-rank test that neither trial takes longer; 1 where no map differs.
+    """Two-sided p of Wilcoxon's signed-rank test that neither condition takes longer; 1 where no map differs.
+
+    On few maps it is exact with ties too: the ranks' signs are flipped in all ways. SciPy's p is the same there, but
+    it calls a function for each way.
 
     Args:
         late: difference of time by map, shape [M].
     """
-    return float(wilcoxon(late).pvalue) if np.any(late) else 1.0
+    if len(late) > _ALL_FLIPPED:
+        return float(wilcoxon(late).pvalue) if np.any(late) else 1.0
+    differing = late[late != 0]
+    twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(
+        differing
+    )  # whole numbers, those of ties too
+    return sign_flip_p(twice_ranks.astype(np.int64))

@@ -26,7 +26,7 @@ from benchnav.eval.stats.difference import (
 )
 from benchnav.eval.stats.summary import time_budgets, units_of
 
-_DRAW = ["seed", "realisation", "instance"]
+_DRAW = ["seed", "realisation", "map"]
 # Confidence at which a p-value of a margin is looked for, but for what rounds to 0 and 1.
 _MOST = 1 - 1e-12
 
@@ -48,14 +48,14 @@ def test_hypotheses(
         `high_90`; `p`, after Holm's correction `p_holm`; and `supported`, true where `p_holm` is under 0.05. Under
         `difference.LEAST_MAPS` maps a difference of anything but success has no interval.
     """
-    rows = dict(list(episodes.groupby("trial", sort=False)))
+    rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []
     for plain in about["tests"]:
         fields = {name: value for name, value in plain.items() if name != "claim"}
         test = Hypothesis(**{**fields, "names": tuple(plain["names"])})
         one, other = (
-            rows[trial].assign(time_budget_s=time_budgets(rows[trial], worlds[trial]))
-            for trial in (test.one, test.other)
+            rows[condition].assign(time_budget_s=time_budgets(rows[condition], worlds[condition]))
+            for condition in (test.one, test.other)
         )
         made.append({**plain, **_test(test, _side_by_side(one, other, test.metric))})
     table = pd.DataFrame(made)

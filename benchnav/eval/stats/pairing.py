@@ -9,7 +9,7 @@ import pandas as pd
 
 from benchnav import registry
 from benchnav.errors import ConfigError
-from benchnav.eval.trial import LABELS, NOT_USED
+from benchnav.eval.condition import LABELS, NOT_USED
 
 # By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
 _KEYS: Mapping[str, tuple[str, ...]] = {
@@ -18,7 +18,7 @@ _KEYS: Mapping[str, tuple[str, ...]] = {
     "run": (),
 }
 COMPARED = tuple(_KEYS)
-DRAW = ["seed", "realisation", "instance"]
+DRAW = ["seed", "realisation", "map"]
 # Of an episode, what pairs hold of both sides, where the tables have it.
 _MEASURES = ("success", "total_time_s", "time_budget_s", "score", "traversability", "path_length_m")
 
@@ -30,7 +30,7 @@ class Compared:
     Args:
         labels: what tables call it, by column; `run` among them, `NOT_USED` where no two runs share a condition.
         value: all that bears on its rows, as `run.json` holds it.
-        maps: digests of its maps, in the order of instances.
+        maps: digests of its maps, in the order of maps.
         episodes: its rows, with T of each as `time_budget_s`.
         code: what code made the rows, by run: names of sources, versions and parts with what identifies them.
     """
@@ -50,7 +50,7 @@ class Pair:
         one: label of what is compared.
         other: and with what.
         shared: labels of the two; of a label that one of them does not use, the other's.
-        episodes: of both, paired by seed, realisation and instance, on all maps that both met: one's `success`,
+        episodes: of both, paired by seed, realisation and map, on all maps that both met: one's `success`,
             `total_time_s`, `time_budget_s` and other measures, the other's with `_other`; and `group`, the statistical
             unit, where the tables have it. Maps may have unequally many.
         left_out: episodes of either condition that the other does not have.
@@ -65,13 +65,13 @@ class Pair:
     members: tuple[Compared, ...] = ()
 
 
-def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> list[Pair]:
+def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") -> list[Pair]:
     """Pairs conditions whose values differ in one thing alone.
 
     What a condition does not use, such as the risk setting of a blind planner, is like any other.
 
     Args:
-        trials: conditions of one run or several, each once unless runs are compared with each other.
+        conditions: conditions of one run or several, each once unless runs are compared with each other.
         by: what differs, of `COMPARED`; see `by_what`.
         against: a label, which all others are compared with; all pairs when not given.
 
@@ -81,31 +81,33 @@ def find_pairs(trials: Sequence[Compared], by: str = "", against: str = "") -> l
     Raises:
         ConfigError: there is nothing to compare, or it cannot be paired.
     """
-    by = by_what(trials, by, against)
-    values = list(dict.fromkeys(trial.labels[by] for trial in trials if trial.labels[by] != NOT_USED))
+    by = by_what(conditions, by, against)
+    values = list(
+        dict.fromkeys(condition.labels[by] for condition in conditions if condition.labels[by] != NOT_USED)
+    )
     if against and against not in values:
         raise ConfigError(
             f"Expected `against` among {', '.join(values)}, got {against!r}.{registry.hint(against, values)}"
         )
     pairs = [
         _pair(*_ordered(a, b, by, against), by)
-        for a, b in combinations(trials, 2)
+        for a, b in combinations(conditions, 2)
         if _differ_in(a, b, by) and (not against or against in (a.labels[by], b.labels[by]))
     ]
     if not pairs:
         raise ConfigError(
-            f"Expected two trials or more that differ in their {by} and in nothing else, got {by} "
-            f"{', '.join(values) or NOT_USED}.{_others(trials, by)}"
+            f"Expected two conditions or more that differ in their {by} and in nothing else, got {by} "
+            f"{', '.join(values) or NOT_USED}.{_others(conditions, by)}"
         )
     families = list(dict.fromkeys(tuple(pair.shared.values()) for pair in pairs))
     return sorted(pairs, key=lambda pair: families.index(tuple(pair.shared.values())))
 
 
-def by_what(trials: Sequence[Compared], by: str = "", against: str = "") -> str:
+def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> str:
     """By what conditions are compared, of `COMPARED`.
 
     Args:
-        trials: the conditions.
+        conditions: the conditions.
         by: what was asked for. When empty: that in which `against` is found; `run` where runs share conditions; else
             `risk`.
         against: a label, or empty.
@@ -121,10 +123,10 @@ def by_what(trials: Sequence[Compared], by: str = "", against: str = "") -> str:
             )
         return by
     if not against:
-        return "run" if any(trial.labels["run"] != NOT_USED for trial in trials) else "risk"
-    found = [name for name in COMPARED if any(trial.labels[name] == against for trial in trials)]
+        return "run" if any(condition.labels["run"] != NOT_USED for condition in conditions) else "risk"
+    found = [name for name in COMPARED if any(condition.labels[name] == against for condition in conditions)]
     if not found:
-        known = sorted({trial.labels[name] for trial in trials for name in COMPARED} - {NOT_USED})
+        known = sorted({condition.labels[name] for condition in conditions for name in COMPARED} - {NOT_USED})
         raise ConfigError(
             f"Expected `against` among {', '.join(known)}, got {against!r}.{registry.hint(against, known)}"
         )
@@ -133,20 +135,20 @@ def by_what(trials: Sequence[Compared], by: str = "", against: str = "") -> str:
     return found[0]
 
 
-def check_one_value_each(trials: Iterable[Compared]) -> None:
+def check_one_value_each(conditions: Iterable[Compared]) -> None:
     """Refuses two values under one label, which no reader of a table could distinguish.
 
     Raises:
         ConfigError: there are such.
     """
     known: dict[tuple[str, str], tuple[dict[str, Any], Compared]] = {}
-    for trial in trials:
+    for condition in conditions:
         for name, keys in _KEYS.items():
-            value = {key: trial.value[key] for key in keys}
-            label = trial.labels[name]
-            earlier, first = known.setdefault((name, label), (value, trial))
+            value = {key: condition.value[key] for key in keys}
+            label = condition.labels[name]
+            earlier, first = known.setdefault((name, label), (value, condition))
             if earlier != value and label != NOT_USED:
-                runs = " and ".join(dict.fromkeys([*first.code, *trial.code]))
+                runs = " and ".join(dict.fromkeys([*first.code, *condition.code]))
                 raise ConfigError(
                     f"Expected one {name} under each label, got two that {runs} call {label!r}: "
                     f"{', '.join(differences(earlier, value))}. Leave one of the runs out, or run one again under "
@@ -163,16 +165,16 @@ def differences(one: Any, other: Any, name: str = "") -> list[str]:
     return [] if one == other else [f"{name} {one} and {other}"]
 
 
-def _others(trials: Sequence[Compared], by: str) -> str:
+def _others(conditions: Sequence[Compared], by: str) -> str:
     """Names the labels in which the conditions do differ, or what is unlike in their worlds."""
-    fields = {repr(field): field for trial in trials if (field := _field(trial))}
+    fields = {repr(field): field for condition in conditions if (field := _field(condition))}
     if by == "world" and len(fields) > 1:
         first, second, *_ = fields.values()
         return f" λ itself differs between their worlds: {', '.join(differences(first, second))}."
     several = {
         name: labels
         for name in COMPARED
-        if name != by and len(labels := {trial.labels[name] for trial in trials} - {NOT_USED}) > 1
+        if name != by and len(labels := {condition.labels[name] for condition in conditions} - {NOT_USED}) > 1
     }
     if not several:
         return ""
@@ -193,9 +195,9 @@ def _differ_in(one: Compared, other: Compared, by: str) -> bool:
     return alike and differ and by not in unused and _field(one) == _field(other)
 
 
-def _field(trial: Compared) -> dict[str, Any]:
+def _field(condition: Compared) -> dict[str, Any]:
     """What of a world decides which λ is drawn; time budgets do not, and what immobilises does where λ is frozen."""
-    world = trial.value["world"]
+    world = condition.value["world"]
     if world["noise"] != "frozen":
         return {"noise": world["noise"]}
     below = (world.get("immobile") or {}).get("below")
@@ -214,12 +216,12 @@ def _pair(one: Compared, other: Compared, by: str) -> Pair:
     both = one.episodes[columns].merge(other.episodes[columns], on=DRAW, suffixes=("", "_other"))
     if both.empty:
         raise ConfigError(
-            f"Expected trials with episodes in common, got {names} with {_draws(one)} and {_draws(other)}."
+            f"Expected conditions with episodes in common, got {names} with {_draws(one)} and {_draws(other)}."
         )
-    grouped = next((trial.episodes for trial in (one, other) if "group" in trial.episodes), None)
+    grouped = next((condition.episodes for condition in (one, other) if "group" in condition.episodes), None)
     if grouped is not None:
-        known = grouped.dropna(subset=["group"]).drop_duplicates("instance").set_index("instance")["group"]
-        both["group"] = both["instance"].map(known).fillna(both["instance"]).astype("int64")
+        known = grouped.dropna(subset=["group"]).drop_duplicates("map").set_index("map")["group"]
+        both["group"] = both["map"].map(known).fillna(both["map"]).astype("int64")
     shared = {
         name: other.labels[name] if one.labels[name] == NOT_USED else one.labels[name]
         for name in (*LABELS, "run")
@@ -243,12 +245,14 @@ def check_maps(one: Compared, other: Compared, names: str) -> None:
     """
     common = min(len(one.maps), len(other.maps))
     if list(one.maps[:common]) != list(other.maps[:common]):
-        raise ConfigError(f"Expected trials on the same maps, got {names}, whose maps have other digests.")
+        raise ConfigError(
+            f"Expected conditions on the same maps, got {names}, whose maps have other digests."
+        )
 
 
-def _draws(trial: Compared) -> str:
+def _draws(condition: Compared) -> str:
     def listed(values: Iterable[Any]) -> str:
         return ", ".join(str(value) for value in sorted(set(values)))
 
-    rows = trial.episodes
+    rows = condition.episodes
     return f"seeds {listed(rows['seed'])}, realisations {listed(rows['realisation'])}"

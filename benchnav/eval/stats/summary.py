@@ -1,4 +1,4 @@
-"""Summaries of trials: success with its interval, and means with how many episodes each is made of.
+"""Summaries of conditions: success with its interval, and means with how many episodes each is made of.
 
 The map is the unit, or the group of maps where a dataset has groups. Episodes on one map, under other seeds or
 realisations, have much in common, so that a hundred of them on twenty maps tell less than a hundred maps would. The
@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
+from benchnav.eval.condition import LABELS
 from benchnav.eval.stats.difference import by_map, total_time_interval
-from benchnav.eval.trial import LABELS
 from benchnav.planning.world.outcome import FAILURES
 
 # Of each column its name in the summary, which the statistic parts, and its unit.
@@ -34,7 +34,7 @@ def wilson_interval(rate: float, n: float, confidence: float = 0.95) -> tuple[fl
 
     Args:
         rate: share of successes, in [0, 1].
-        n: number of independent trials, > 0; an effective number need not be whole.
+        n: number of independent conditions, > 0; an effective number need not be whole.
         confidence: coverage asked for.
 
     Returns:
@@ -55,7 +55,7 @@ def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     all, or there is but one map, ρ cannot be seen; it is then 1, so that a map counts as one episode. Since ρ
     is an estimate, a 95 % interval made with it holds 93 % of the time on 20 maps and 95 % on 60 (simulated,
     five episodes a map).
-    Source: Donner and Klar (2000), "Design and Analysis of Cluster Randomization Trials", 1.2 and 6.2.1;
+    Source: Donner and Klar (2000), "Design and Analysis of Cluster Randomization Conditions", 1.2 and 6.2.1;
     Ridout, Demétrio and Firth (1999) for the estimator on binary data.
 
     Args:
@@ -105,7 +105,7 @@ def units_of(episodes: pd.DataFrame) -> pd.Series:
     Args:
         episodes: rows of one dataset's split.
     """
-    return episodes["group" if "group" in episodes else "instance"]
+    return episodes["group" if "group" in episodes else "map"]
 
 
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
@@ -152,24 +152,24 @@ def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[f
 
 
 def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Summarises each trial, in the order in which trials first appear.
+    """Summarises each condition, in the order in which conditions first appear.
 
     Args:
         episodes: rows of episodes, format version 2 or later.
-        worlds: by trial what λ did, as `run.json` holds it.
+        worlds: by condition what λ did, as `run.json` holds it.
 
     Returns:
-        A row a trial: `trial` and its labels; `n_episodes`, `n_maps`, and `n_groups`, which is the number of maps
-        where the dataset has no groups; `success_rate` with Wilson's interval `success_low`, `success_high` on the
+        A row a condition: `condition` and its labels; `n_episodes`, `n_maps`, and `n_groups`, which is the number of
+        maps where the dataset has no groups; `success_rate` with Wilson's interval `success_low`, `success_high` on the
         number of episodes over `cautious_design_effect`. Of each quantity
         `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
-        counted as T; time of the successes alone; λ met; time over the reference time; score; path length;
+        counted as T; time of the successes alone; observed λ; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
         from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`, which
         runs of earlier versions do not have; `compiled_share`; and `OUTCOME_count` of each failure.
     """
-    groups = episodes.groupby("trial", sort=False)
-    return pd.DataFrame([_summarise_trial(group, worlds[str(trial)]) for trial, group in groups])
+    groups = episodes.groupby("condition", sort=False)
+    return pd.DataFrame([_summarise_condition(group, worlds[str(condition)]) for condition, group in groups])
 
 
 def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray, weighted: float) -> float:
@@ -186,12 +186,12 @@ def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray,
     return min(max((between - within) / (between + (typical - 1) * within), 0.0), 1.0)
 
 
-def _summarise_trial(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:
+def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:
     success, member = group["success"].to_numpy(dtype=bool), units_of(group).to_numpy()
     effect = cautious_design_effect(success, member)
     rate, low, high = success_mean(group)
-    row: dict[str, object] = {name: group[name].iloc[0] for name in ("trial", *LABELS)}
-    row |= {"n_episodes": len(group), "n_maps": group["instance"].nunique()}
+    row: dict[str, object] = {name: group[name].iloc[0] for name in ("condition", *LABELS)}
+    row |= {"n_episodes": len(group), "n_maps": group["map"].nunique()}
     row["n_groups"] = len(np.unique(member))
     row |= {"success_rate": rate, "success_low": low, "success_high": high, "design_effect": effect}
     columns = group.assign(success_time_s=group["total_time_s"].where(success))

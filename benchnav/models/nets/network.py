@@ -17,7 +17,7 @@ from benchnav.models.config import DEEPEST, ClassifierConfig
 from benchnav.options import hint, one_line
 
 _DETAIL_CHANNELS = 32
-_TRIAL_SIDE = 64
+_CONDITION_SIDE = 64
 
 
 class WithFullResolution(nn.Module):
@@ -136,9 +136,9 @@ def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:
     Raises:
         ValueError: at this depth the network's answer is not of the image's size.
     """
-    answer = network.eval()(torch.zeros(1, 3, _TRIAL_SIDE, _TRIAL_SIDE))
-    if answer.shape[-1] != _TRIAL_SIDE:
-        raise ValueError(f"it answers {_TRIAL_SIDE} cells with {answer.shape[-1]}.")
+    answer = network.eval()(torch.zeros(1, 3, _CONDITION_SIDE, _CONDITION_SIDE))
+    if answer.shape[-1] != _CONDITION_SIDE:
+        raise ValueError(f"it answers {_CONDITION_SIDE} cells with {answer.shape[-1]}.")
     answer.sum().backward()
     for part in list(encoder.modules()):
         for name, inner in list(part.named_children()):

@@ -210,15 +210,15 @@ def _without_truth(model: "AnyModel", dataset: "TerrainDataset", splits: "Sequen
 
 def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
     """Says which figures do not apply, and why."""
-    from benchnav.models.quality.ladders import find_ladders
+    from benchnav.models.quality.series import find_series
 
     lines = []
     if not all(quality.classes for quality in qualities.values()):
         lines.append("no confusion matrix, reliability diagram or entropy: the model predicts no classes")
     if _slope_table(model) is None:
         lines.append("no latent functions: the model has no Gaussian processes over slope")
-    if not find_ladders(qualities):
-        lines.append("no ladder of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
+    if not find_series(qualities):
+        lines.append("no series of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
     return lines
 
 
@@ -254,7 +254,7 @@ def _figures(
     from functools import partial
 
     from benchnav.models.quality import figures, map_sheet
-    from benchnav.models.quality.ladders import find_ladders
+    from benchnav.models.quality.series import find_series
     from benchnav.models.quality.words import sheet_name
 
     by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
@@ -264,8 +264,8 @@ def _figures(
         yield "confusion", partial(figures.confusion_figure, by_class, [item.name for item in classes])
         yield "reliability", partial(figures.reliability_figure, by_class)
     yield "pit", partial(figures.pit_figure, by_cell)
-    if ladders := find_ladders(qualities):
-        yield "ladder", partial(figures.ladder_figure, ladders, qualities)
+    if all_series := find_series(qualities):
+        yield "severity", partial(figures.severity_figure, all_series, qualities)
     if table is not None and by_class:
         cells = [
             [sum(counts) for counts in zip(*rows, strict=True)]

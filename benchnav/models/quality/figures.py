@@ -1,7 +1,7 @@
 """Figures of a model's quality: where it errs, and whether its probabilities can be trusted.
 
 Sizes are in inches and points as printed over the two columns of a page. Colours are those of Okabe
-and Ito (2008) and of maps even in lightness, told apart by every kind of colour vision; lines differ in
+and Ito (2008) and of maps even in lightness, distinct to every kind of colour vision; lines differ in
 marker or dash too. A figure has a panel a split, in the order given. Letters in shapes: C classes, G
 nodes.
 """
@@ -40,13 +40,13 @@ _NO_SOFT = (0.0, 0.0, 1.0)  # weight, mean and standard deviation of no second m
 _NEAR = 0.01  # to the ideal; finer differences fill no panel
 
 # Title, the quantity of ClassQuality or TraversabilityQuality, and its ideal where that is not an end.
-_CLASS_LADDER: tuple[tuple[str, str, float | None], ...] = (
+_CLASS_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
     ("Accuracy", "accuracy", None),
     ("Calibration error (ECE)", "ece", None),
     ("Mean entropy [nats]", "entropy", None),
     ("AUROC of uncertainty", "entropy_auroc", None),
 )
-_LATENT_LADDER: tuple[tuple[str, str, float | None], ...] = (
+_LATENT_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
     ("RMSE of E[λ]", "rmse_expected", None),
     ("CRPS of λ", "crps", None),
     ("In the 90 % interval", "coverage", 0.9),
@@ -216,31 +216,31 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     return figure
 
 
-def ladder_figure(
-    ladders: Mapping[str, Sequence[tuple[float, str]]], qualities: Mapping[str, Quality]
+def severity_figure(
+    all_series: Mapping[str, Sequence[tuple[float, str]]], qualities: Mapping[str, Quality]
 ) -> Figure:
     """Draws quality against the severity of a shift, a line a scenario.
 
     Args:
-        ladders: by scenario, its rungs as (severity, split), ascending.
+        all_series: by scenario, its pairs as (severity, split), ascending.
         qualities: of all these splits.
     """
-    rungs = [split for ladder in ladders.values() for _, split in ladder]
-    kinds = [_CLASS_LADDER] * all(bool(qualities[split].classes) for split in rungs) + [_LATENT_LADDER]
-    ensemble = not any(np.isnan(_quantity(qualities[split], "mutual_information")) for split in rungs)
+    pairs = [split for series in all_series.values() for _, split in series]
+    kinds = [_CLASS_SEVERITY] * all(bool(qualities[split].classes) for split in pairs) + [_LATENT_SEVERITY]
+    ensemble = not any(np.isnan(_quantity(qualities[split], "mutual_information")) for split in pairs)
 
-    def values(ladder: Sequence[tuple[float, str]], name: str) -> list[float]:
-        return [_quantity(qualities[split], name) for _, split in ladder]
+    def values(series: Sequence[tuple[float, str]], name: str) -> list[float]:
+        return [_quantity(qualities[split], name) for _, split in series]
 
     figure = _figure(1, len(kinds), 1.65, 0.45)
     panels = figure.subplots(len(kinds), 4, squeeze=False, sharex=True)
     for panel, (title, name, ideal) in zip(panels.flat, [one for kind in kinds for one in kind], strict=True):
-        for place, ladder in enumerate(ladders.values()):
-            severities = [severity for severity, _ in ladder]
+        for place, series in enumerate(all_series.values()):
+            severities = [severity for severity, _ in series]
             style = {"color": _COLOURS[place % len(_COLOURS)], "marker": _MARKERS[place % len(_MARKERS)]}
-            panel.plot(severities, values(ladder, name), ms=3, lw=1, **style)
+            panel.plot(severities, values(series, name), ms=3, lw=1, **style)
             if name == "entropy_auroc" and ensemble:
-                others = values(ladder, "mutual_information_auroc")
+                others = values(series, "mutual_information_auroc")
                 panel.plot(severities, others, ms=3, lw=1, ls=":", mfc="white", **style)
         panel.set_title(title, size=TITLE)
         panel.margins(x=0.05, y=0.12)
@@ -262,7 +262,7 @@ def ladder_figure(
             lw=1,
             label=name,
         )
-        for i, name in enumerate(ladders)
+        for i, name in enumerate(all_series)
     ]
     lines.append(Line2D([], [], color="0.4", lw=0.8, ls="--", label="calibrated"))
     if ensemble:

@@ -20,7 +20,7 @@ from torchmetrics.classification import (
 
 from benchnav import rng
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.classes import twins
+from benchnav.datagen.recipe.classes import look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.device import CPU, exact_convolutions
 from benchnav.errors import CheckpointError, DatasetError
@@ -29,6 +29,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import MeanIoU
 from benchnav.models.predictor import PRIVILEGED, AnyModel, ClassModel, EnsembleModel, predict
 from benchnav.models.probabilities import class_probabilities
+from benchnav.models.quality.look_alikes import LookAlikeQuality, LookAlikeTally
 from benchnav.models.quality.scores import (
     LEVEL,
     PIT_BINS,
@@ -41,7 +42,6 @@ from benchnav.models.quality.scores import (
     pit_counts,
     tail_rate,
 )
-from benchnav.models.quality.twins import TwinQuality, TwinTally
 from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
 from benchnav.terrain import Terrain
 
@@ -81,7 +81,7 @@ class ClassQuality:
         confusion: cells by true class (row) and most likely class (column), [C][C].
         reliability: the curve that the ECE sums up.
         slope_cells: cells by true class and whole degree of slope, [C][90].
-        twins: with classes that look alike merged; None where no two do.
+        look_alikes: with classes that look alike merged; None where no two do.
     """
 
     accuracy: float
@@ -96,7 +96,7 @@ class ClassQuality:
     confusion: tuple[tuple[int, ...], ...]
     reliability: Reliability
     slope_cells: tuple[tuple[int, ...], ...]
-    twins: TwinQuality | None = None
+    look_alikes: LookAlikeQuality | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +189,7 @@ def evaluate(
         DatasetError: there is no such split, or no test split.
         CheckpointError: the model was trained on another class table.
     """
-    alike = twins(dataset.recipe.classes)
+    alike = look_alike_classes(dataset.recipe.classes)
     for split in choose_splits(model, dataset, splits):
         truth = dataset.truth_of(split) == "generated"
         generator = rng.generator(rng.stream_key(seed, "models", "pit", split))
@@ -287,7 +287,7 @@ class _ClassTally:
         self.entropy = _Uncertainty(device)
         self.information = _Uncertainty(device) if several else None
         self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
-        self.twins = TwinTally(alike, device) if any(len(own) > 1 for own in alike) else None
+        self.look_alikes = LookAlikeTally(alike, device) if any(len(own) > 1 for own in alike) else None
 
     def add(self, probabilities: Tensor, members: Tensor, class_id: Tensor, slope_deg: Tensor) -> None:
         """Adds maps: probabilities [B, C, H, W], of members [M, B, C, H, W], true classes and slopes [B, H, W]."""
@@ -309,8 +309,8 @@ class _ClassTally:
         degree = slope_deg.floor().long().clamp(0, 89)
         counted = torch.bincount((90 * class_id + degree).flatten(), minlength=self.slope_cells.numel())
         self.slope_cells += counted.view_as(self.slope_cells)
-        if self.twins is not None:
-            self.twins.add(probabilities, class_id)
+        if self.look_alikes is not None:
+            self.look_alikes.add(probabilities, class_id)
 
     def quality(self) -> ClassQuality:
         by_class, curve = self.by_class.compute(), self.reliability.compute().cpu()
@@ -331,7 +331,7 @@ class _ClassTally:
                 accuracy=tuple(curve[2].tolist()),
             ),
             slope_cells=tuple(tuple(row) for row in self.slope_cells.tolist()),
-            twins=None if self.twins is None else self.twins.quality(),
+            look_alikes=None if self.look_alikes is None else self.look_alikes.quality(),
         )
 
 

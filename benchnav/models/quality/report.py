@@ -11,8 +11,8 @@ from typing import Any
 
 from rich.table import Table
 
-from benchnav.models.quality.ladders import find_ladders
 from benchnav.models.quality.measure import Quality
+from benchnav.models.quality.series import find_series
 from benchnav.models.quality.words import COLUMNS, caption
 
 # Headings of the numbers of ClassQuality and TraversabilityQuality, in two lines.
@@ -20,10 +20,10 @@ HEADINGS = {
     "accuracy": "accuracy\n",
     "miou": "mIoU\n",
     "miou_predicted": "mIoU\n∪ pred.",
-    "twin_accuracy": "accuracy\ntwins=1",
-    "twin_miou": "mIoU\ntwins=1",
-    "twin_share_error": "twins\noff ½",
-    "twin_share_ece": "ECE\ntwins",
+    "look_alike_accuracy": "accuracy\nlook-alikes=1",
+    "look_alike_miou": "mIoU\nlook-alikes=1",
+    "look_alike_share_error": "look-alikes\noff ½",
+    "look_alike_share_ece": "ECE\nlook-alikes",
     "ece": "ECE\n",
     "brier": "Brier\n",
     "entropy": "entropy\n[nats]",
@@ -37,13 +37,14 @@ HEADINGS = {
     "coverage": "in 90 %\n(0.9)",
     "tail_rate": "< VaR\n(0.1)",
 }
-TWINS = ("twin_accuracy", "twin_miou", "twin_share_error", "twin_share_ece")  # where classes look alike
+# Where classes look alike.
+LOOK_ALIKES = ("look_alike_accuracy", "look_alike_miou", "look_alike_share_error", "look_alike_share_ece")
 _FILES_ONLY = (
     "miou_predicted",
     "entropy",
     "mutual_information",
-    "twin_miou",
-    "twin_share_error",
+    "look_alike_miou",
+    "look_alike_share_error",
 )  # for which the terminal is too narrow
 
 
@@ -80,28 +81,30 @@ def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> 
         }
         for split, quality in qualities.items()
     }
-    ladders = {
-        scenario: [{"severity": severity, "split": split} for severity, split in rungs]
-        for scenario, rungs in find_ladders(qualities).items()
+    all_series = {
+        scenario: [{"severity": severity, "split": split} for severity, split in pairs]
+        for scenario, pairs in find_series(qualities).items()
     }
-    return json.dumps(_finite({**about, "splits": splits, "ladders": ladders}), indent=1) + "\n"
+    return json.dumps(_finite({**about, "splits": splits, "series": all_series}), indent=1) + "\n"
 
 
 def quality_csv(qualities: Mapping[str, Quality]) -> str:
-    """Writes the numbers as CSV, a row a split, with scenario and severity where it is of a ladder.
+    """Writes the numbers as CSV, a row a split, with scenario and severity where it is of a series.
 
-    `std` stands at severity 0 with no scenario, as it begins every ladder.
+    `std` stands at severity 0 with no scenario, as it begins every series.
     """
-    rungs: dict[str, tuple[str, float]] = {}
-    for scenario, ladder in find_ladders(qualities).items():
-        for severity, split in ladder:
-            rungs[split] = (scenario if severity else "", severity)
+    pairs: dict[str, tuple[str, float]] = {}
+    for scenario, series in find_series(qualities).items():
+        for severity, split in series:
+            pairs[split] = (scenario if severity else "", severity)
     text = io.StringIO()
-    columns = [name for name in HEADINGS if name not in TWINS or any(map(_has_twins, qualities.values()))]
+    columns = [
+        name for name in HEADINGS if name not in LOOK_ALIKES or any(map(_has_look_alikes, qualities.values()))
+    ]
     writer = csv.DictWriter(text, ["split", "scenario", "severity", "maps", *columns], lineterminator="\n")
     writer.writeheader()
     for split, quality in qualities.items():
-        scenario, severity = rungs.get(split, ("", math.nan))
+        scenario, severity = pairs.get(split, ("", math.nan))
         row = {name: f"{value:.6g}" for name, value in numbers(quality).items() if math.isfinite(value)}
         place = {"scenario": scenario, "severity": "" if math.isnan(severity) else f"{severity:g}"}
         writer.writerow({"split": split, "maps": quality.maps} | place | row)
@@ -146,12 +149,12 @@ def _class_numbers(quality: Quality) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for item in quality.classes:
         found |= asdict(item)
-        found |= found.pop("twins") or {}
+        found |= found.pop("look_alikes") or {}
     return found
 
 
-def _has_twins(quality: Quality) -> bool:
-    return any(item.twins is not None for item in quality.classes)
+def _has_look_alikes(quality: Quality) -> bool:
+    return any(item.look_alikes is not None for item in quality.classes)
 
 
 def _shown(rows: Mapping[str, Mapping[str, float]]) -> list[str]:

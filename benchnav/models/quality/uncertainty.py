@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-_DROPPED_BITS = 13  # of a float32's 23 fraction bits: scores that differ by over 0.1 % are told apart
+_DROPPED_BITS = 13  # of a float32's 23 fraction bits: scores that differ by over 0.1 % are distinct
 _PLACES = 2 ** (31 - _DROPPED_BITS)
 
 

@@ -9,11 +9,13 @@ COLUMNS = {
     "either, in the mean over the classes that occur in truth; 1 is perfect.",
     "miou_predicted": "the same in the mean over the classes that are true or predicted somewhere; one that never "
     "occurs counts as 0 as soon as a cell is taken for it.",
-    "twin_accuracy": "accuracy with classes of one colour counted as one, as no image tells them apart; 1 is perfect.",
-    "twin_miou": "mean intersection over union with classes of one colour counted as one; 1 is perfect.",
-    "twin_share_error": "of two classes that share a colour, how far the share of the true one is from ½, which is all "
-    "that can be said; 0 is perfect.",
-    "twin_share_ece": "of two classes that share a colour, the calibration error of the larger share; 0 is perfect.",
+    "look_alike_accuracy": "accuracy with classes of one colour counted as one, as no image tells them apart; 1 is "
+    "perfect.",
+    "look_alike_miou": "mean intersection over union with classes of one colour counted as one; 1 is perfect.",
+    "look_alike_share_error": "of two classes that share a colour, how far the share of the true one is from ½, which "
+    "is all that can be said; 0 is perfect.",
+    "look_alike_share_ece": "of two classes that share a colour, the calibration error of the larger share; 0 is "
+    "perfect.",
     "ece": "expected calibration error: how far the probability of the most likely class is from how often it is "
     "right, in the mean over cells; 0 is perfect.",
     "brier": "squared distance of the class probabilities to the truth, which is 1 for the true class and 0 for the "
@@ -57,7 +59,7 @@ _FIGURES = {
         "sure enough; high at the left, in orange, that bad ground comes more often than predicted. Each panel has a "
         "scale of its own.",
     ),
-    "ladder": (
+    "severity": (
         "Quality over the severity of a shift",
         "The numbers of the table over the severity of each scenario, from 0, the maps of training, to the scenario "
         "itself at 1.",

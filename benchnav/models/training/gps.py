@@ -98,8 +98,8 @@ def train_gps_on_logs(
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
         kept, held = hold_out(cells, _HELD_OUT, seed)
-        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options)
-        metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
+        condition = fit_gps(config, SlopeSums.of(kept, len(names)), options)
+        metrics["held_out_nll"] = cell_nll(held, condition.tabulate())
         say(
             f"gp: NLL of {len(held)} rows held out, which follow one another in each class, "
             f"{metrics['held_out_nll']:.4f}; now with all rows"

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
@@ -174,7 +174,7 @@ class MPPI:
             plan = _drawn(problem, step.state, updated, mean, noise, weights)
         return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
 
-    def took(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
+    def commit_action(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
         """Plans on as before; see `LocalPlanner`."""
         return plan_state
 
@@ -198,7 +198,7 @@ def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
 
 
 def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor) -> Tensor:
-    """Sums J and the price of ground that is not free along sampled action sequences.
+    """Sums J and the penalty of ground that is not free along sampled action sequences.
 
     Args:
         problem: B problems.
@@ -235,7 +235,7 @@ def roll_out(
         states, cost = advance(
             states, cost, mean[:, chunk].contiguous(), noise[chunk], *problem.action_bounds,
             problem.padded_ground, target, problem.grid, problem.robot, problem.objective,
-            problem.task.rules.slowest,
+            problem.task.rules.min_traversability,
         )  # fmt: skip
     return states, cost
 
@@ -261,14 +261,14 @@ def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
 
 def advance_chunk(
     states: Tensor, cost: Tensor, mean: Tensor, noise: Tensor, low: Tensor, high: Tensor,
-    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective, slowest: float,
+    padded_ground: Tensor, target: Tensor, grid: Grid, robot: Robot, objective: Objective, min_traversability: float,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Rolls samples out over a chunk of the horizon, adding up their costs; takes a problem in its parts."""
     for step in range(mean.shape[1]):
         action = _perturb(mean[:, step, :, None], noise[step], low, high).movedim(1, 2)
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, action, ground, target)
-        states = robot(states, action, motion_traversability(ground, slowest))
+        states = robot(states, action, motion_traversability(ground, min_traversability))
     return component_wise(states), cost
 
 
@@ -292,9 +292,9 @@ def weigh(
 def cost_spread(cost: Tensor) -> Tensor:
     """How far the costs of samples lie above the least, on average: the unit of the relative temperature.
 
-    Samples that pay the price of ground that is not free for more steps than the best does are left out: else the
-    temperature near such ground would be that of the price, and all ways over free ground would count alike. They
-    are told by an excess of half the price, so J itself should spread less, as the price of such ground asks too.
+    Samples that pay the penalty of ground that is not free for more steps than the best does are left out: else the
+    temperature near such ground would be that of the penalty, and all ways over free ground would count alike. They
+    are told by an excess of half the penalty, so J itself should spread less, as the penalty of such ground asks too.
 
     Args:
         cost: shape [B, K].
@@ -303,7 +303,7 @@ def cost_spread(cost: Tensor) -> Tensor:
         More than 0, shape [B, 1].
     """
     excess = cost - cost.amin(dim=1, keepdim=True)
-    counted = excess < 0.5 * PRICE
+    counted = excess < 0.5 * PENALTY
     spread = torch.where(counted, excess, 0).sum(dim=1, keepdim=True) / counted.sum(dim=1, keepdim=True)
     return spread.clamp(min=_LEAST_SPREAD)
 

@@ -31,13 +31,13 @@ class Step:
 
     Args:
         state: where the robots are, shape [B, S].
-        felt: the λ that each met in the last step, NaN at first, shape [B].
+        traversability: the λ that each met in the last step, NaN at first, shape [B].
         time_s: time since the episodes began.
         draw: what is planned will be drawn; a planner may leave the layers of its `Plan` out otherwise.
     """
 
     state: Tensor
-    felt: Tensor
+    traversability: Tensor
     time_s: float
     draw: bool = False
 
@@ -92,7 +92,7 @@ class Planner(Protocol[State]):
       it any robot is accepted.
     - `follows(task)`: a line on what it minimises, for tables, where that is not the task's J alone; empty where it
       is.
-    - `blind`: on the class, true where it looks at nothing predicted, so that one run stands for every
+    - `blind`: on the class, true where it is blind, so that one run stands for every
       model and risk setting.
     - `remarks(task)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
     - `compiled`: whether it runs compiled; None before its first plan.
@@ -116,7 +116,7 @@ class Planner(Protocol[State]):
         """Chooses the next action of every episode.
 
         Args:
-            step: where the robots are and what they felt.
+            step: where the robots are, and the λ that they observed.
             plan_state: from `init` or the previous call; not changed.
 
         Returns:

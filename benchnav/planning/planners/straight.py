@@ -1,6 +1,6 @@
 """Driving straight at the goal: the floor that a planner has to beat.
 
-`Straight` looks at nothing but the goal. Planners with a global path recover by the same control law.
+`Straight` is blind: it uses the goal alone. Planners with a global path recover by the same control law.
 Letters in shapes: B episodes, S state and A action dimensions.
 """
 

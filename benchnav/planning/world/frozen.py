@@ -1,7 +1,7 @@
 """Frozen λ: drawn once an episode as a correlated field, each cell with its own distribution.
 
 A field of correlated standard normals goes through each cell's quantile function (`benchnav.copula`). Where
-ground can hold a robot for good, a field that cuts the start off from the goal is drawn again: what is asked
+ground can immobilise a robot, a field that cuts the start off from the goal is drawn again: what is asked
 is which way to take, and there has to be one. Letters in shapes: B episodes, H×W cells.
 """
 
@@ -23,16 +23,16 @@ MOST_ATTEMPTS = 100
 
 
 def draw_frozen(
-    terrain: Terrain, world: World, places: Places, key: int, instances: Sequence[int]
+    terrain: Terrain, world: World, places: Places, key: int, maps: Sequence[int]
 ) -> tuple[Tensor, Tensor]:
     """Draws the λ of B episodes.
 
     Args:
         terrain: the true maps.
-        world: correlation length, and what holds a robot.
+        world: correlation length, and what immobilises a robot.
         places: starts and goals.
-        key: root of the luck.
-        instances: names each episode's stream under that root, B of them.
+        key: root key of the noise.
+        maps: names each episode's stream under that root, B of them.
 
     Returns:
         λ in [0, 1], shape [B, H, W]; and how many fields of each episode were drawn, int64, shape [B].
@@ -45,7 +45,7 @@ def draw_frozen(
     attempts = torch.zeros(len(terrain), dtype=torch.int64, device=field.device)
     pending = torch.arange(len(terrain), device=field.device)
     for attempt in range(MOST_ATTEMPTS):
-        normal = _normals(terrain, world, key, [instances[i] for i in pending.tolist()], attempt)
+        normal = _normals(terrain, world, key, [maps[i] for i in pending.tolist()], attempt)
         drawn = terrain.truth.select(pending).from_normal(normal.to(field))
         field = field.index_copy(0, pending, drawn)
         attempts = attempts.index_add(0, pending, torch.ones_like(pending))
@@ -56,8 +56,8 @@ def draw_frozen(
         if len(pending) == 0:
             return field, attempts
     raise ConfigError(
-        f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for instance "
-        f"{instances[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
+        f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
+        f"{maps[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
     )
 
 
@@ -75,12 +75,12 @@ def check_correlation(world: World, grid: Grid) -> None:
         )
 
 
-def _normals(terrain: Terrain, world: World, key: int, instances: Sequence[int], attempt: int) -> Tensor:
-    """Correlated standard normals, float64, shape [M, H, W]; a stream an instance and attempt."""
+def _normals(terrain: Terrain, world: World, key: int, maps: Sequence[int], attempt: int) -> Tensor:
+    """Correlated standard normals, float64, shape [M, H, W]; a stream a map and attempt."""
     grid, first = terrain.grid, np.zeros(1, dtype=np.int64)
     cells = world.correlation_m / grid.resolution_m
     fields = [
-        correlated_normal(rng.stream_key(key, int(instance), "field", attempt), first, grid.shape, cells)
-        for instance in instances
+        correlated_normal(rng.stream_key(key, int(map_index), "field", attempt), first, grid.shape, cells)
+        for map_index in maps
     ]
     return torch.from_numpy(np.concatenate(fields))

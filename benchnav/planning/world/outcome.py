@@ -24,7 +24,7 @@ class Outcome(IntEnum):
     STALLED = 6  # a timeout whose last 10 s did not drive and moved under 0.5 m: the planner held it
     PLANNER_ERROR = 7  # the planner raised, ran out of time, or returned what no robot can do
     MODEL_ERROR = 8  # the model or the risk measure raised, or gave no distribution
-    IMMOBILISED = 9  # on ground that holds a robot, for as long as the world allows
+    IMMOBILISED = 9  # on ground that immobilises a robot, for as long as the world allows
 
 
 FAILURES = tuple(o for o in Outcome if o not in (Outcome.RUNNING, Outcome.SUCCESS))

@@ -1,6 +1,6 @@
 """The λ that robots meet: a value for each episode, step and place.
 
-Luck is keyed by (root key, instance, step), or by (root key, instance) where λ stays what it is, so every
+Noise is keyed by (root key, map, step), or by (root key, map) where λ stays what it is, so every
 planner and setting meets the same, whatever the batch or the order. Letters in shapes: B episodes, N steps,
 H×W cells, K components.
 """
@@ -29,8 +29,8 @@ class Realisation:
         world: what λ does.
         places: starts and goals.
         steps: most steps N of the time budgets.
-        key: root of the luck; see `rng.stream_key`.
-        instances: names each episode's stream under that root, B of them.
+        key: root key of the noise; see `rng.stream_key`.
+        maps: names each episode's stream under that root, B of them.
 
     Attributes:
         field: the λ of every cell where it stays what it is, shape [B, H, W]; None where it is resampled.
@@ -44,9 +44,9 @@ class Realisation:
         places: Places,
         steps: int,
         key: int,
-        instances: Sequence[int],
+        maps: Sequence[int],
     ) -> None:
-        """Draws all luck.
+        """Draws all noise.
 
         Raises:
             ConfigError: λ of some cells is not known.
@@ -58,15 +58,15 @@ class Realisation:
         if world.noise == "stored":
             self.field = terrain.traversability.clone()
         elif world.noise == "frozen":
-            self.field, self.attempts = draw_frozen(terrain, world, places, key, instances)
+            self.field, self.attempts = draw_frozen(terrain, world, places, key, maps)
         if self.field is not None:
             self._ground = terrain.grid.pad(self.field, outside=0.0)[:, None]
             return
         self._ground = _padded_parameters(terrain.truth, terrain.grid)
-        # A stream each, so that another time budget leaves the luck of the first steps as it is.
+        # A stream each, so that another time budget leaves the noise of the first steps as it is.
         first = np.zeros(1, dtype=np.int64)
-        luck = [rng.normal(rng.stream_key(key, int(i)), first, (steps,)) for i in instances]
-        self._noise = torch.from_numpy(np.concatenate(luck)).to(self._ground)
+        noise = [rng.normal(rng.stream_key(key, int(i)), first, (steps,)) for i in maps]
+        self._noise = torch.from_numpy(np.concatenate(noise)).to(self._ground)
 
     def at(self, state: Tensor, step: Tensor) -> Tensor:
         """λ that robots meet at their next step.

@@ -27,7 +27,7 @@ class SimulationState:
         state: robot states, shape [B, S].
         outcome: `Outcome` of each, int64, shape [B].
         step: steps taken by each, int64, shape [B].
-        held: steps in a row, up to now, on ground that holds a robot, int64, shape [B].
+        held: steps in a row, up to now, on ground that immobilises a robot, int64, shape [B].
     """
 
     state: Tensor
@@ -49,8 +49,8 @@ class Simulation:
         task: robot, goal radius; the same that planners are given.
         world: what λ does.
         places: starts and goals.
-        luck_key: root of the luck; see `rng.stream_key`.
-        instances: names each episode's stream under that root, B of them.
+        noise_key: root key of the noise; see `rng.stream_key`.
+        maps: names each episode's stream under that root, B of them.
 
     Attributes:
         robot: F.
@@ -64,16 +64,16 @@ class Simulation:
         task: Task,
         world: World,
         places: Places,
-        luck_key: int,
-        instances: Sequence[int],
+        noise_key: int,
+        maps: Sequence[int],
     ) -> None:
-        """Draws all luck."""
+        """Draws all noise."""
         self.robot = task.robot
         self.time_budget_s = world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
         self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
         self._grid, self._goal_m, self._goal_radius_m = terrain.grid, places.goal_m, task.rules.goal_radius_m
         most = int(self.steps.max())
-        self._realisation = Realisation(terrain, world, places, most, luck_key, instances)
+        self._realisation = Realisation(terrain, world, places, most, noise_key, maps)
         self._immobile = world.immobile
         self._low = places.goal_m.new_tensor(task.robot.action_low)
         self._high = places.goal_m.new_tensor(task.robot.action_high)
@@ -84,8 +84,8 @@ class Simulation:
         return self._realisation.field
 
     @property
-    def holding(self) -> Tensor:
-        """Cells that hold a robot for good, bool, shape [B, H, W]; none where λ is resampled or nothing holds."""
+    def immobilising(self) -> Tensor:
+        """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is resampled or nothing holds."""
         if self.field is None or self._immobile is None:
             size = (len(self._goal_m), *self._grid.shape)
             return torch.zeros(size, dtype=torch.bool, device=self._goal_m.device)
@@ -135,7 +135,7 @@ class Simulation:
         return self.robot(now.state.clone(), action, torch.ones_like(now.state[:, 0]))
 
     def exchange_(self, members: Tensor, others: "Simulation") -> None:
-        """Gives some episodes the maps, goals and luck of another simulation, in place; the rest keep theirs.
+        """Gives some episodes the maps, goals and noise of another simulation, in place; the rest keep theirs.
 
         Args:
             members: indices of the episodes, int64, shape [M].

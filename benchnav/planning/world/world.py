@@ -15,10 +15,10 @@ NOISES = ("resampled", "stored", "frozen")
 
 @dataclass(frozen=True, kw_only=True)
 class Immobile:
-    """What holds a robot for good.
+    """What immobilises a robot.
 
     Args:
-        below: λ met under this holds a robot.
+        below: observed λ under this immobilises a robot.
         for_s: an episode ends when it was held for so long without a break, whatever was commanded.
     """
 
@@ -149,8 +149,8 @@ PRESETS: Mapping[str, Preset] = {
         rules=Rules(),
     ),
     "stakes": Preset(
-        purpose="λ stays what it is at a place, and soft ground holds a robot for good.",
+        purpose="λ stays what it is at a place, and soft ground immobilises a robot.",
         world=World(noise="frozen", immobile=Immobile(), time_budget_s=None, time_budget_ratio=3.0),
-        rules=Rules(free_space=FreeSpace(by="mean", above=0.1), slowest=0.05),
+        rules=Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05),
     ),
 }

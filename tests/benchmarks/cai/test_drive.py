@@ -65,7 +65,7 @@ def test_a_blocked_cell_holds_the_robot() -> None:
     assert arrival_s.isinf().tolist() == [True, False]
     last = held.seen[-1].state[0]
     assert (last[:2].floor() == 4).all()
-    assert float(held.seen[-1].felt[0]) == 0.0
+    assert float(held.seen[-1].traversability[0]) == 0.0
 
 
 def test_a_trial_that_has_ended_does_not_move_on() -> None:

@@ -34,7 +34,7 @@ def times(rows: pd.DataFrame, **chosen: object) -> list[float]:
     return rows.loc[kept, "time_s"].fillna(-1).tolist()
 
 
-def test_every_setting_and_density_meets_the_same_luck(rows: pd.DataFrame) -> None:
+def test_every_setting_and_density_meets_the_same_noise(rows: pd.DataFrame) -> None:
     alone = trials([0.4, 0.4], ["cvar:0.8"])
     assert times(alone) == 2 * times(rows, density=0.4, setting="cvar:0.8", realisation=0)
 
@@ -54,7 +54,7 @@ def test_realisations_settings_and_seeds_count(rows: pd.DataFrame) -> None:
     assert first != times(trials(DENSITIES, SETTINGS, seed=1))
 
 
-def test_luck_is_named_by_map_and_realisation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_is_named_by_map_and_realisation(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds, fields = [], []
 
     def record(planner: object, problem: Problem, traction: Tensor, generator: torch.Generator) -> Tensor:
@@ -76,7 +76,9 @@ def test_luck_is_named_by_map_and_realisation(monkeypatch: pytest.MonkeyPatch) -
     ]
 
 
-@pytest.mark.parametrize("change", [{"risk_map": "histogram"}, {"distance_power": 2}, {"slowest": 0.9}])
+@pytest.mark.parametrize(
+    "change", [{"risk_map": "histogram"}, {"distance_power": 2}, {"min_traversability": 0.9}]
+)
 def test_a_setup_is_heeded(rows: pd.DataFrame, change: dict) -> None:
     changed = trials(DENSITIES, SETTINGS, setup=Setup(mppi=QUICK.mppi, **change))
     assert times(changed) != times(rows, realisation=0)

@@ -41,8 +41,8 @@ def test_the_whole_map_is_free_and_nothing_else() -> None:
     assert not bool(problem.free_at(torch.tensor([[[-0.1, 4.0, 0.0]], [[4.0, 9.1, 0.0]]])).any())
 
 
-def test_slowest_bounds_what_motion_is_given() -> None:
-    problem = pose(VEGETATED, ["cvar:0.8"], Setup(slowest=0.3))
+def test_min_traversability_bounds_what_motion_is_given() -> None:
+    problem = pose(VEGETATED, ["cvar:0.8"], Setup(min_traversability=0.3))
     assert float(problem.traversability.min()) == pytest.approx(0.3)
     assert float(problem.risk_map.min()) < 0.05
     assert float(pose(VEGETATED, ["cvar:0.8"], Setup()).traversability.min()) < 0.05

@@ -414,7 +414,7 @@ def test_the_remedy_of_the_message_is_one(tmp_path: Path, case: str) -> None:
 # Recipes of synthesis 2
 
 
-def test_places_and_luck_are_drawn_on_real_ground_too(tmp_path: Path) -> None:
+def test_places_and_noise_are_drawn_on_real_ground_too(tmp_path: Path) -> None:
     places = PlacesRule(least_distance_m=6, margin_m=1)
     recipe = small_stakes(height=16, width=24, places=places)
     values = rough(32, 48).astype(np.float64) / 8

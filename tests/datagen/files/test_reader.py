@@ -83,16 +83,18 @@ def test_bad_requests_are_named(dataset_path: Path) -> None:
 
 
 def test_components_belong_to_the_class_whose_soft_spots_they_hold() -> None:
-    """The truth by class, and what looks alike by each twin: single-class settings choose among these."""
+    """The truth by class, and what looks alike by each look-alike: single-class settings choose among these."""
     recipe = small_stakes()
     terrain = terrain_of(generate(recipe, "train", np.arange(4)), recipe)
     assert terrain.truth.group == (0, 0)
     assert terrain.look_alikes is not None
     seen = terrain.look_alikes(terrain.class_id, terrain.slope_deg)
     assert seen.group == (0, 0, 1, 1)
-    twins = torch.tensor([len(own) for own in classes.twins(recipe.classes)])[terrain.class_id]
-    assert set(twins.unique().tolist()) == {1, 2}
-    for place, share in enumerate((1 / twins, 1 - 1 / twins)):
+    look_alikes = torch.tensor([len(own) for own in classes.look_alike_classes(recipe.classes)])[
+        terrain.class_id
+    ]
+    assert set(look_alikes.unique().tolist()) == {1, 2}
+    for place, share in enumerate((1 / look_alikes, 1 - 1 / look_alikes)):
         own = [k for k, group in enumerate(seen.group) if group == place]
         torch.testing.assert_close(seen.weights[:, own].sum(1), share)
 

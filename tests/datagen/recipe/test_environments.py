@@ -65,13 +65,13 @@ def test_single_classes_are_dealt_equally_and_few_environments_are_alike() -> No
     assert len({tuple(sorted(dealt)) for dealt in table.tolist()}) >= 8
 
 
-def test_the_environments_of_stakes_show_every_class_alike_and_twins_together() -> None:
+def test_the_environments_of_stakes_show_every_class_alike_and_look_alikes_together() -> None:
     names = [item.name for item in STAKES.classes]
     table = np.stack([STAKES.environment_classes(e) for e in range(STAKES.environments)])
     assert np.bincount(table.ravel()).tolist() == [4] * 12
     assert len({tuple(sorted(dealt)) for dealt in table.tolist()}) == 12
-    for twins in (("packed_soil", "crusted_soil"), ("firm_sand", "drift_sand")):
-        first, second = (names.index(name) for name in twins)
+    for look_alikes in (("packed_soil", "crusted_soil"), ("firm_sand", "drift_sand")):
+        first, second = (names.index(name) for name in look_alikes)
         assert ((table == first).any(axis=1) == (table == second).any(axis=1)).all()
 
 
@@ -82,14 +82,14 @@ def test_recipes_of_synthesis_1_deal_as_they_did() -> None:
     ]  # fmt: skip
 
 
-def test_each_of_two_twins_takes_each_band_of_the_noise_equally_often() -> None:
+def test_each_of_two_look_alikes_takes_each_band_of_the_noise_equally_often() -> None:
     recipe = small_stakes(height=16, width=16, places=None, start_m=(1, 1), goal_m=(7, 7))
     names = [item.name for item in recipe.classes]
     pair = [names.index("packed_soil"), names.index("crusted_soil")]
     shows = [e for e in range(12) if pair[0] in recipe.environment_classes(e)]
     indices = np.sort(np.concatenate([e + 12 * np.arange(500) for e in shows]))
     maps = class_map(recipe, "train", indices)
-    # The bands of 30 % are told apart from those of 20 % by how much of a map they cover.
+    # The bands of 30 % differ from those of 20 % by how much of a map they cover.
     wide = np.stack([(maps == member).mean(axis=(1, 2)) > 0.25 for member in pair], axis=1)
     for share, expected in ((wide.mean(axis=0), 0.5), ((wide[:, 0] & wide[:, 1]).mean(), 1 / 6)):
         np.testing.assert_allclose(share, expected, atol=4 * 0.5 / np.sqrt(len(indices)))
@@ -108,7 +108,7 @@ def test_tables_that_cannot_be_dealt_are_refused_by_name() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_twins_that_hardly_differ_are_refused_by_name() -> None:
+def test_look_alikes_that_hardly_differ_are_refused_by_name() -> None:
     def table(offset: float, **changes: object) -> tuple:
         return terrain_class("sand", 1, offset=0.2), terrain_class("dust", 1, offset=offset, **changes)
 

@@ -7,7 +7,7 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, twins
+from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.errors import ConfigError
 from benchnav.mixture import TraversabilityMixture
@@ -84,9 +84,9 @@ def test_soft_spots_that_are_no_distribution_are_refused(numbers: dict[str, floa
         SoftSpots(**{"weight": 0.1, "mean": 0.05, "std": 0.05} | numbers)
 
 
-def test_twins_are_classes_of_one_colour() -> None:
+def test_look_alikes_are_classes_of_one_colour() -> None:
     table = tuple(terrain_class(name, red) for name, red in zip("abcdef", (1, 2, 1, 3, 1, 2), strict=True))
-    assert twins(table) == [(0, 2, 4), (1, 5), (0, 2, 4), (3,), (0, 2, 4), (1, 5)]
+    assert look_alike_classes(table) == [(0, 2, 4), (1, 5), (0, 2, 4), (3,), (0, 2, 4), (1, 5)]
 
 
 def test_what_looks_alike_is_the_average_over_its_classes() -> None:
@@ -104,10 +104,10 @@ def test_what_looks_alike_is_the_average_over_its_classes() -> None:
     alike = as_mixture(found)
     for value in (0.0, 0.06, 0.3, 0.55, 0.85, 0.95):
         single = own.cdf(value)[0, 0].numpy()
-        for number, group in enumerate(twins(table)):
+        for number, group in enumerate(look_alike_classes(table)):
             expected = np.mean([single[member] for member in group])
             assert float(alike.cdf(value)[0, 0, number]) == pytest.approx(expected, abs=1e-12)
-    # What is seen is the same whichever of the twins it is.
+    # What is seen is the same whichever of the look-alikes it is.
     mean = alike.mean()[0, 0]
     assert mean[0] == pytest.approx(float(mean[2]), abs=1e-9)
     assert mean[1] == pytest.approx(float(mean[5]), abs=1e-9)

@@ -13,8 +13,8 @@ SHIFT, PAPER = load_recipe("shift-v1"), load_recipe("paper-v1")
 STEPS = (0.25, 0.5, 0.75, 1.0)
 
 
-def ladder(preset: str) -> list[Scenario]:
-    """The rungs from std to the preset."""
+def series(preset: str) -> list[Scenario]:
+    """The pairs from std to the preset."""
     return [SHIFT.scenarios["std"], *(SHIFT.scenarios[f"{preset}-{100 * s:03.0f}"] for s in STEPS)]
 
 
@@ -37,16 +37,16 @@ def test_it_is_paper_v1_but_for_scenarios_and_splits() -> None:
 
 
 @pytest.mark.parametrize("preset", ["hg", "hs"])
-def test_the_ladder_climbs_from_std_to_the_preset_in_equal_steps(preset: str) -> None:
+def test_the_series_climbs_from_std_to_the_preset_in_equal_steps(preset: str) -> None:
     entry = {"bottom": {"preset": preset, "severity": 0}}
     split = {"test/bottom": {"scenario": "bottom", "maps": 1}}
     bottom = recipe_from_dict(SHIFT.to_dict() | {"scenarios": entry, "splits": split}, "test")
-    rungs = ladder(preset)
-    assert bottom.scenarios["bottom"] == rungs[0] == PAPER.scenarios["std"]
-    np.testing.assert_allclose(numbers(rungs[-1]), numbers(PAPER.scenarios[preset]), rtol=0, atol=1e-12)
+    pairs = series(preset)
+    assert bottom.scenarios["bottom"] == pairs[0] == PAPER.scenarios["std"]
+    np.testing.assert_allclose(numbers(pairs[-1]), numbers(PAPER.scenarios[preset]), rtol=0, atol=1e-12)
     whole = numbers(PAPER.scenarios[preset]) - numbers(PAPER.scenarios["std"])
     assert np.any(whole)
-    for below, above in pairwise(rungs):
+    for below, above in pairwise(pairs):
         np.testing.assert_allclose(numbers(above) - numbers(below), whole / 4, rtol=0, atol=1e-12)
 
 
@@ -57,7 +57,7 @@ def test_first_maps_of_std_are_those_of_paper_v1() -> None:
 
 
 @pytest.mark.parametrize("split", SHIFT.splits)
-def test_every_rung_is_solvable(split: str) -> None:
+def test_every_severities_is_solvable(split: str) -> None:
     maps = generate(SHIFT, split, np.arange(3))
     assert np.isfinite(maps["reference_time_s"]).all()
     # Start and goal are 16 m apart on both axes; no cell is crossed faster than at 1 m/s.

@@ -67,7 +67,7 @@ def test_realised_traversability_is_the_clipped_latent_one() -> None:
     assert (expected_traversability(mean, std)[near_one] < mean[near_one]).all()
 
 
-def test_solvable_instances_have_the_reference_time_of_networkx() -> None:
+def test_solvable_maps_have_the_reference_time_of_networkx() -> None:
     recipe = tiny_recipe(test_hg=4)
     maps = generate(recipe, "test/hg", np.arange(4))
     slope = maps["slope_deg"].astype(np.float64)

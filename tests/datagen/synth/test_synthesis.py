@@ -1,4 +1,4 @@
-"""What recipes of synthesis 2 make: the same ground at any size, soft spots, correlated luck."""
+"""What recipes of synthesis 2 make: the same ground at any size, soft spots, correlated noise."""
 
 import hashlib
 from dataclasses import replace
@@ -155,11 +155,11 @@ def test_too_many_craters_for_the_area_are_refused_at_any_size() -> None:
             replace(sized(STAKES, metres), scenarios={"std": STAKES.scenarios["std"], "hg": crowded})
 
 
-def test_the_ladder_of_stakes_climbs_from_std_in_equal_steps() -> None:
+def test_the_series_of_stakes_climbs_from_std_in_equal_steps() -> None:
     for preset in ("hg", "hs"):
         for severity in (0.25, 0.5, 0.75):
-            rung = STAKES.scenarios[f"{preset}-{100 * severity:03.0f}"]
-            assert rung == blend(STAKES.scenarios["std"], STAKES.scenarios[preset], severity)
+            between = STAKES.scenarios[f"{preset}-{100 * severity:03.0f}"]
+            assert between == blend(STAKES.scenarios["std"], STAKES.scenarios[preset], severity)
     assert STAKES.scenarios["std"].relief_m != load_recipe("paper-v1").scenarios["std"].relief_m
     assert STAKES.splits == {
         "train": Split(scenario="std", maps=1000, solvable=True),
@@ -186,23 +186,23 @@ def test_stored_traversability_has_the_distribution_of_each_cell() -> None:
 
 
 @pytest.mark.parametrize("correlation_m", [0.0, 0.5, 1.5, 3.0])
-def test_luck_is_correlated_over_the_metres_asked_for(correlation_m: float) -> None:
-    # One class with λ far from 0 and 1, so that λ is luck and nothing else.
+def test_noise_is_correlated_over_the_metres_asked_for(correlation_m: float) -> None:
+    # One class with λ far from 0 and 1, so that λ is noise and nothing else.
     plain = (terrain_class("even", scale=0.0, offset=0.5, noise=0.05),)
     for resolution_m in (0.5, 0.25):
         recipe = replace(
             small_stakes(correlation_m=correlation_m, classes=plain, occupancy=(1.0,)),
             resolution_m=resolution_m, height=round(16 / resolution_m), width=round(16 / resolution_m),
         )  # fmt: skip
-        luck = (generate(recipe, "train", np.arange(150))["traversability"].astype(float) - 0.5) / 0.05
+        noise = (generate(recipe, "train", np.arange(150))["traversability"].astype(float) - 0.5) / 0.05
         for cells in (1, 3, 6):
             distance_m = cells * resolution_m
             expected = np.exp(-((distance_m / correlation_m) ** 2) / 2) if correlation_m else 0.0
-            for found in (luck[:, cells:] * luck[:, :-cells], luck[:, :, cells:] * luck[:, :, :-cells]):
+            for found in (noise[:, cells:] * noise[:, :-cells], noise[:, :, cells:] * noise[:, :, :-cells]):
                 assert found.mean() == pytest.approx(expected, abs=0.08)
 
 
-def test_each_map_split_and_seed_has_luck_of_its_own() -> None:
+def test_each_map_split_and_seed_has_noise_of_its_own() -> None:
     recipe = small_stakes()
     again = replace(recipe, seed=1)
     first = generate(recipe, "train", np.arange(3))["traversability"]

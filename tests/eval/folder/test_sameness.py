@@ -6,7 +6,7 @@ from benchnav.eval.folder.sameness import differences, differing_columns
 
 def rows(**changes: list[object]) -> pd.DataFrame:
     columns = {
-        "trial": ["a", "a", "b"], "seed": [0, 0, 0], "realisation": [0, 1, 0], "instance": [4, 4, 4],
+        "condition": ["a", "a", "b"], "seed": [0, 0, 0], "realisation": [0, 1, 0], "map": [4, 4, 4],
         "outcome": ["success", "timeout", "success"], "total_time_s": [1.0, 40.0, 3.0],
         "time_ratio": [1.5, np.nan, 1.25], "planning_ms": [0.1, 0.2, 0.3],
     }  # fmt: skip
@@ -47,5 +47,5 @@ def test_episodes_that_one_table_lacks_are_differences() -> None:
 
 
 def test_columns_of_one_table_alone_are_told_and_not_compared() -> None:
-    assert differing_columns(rows(), rows(redrawn=[0, 0, 0])) == ["redrawn"]
-    assert differences(rows(), rows(redrawn=[0, 0, 0])) == []
+    assert differing_columns(rows(), rows(rejected_draws=[0, 0, 0])) == ["rejected_draws"]
+    assert differences(rows(), rows(rejected_draws=[0, 0, 0])) == []

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.folder.folder import EPISODES, read_table
 from benchnav.eval.folder.steps import align_steps, read_steps
 from benchnav.eval.keep import Keep
@@ -19,7 +20,6 @@ from benchnav.eval.report.failures import failures_table
 from benchnav.eval.run.rows import step_table
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Extent, units
 from tests.edits import edit_table
 from tests.eval.run.test_rows import made, unit
@@ -28,7 +28,7 @@ PLANNERS: tuple[Any, ...] = ({"part": "tests.eval.parts:Faulty", "label": "slow"
 
 
 def run(dataset: Path, folder: Path, **changes: Any) -> Path:
-    given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "instances": 2, "seeds": (0, 5)} | changes
+    given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "maps": 2, "seeds": (0, 5)} | changes
     suite = Suite(
         data=str(dataset), scenarios=("std",), model="oracle", noise="stored", time_budget_s=4.0, record="none",
         **given,
@@ -46,7 +46,7 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_steps_hold_the_driven_path_and_the_robots_own_actions() -> None:
     problem, episodes = made()
     rows = step_table(unit(), problem, episodes, [0, 1]).to_pandas()
-    first, second = (rows[rows["instance"] == i] for i in unit().instances)
+    first, second = (rows[rows["map"] == i] for i in unit().maps)
     assert first["x_m"].tolist() == [0, 3, 3]
     assert first["y_m"].tolist() == [0, 0, 4]
     assert first["speed_mps"].tolist()[:2] == [1, 1]
@@ -63,35 +63,38 @@ def test_one_episode_is_read_with_filters_by_any_reader(folder: Path) -> None:
     rows = pd.read_parquet(folder / "episodes.parquet")
     everything = read_steps(folder)
     assert len(everything) == round((rows["end_time_s"] / 0.1 + 1).sum())
-    for trial in rows["trial"].unique():
-        filters = [("trial", "==", trial), ("instance", "==", 1), ("seed", "==", 5)]
+    for condition in rows["condition"].unique():
+        filters = [("condition", "==", condition), ("map", "==", 1), ("seed", "==", 5)]
         steps = pd.read_parquet(folder / "steps", filters=filters)
-        (row,) = rows[(rows["trial"] == trial) & (rows["instance"] == 1) & (rows["seed"] == 5)].to_dict(
+        (row,) = rows[(rows["condition"] == condition) & (rows["map"] == 1) & (rows["seed"] == 5)].to_dict(
             "records"
         )
-        assert set(steps["trial"]) == {trial}
+        assert set(steps["condition"]) == {condition}
         assert steps["time_s"].max() == pytest.approx(row["end_time_s"])
         assert np.nanmean(steps["traversability"].to_numpy(np.float64)) == pytest.approx(
             row["traversability"]
         )
-        ours = read_steps(folder, trial=trial, instance=1, seed=5)
-        pd.testing.assert_frame_equal(ours[steps.columns.drop("trial")], steps.drop(columns="trial"))
-        assert ours["trial"].tolist() == [trial] * len(ours)
+        ours = read_steps(folder, condition=condition, map=1, seed=5)
+        pd.testing.assert_frame_equal(ours[steps.columns.drop("condition")], steps.drop(columns="condition"))
+        assert ours["condition"].tolist() == [condition] * len(ours)
 
 
-def test_steps_are_found_by_what_tables_call_their_trials(folder: Path) -> None:
+def test_steps_are_found_by_what_tables_call_their_conditions(folder: Path) -> None:
     rows = pd.read_parquet(folder / "episodes.parquet")
-    named = rows.groupby(["planner", "risk"])["trial"].first()
-    assert set(read_steps(folder, planner="slow")["trial"]) == {named["slow", "mean"], named["slow", "cvar"]}
-    assert set(read_steps(folder, planner=["slow", "straight"], risk=["cvar", "–"])["trial"]) == {
+    named = rows.groupby(["planner", "risk"])["condition"].first()
+    assert set(read_steps(folder, planner="slow")["condition"]) == {
+        named["slow", "mean"],
+        named["slow", "cvar"],
+    }
+    assert set(read_steps(folder, planner=["slow", "straight"], risk=["cvar", "–"])["condition"]) == {
         named["slow", "cvar"], named["straight", "–"]
     }  # fmt: skip
     assert len(read_steps(folder, planner="slow", risk="–")) == 0
-    assert set(read_steps(folder, trial=named["slow", "mean"], risk="mean")["trial"]) == {
+    assert set(read_steps(folder, condition=named["slow", "mean"], risk="mean")["condition"]) == {
         named["slow", "mean"]
     }
-    assert len(read_steps(folder, trial=named["slow", "mean"], risk="cvar")) == 0
-    with pytest.raises(ConfigError, match=r"Expected filters among .*instance.* got 'instanse'"):
+    assert len(read_steps(folder, condition=named["slow", "mean"], risk="cvar")) == 0
+    with pytest.raises(ConfigError, match=r"Expected filters among .*map.* got 'instanse'"):
         read_steps(folder, instanse=1)
 
 
@@ -115,15 +118,15 @@ def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path:
 def test_steps_of_recorded_episodes_alone_or_none(dataset_path: Path, tmp_path: Path) -> None:
     suite = Suite(
         data=str(dataset_path), scenarios=("std",), model="oracle", planners=PLANNERS, risks=("mean", "cvar"),
-        instances=2, seeds=(0, 5), time_budget_s=4.0, steps="recorded",
+        maps=2, seeds=(0, 5), time_budget_s=4.0, steps="recorded",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     steps = read_steps(tmp_path / "run")
-    kept = steps[["trial", "seed", "instance"]].drop_duplicates()
+    kept = steps[["condition", "seed", "map"]].drop_duplicates()
     assert len(kept) == 3
     assert set(kept["seed"]) == {0}
-    assert set(kept["instance"]) == {0}
+    assert set(kept["map"]) == {0}
     none = run(dataset_path, tmp_path / "none", steps="none")
     assert not (none / "steps").exists()
     with pytest.raises(ConfigError, match="--steps all"):
@@ -135,8 +138,10 @@ def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> No
     assert len(before) == 6
     suite = Suite(data=str(dataset_path), model="oracle", planners=PLANNERS, risks=("mean", "cvar"), noise="stored",
                   time_budget_s=4.0)  # fmt: skip
-    trials = {t.id: (t, Extent.product((0, 5), 1, 2)) for t in trials_of(suite, lambda data: ("std",))}
-    align_steps(folder, units(trials, Keep()))
+    conditions = {
+        t.id: (t, Extent.product((0, 5), 1, 2)) for t in conditions_of(suite, lambda data: ("std",))
+    }
+    align_steps(folder, units(conditions, Keep()))
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 

@@ -7,21 +7,21 @@ import numpy as np
 import pandas as pd
 import torch
 
+from benchnav.eval.condition import LABELS
 from benchnav.eval.report.recorded.drawn_plan import drawn_plan
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.eval.stats.best import against_best, told_the_truth
+from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
-from benchnav.eval.trial import LABELS
 from benchnav.grid import Grid
 
 PAPER = {
     "world": {"noise": "resampled", "time_budget_s": 100.0},
-    "rules": {"free_space": {"by": "risk", "above": 0.3}, "slowest": 0.3, "goal_radius_m": 1.0},
+    "rules": {"free_space": {"by": "risk", "above": 0.3}, "min_traversability": 0.3, "goal_radius_m": 1.0},
 }
 
 
-def trial(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
-    """Labels of a trial."""
+def condition(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str, str]:
+    """Labels of a condition."""
     same = {"data": "paper-v1", "scenario": "std", "world": "paper", "robot": "unicycle"}
     return (
         same | {"objective": "goal_distance", "model": "paper-v1", "planner": planner, "risk": risk} | labels
@@ -29,18 +29,18 @@ def trial(planner: str = "mppi", risk: str = "cvar", **labels: str) -> dict[str,
 
 
 def row(
-    labels: dict[str, str], instance: int = 0, time_s: float | None = 30.0, **changes: Any
+    labels: dict[str, str], map_index: int = 0, time_s: float | None = 30.0, **changes: Any
 ) -> dict[str, Any]:
     """An episode; a time of None is a timeout."""
     success = time_s is not None
     made: dict[str, Any] = {
-        "trial": "+".join(labels[name] for name in LABELS), **labels, "seed": 0, "realisation": 0,
-        "instance": instance, "outcome": "success" if success else "timeout", "success": success,
+        "condition": "+".join(labels[name] for name in LABELS), **labels, "seed": 0, "realisation": 0,
+        "map": map_index, "outcome": "success" if success else "timeout", "success": success,
         "total_time_s": time_s if success else 100.0, "end_time_s": time_s if success else 100.0,
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
         "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
-        "redrawn": 0, "compiled": True, "error": "",
+        "rejected_draws": 0, "compiled": True, "error": "",
     }  # fmt: skip
     return made | changes
 
@@ -51,13 +51,13 @@ def rows(*episodes: dict[str, Any] | Iterable[dict[str, Any]]) -> pd.DataFrame:
     return pd.DataFrame(flat)
 
 
-def trials(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """What `run.json` says of the trials; `follows` and `remarks` by planner."""
+def conditions(episodes: pd.DataFrame, **notes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What `run.json` says of the conditions; `follows` and `remarks` by planner."""
     return {
         name: {"value": PAPER | _model(group), "labels": {label: group[label].iloc[0] for label in LABELS}}
         | {"follows": "", "remarks": [], "changed": [], "seeds": sorted(set(group["seed"].tolist()))}
         | notes.get(group["planner"].iloc[0], {})
-        for name, group in episodes.groupby("trial", sort=False)
+        for name, group in episodes.groupby("condition", sort=False)
     }
 
 
@@ -68,21 +68,21 @@ def _model(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def summarised(episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]) -> pd.DataFrame:
-    """A row a trial, all of one world."""
-    return summarise(episodes, dict.fromkeys(episodes["trial"].unique(), world))
+    """A row a condition, all of one world."""
+    return summarise(episodes, dict.fromkeys(episodes["condition"].unique(), world))
 
 
 def summary(episodes: pd.DataFrame) -> pd.DataFrame:
     """What a report makes of rows."""
     table = summarised(episodes)
-    return table.merge(against_best(episodes, table, told_the_truth(trials(episodes))), on="trial")
+    return table.merge(against_best(episodes, table, privileged_models(conditions(episodes))), on="condition")
 
 
 def recording(
     steps: int = 200, dt_s: float = 0.1, labels: dict[str, str] | None = None, **changes: Any
 ) -> Recording:
     """An episode on a map that is not square, of a robot with five states and two actions."""
-    labels = labels or trial()
+    labels = labels or condition()
     grid = Grid(40, 60, 0.5)
     generator = np.random.default_rng(3)
     x = 2 + np.arange(steps + 1) * dt_s
@@ -90,12 +90,12 @@ def recording(
     states = np.concatenate((states, np.zeros((steps + 1, 2))), axis=1).astype(np.float32)
     predicted = generator.random((40, 60)).astype(np.float32) ** 0.5
     made: dict[str, Any] = {
-        "about": {"trial": "t", **labels, "seed": "0", "realisation": "0", "instance": "4", "outcome": "success"},
+        "about": {"condition": "t", **labels, "seed": "0", "realisation": "0", "map": "4", "outcome": "success"},
         "grid": grid, "rgb": (255 * generator.random((3, 40, 60))).astype(np.uint8),
         "elevation_m": generator.random((40, 60)).astype(np.float32), "predicted": predicted,
         "true_mean": generator.random((40, 60)).astype(np.float32), "time_budget_s": 100.0,
         "free": predicted > 0.3, "free_by": "risk", "free_above": 0.3, "field": None, "soft": np.zeros((40, 60), bool),
-        "holding": np.zeros((40, 60), bool), "goal_m": np.array([24.0, 15.0], np.float32), "dt_s": dt_s,
+        "immobilising": np.zeros((40, 60), bool), "goal_m": np.array([24.0, 15.0], np.float32), "dt_s": dt_s,
         "action_names": ("speed_mps", "steering_rad"),
         "states": states, "actions": generator.random((steps, 2)).astype(np.float32),
         "traversability": generator.random(steps).astype(np.float32),
@@ -108,8 +108,8 @@ def held_recording(steps: int = 80, **changes: Any) -> Recording:
     """An episode on λ that stays, of a robot that was immobilised; no map of it is like another's mirror."""
     generator = np.random.default_rng(4)
     field = generator.random((40, 60)).astype(np.float32)
-    about = {"trial": "t", **trial(world="stakes"), "seed": "0", "realisation": "0", "instance": "4"}
-    ground = {"field": field, "soft": generator.random((40, 60)) < 0.2, "holding": field < 0.15}
+    about = {"condition": "t", **condition(world="stakes"), "seed": "0", "realisation": "0", "map": "4"}
+    ground = {"field": field, "soft": generator.random((40, 60)) < 0.2, "immobilising": field < 0.15}
     return recording(steps, **({"about": about | {"outcome": "immobilised"}} | ground | changes))
 
 

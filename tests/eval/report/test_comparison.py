@@ -25,7 +25,7 @@ def test_success_is_in_points_and_p_is_the_corrected_one() -> None:
     low, high = 100 * table["success_low"][0], 100 * table["success_high"][0]
     assert f"{low:+.1f} to {high:+.1f}" in first.values()
     assert "0.032" in first.values()
-    assert first["told apart"] == "yes"
+    assert first["significant"] == "yes"
     assert "< 0.0001" in second.values()
     assert second["Δ [points]"] == "-25.0"
 
@@ -35,10 +35,10 @@ def test_shares_are_not_rounded_to_a_wrong_whole() -> None:
     assert cells(table)[0]["Succ. [%]"] == "60.5 : 72.5"
 
 
-def test_what_cannot_be_told_apart_says_so() -> None:
+def test_what_is_not_significant_says_so() -> None:
     table = compare([pair(A, B)])
     assert table["success_p_holm"][0] > 0.05
-    assert cells(table)[0]["told apart"] == "no"
+    assert cells(table)[0]["significant"] == "no"
 
 
 def test_no_minus_before_a_zero_and_a_dash_for_nothing() -> None:
@@ -62,9 +62,9 @@ def test_labels_that_differ_have_a_column_and_notes_name_the_family() -> None:
 def test_maps_too_few_to_show_any_difference_say_so() -> None:
     table = compare([pair(A[:4], B[:4]), pair(A * 10, B * 10)])
     few, many = cells(table)
-    assert table["success_shown"][0] > 1
-    assert few["shows from"] == "–"
-    assert many["shows from"] == f"{100 * table['success_shown'][1]:.0f}"
+    assert table["success_detectable"][0] > 1
+    assert few["detectable"] == "–"
+    assert many["detectable"] == f"{100 * table['success_detectable'][1]:.0f}"
 
 
 def test_what_test_p_is_of_stands_in_heading_and_note() -> None:

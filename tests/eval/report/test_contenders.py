@@ -1,26 +1,28 @@
 import pytest
 
-from benchnav.eval.report.contenders import contender_names, trial_colours
+from benchnav.eval.report.contenders import condition_colours, contender_names
 from tests.eval.report import made
 
 
 @pytest.mark.parametrize(
-    ("trials", "names"),
+    ("conditions", "names"),
     [
-        ([made.trial(risk="mean"), made.trial(risk="cvar:0.9")], ["mean", "cvar:0.9"]),
+        ([made.condition(risk="mean"), made.condition(risk="cvar:0.9")], ["mean", "cvar:0.9"]),
         (
-            [made.trial("mppi", "mean"), made.trial("straight", "–", model="–")],
+            [made.condition("mppi", "mean"), made.condition("straight", "–", model="–")],
             ["mppi", "straight"],
         ),
-        ([made.trial(model="a"), made.trial(model="b")], ["a", "b"]),
-        ([made.trial(robot="a"), made.trial(robot="b", world="stakes")], ["a, paper", "b, stakes"]),
-        ([made.trial()], ["mppi"]),
+        ([made.condition(model="a"), made.condition(model="b")], ["a", "b"]),
+        ([made.condition(robot="a"), made.condition(robot="b", world="stakes")], ["a, paper", "b, stakes"]),
+        ([made.condition()], ["mppi"]),
     ],
 )
-def test_trials_are_called_by_what_tells_them_apart(trials: list[dict[str, str]], names: list[str]) -> None:
-    assert contender_names(trials) == names
+def test_conditions_are_called_by_what_tells_them_apart(
+    conditions: list[dict[str, str]], names: list[str]
+) -> None:
+    assert contender_names(conditions) == names
 
 
-def test_eight_trials_have_eight_colours() -> None:
-    assert len(set(trial_colours(8))) == 8
-    assert trial_colours(9)[8] == trial_colours(1)[0]
+def test_eight_conditions_have_eight_colours() -> None:
+    assert len(set(condition_colours(8))) == 8
+    assert condition_colours(9)[8] == condition_colours(1)[0]

@@ -15,23 +15,23 @@ RATES = {"mean": 2, "var": 5, "cvar": 8}
 
 
 def ground_of(failures: pd.DataFrame) -> FailedGround:
-    """λ̂ is a hundredth of the instance; the goal's x is the instance."""
+    """λ̂ is a hundredth of the map; the goal's x is the map."""
     count = len(failures)
-    instance = failures["instance"].to_numpy(dtype=float)
+    map_index = failures["map"].to_numpy(dtype=float)
     return FailedGround(
-        predicted=np.ones((count, 8, 8)) * instance[:, None, None] / 100,
-        holding=np.zeros((count, 8, 8), bool),
+        predicted=np.ones((count, 8, 8)) * map_index[:, None, None] / 100,
+        immobilising=np.zeros((count, 8, 8), bool),
         resolution_m=1.0,
-        goal_m=np.stack((instance, instance), axis=1),
+        goal_m=np.stack((map_index, map_index), axis=1),
     )
 
 
 def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, dict[str, str]]:
     """Ten maps; robots fail on the last ones, and end at x = 1."""
-    blind = made.trial("straight", "–", model="–")
+    blind = made.condition("straight", "–", model="–")
     rows = made.rows(
         *(
-            [made.row(made.trial(risk=r), i, 20.0 if i < n else None) for i in range(10)]
+            [made.row(made.condition(risk=r), i, 20.0 if i < n else None) for i in range(10)]
             for r, n in RATES.items()
         ),
         (made.row(blind, i, None) for i in range(10)),
@@ -40,40 +40,40 @@ def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, di
         same = {"seed": 0, "realisation": 0, "step": [0, 1], "time_s": [0.0, 0.1], "x_m": [0.5, 1.0]}
         parts = [
             pd.DataFrame(
-                {"trial": row["trial"], "instance": row["instance"], "y_m": 0.1 * row["instance"], **same}
+                {"condition": row["condition"], "map": row["map"], "y_m": 0.1 * row["map"], **same}
             ).assign(traversability=[0.2, np.nan])
             for row in rows.to_dict("records")
         ]
         for place, part in enumerate(parts):
-            path = folder / "steps" / f"trial={part['trial'].iloc[0]}" / f"{place}.parquet"
+            path = folder / "steps" / f"condition={part['condition'].iloc[0]}" / f"{place}.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.drop(columns="trial").to_parquet(path, index=False)
+            part.drop(columns="condition").to_parquet(path, index=False)
     summary = made.summary(rows)
     sheets = collect_sheets(folder, summary, failures_table(folder, rows), ground)
-    return sheets, dict(zip(summary["risk"], summary["trial"], strict=True))
+    return sheets, dict(zip(summary["risk"], summary["condition"], strict=True))
 
 
 def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
-    sheets, trials = collected(tmp_path, ground_of)
+    sheets, conditions = collected(tmp_path, ground_of)
     ((title, (best, worst)),) = sheets.shown
     assert title == "std"
-    assert (best.name, best.among, list(best.failures["instance"])) == ("MPPI, cvar", 2, [8, 9])
-    assert (worst.name, worst.among, list(worst.failures["instance"])) == ("MPPI, mean", 8, [2, 3, 4, 5])
+    assert (best.name, best.among, list(best.failures["map"])) == ("MPPI, cvar", 2, [8, 9])
+    assert (worst.name, worst.among, list(worst.failures["map"])) == ("MPPI, mean", 8, [2, 3, 4, 5])
     assert sheets.left_out == ""
     for line in (best, worst):
-        np.testing.assert_array_equal(line.ground.goal_m[:, 0], line.failures["instance"])
-        for track, instance in zip(line.tracks, line.failures["instance"], strict=True):
-            np.testing.assert_allclose(track, [[0.5, 0.1 * instance], [1, 0.1 * instance]])
-    # What the planner was told is that of all failures, shown or not.
-    assert set(sheets.told) == {trials["cvar"], trials["mean"]}
-    np.testing.assert_allclose(sheets.told[trials["mean"]], np.arange(2, 10) / 100)
+        np.testing.assert_array_equal(line.ground.goal_m[:, 0], line.failures["map"])
+        for track, map_index in zip(line.tracks, line.failures["map"], strict=True):
+            np.testing.assert_allclose(track, [[0.5, 0.1 * map_index], [1, 0.1 * map_index]])
+    # What was predicted is that of all failures, shown or not.
+    assert set(sheets.told) == {conditions["cvar"], conditions["mean"]}
+    np.testing.assert_allclose(sheets.told[conditions["mean"]], np.arange(2, 10) / 100)
 
 
 def test_a_planner_that_is_told_nothing_has_no_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in RATES:  # the blind line, which fails on all, is then as good
         monkeypatch.setitem(RATES, name, 0)
-    sheets, trials = collected(tmp_path, ground_of)
-    assert trials["–"] not in sheets.told
+    sheets, conditions = collected(tmp_path, ground_of)
+    assert conditions["–"] not in sheets.told
     assert all("straight" not in line.name for _, lines in sheets.shown for line in lines)
 
 

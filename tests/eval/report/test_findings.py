@@ -7,27 +7,27 @@ import pandas as pd
 from benchnav.eval.report.findings import findings, p_in_words
 from tests.eval.report import made
 
-NONE = pd.DataFrame({"trial": [], "last_traversability": []})
+NONE = pd.DataFrame({"condition": [], "last_traversability": []})
 
 
-def trial(count: int, of: int = 100, outcome: str = "immobilised", **labels: str) -> list[dict[str, Any]]:
-    """A trial that succeeds on the first maps."""
-    own = made.trial(**labels)
+def condition(count: int, of: int = 100, outcome: str = "immobilised", **labels: str) -> list[dict[str, Any]]:
+    """A condition that succeeds on the first maps."""
+    own = made.condition(**labels)
     failed = [made.row(own, i, None, outcome=outcome) for i in range(count, of)]
     return [*(made.row(own, i) for i in range(count)), *failed]
 
 
-def said(*trials: list[dict[str, Any]], failures: pd.DataFrame = NONE, told: Any = None) -> list[str]:
-    (finding,) = findings(summary_of(*trials), failures, told)
+def said(*conditions: list[dict[str, Any]], failures: pd.DataFrame = NONE, told: Any = None) -> list[str]:
+    (finding,) = findings(summary_of(*conditions), failures, told)
     return list(finding.sentences)
 
 
-def summary_of(*trials: list[dict[str, Any]]) -> pd.DataFrame:
-    return made.summary(made.rows(*trials))
+def summary_of(*conditions: list[dict[str, Any]]) -> pd.DataFrame:
+    return made.summary(made.rows(*conditions))
 
 
 def test_a_best_that_all_others_are_worse_than() -> None:
-    sentences = said(trial(90, risk="cvar:0.9"), trial(40, risk="mean"), trial(30, risk="var"))
+    sentences = said(condition(90, risk="cvar:0.9"), condition(40, risk="mean"), condition(30, risk="var"))
     assert sentences[0] == (
         "The highest success rate is that of MPPI, cvar:0.9: 90 % of its episodes reached the goal (95 % interval "
         "83 to 94 %)."
@@ -45,7 +45,7 @@ def test_a_best_that_all_others_are_worse_than() -> None:
 
 
 def test_one_that_is_not_worse_and_the_next_that_is() -> None:
-    sentences = said(trial(40, risk="mean"), trial(88, risk="var"), trial(90, risk="cvar"))
+    sentences = said(condition(40, risk="mean"), condition(88, risk="var"), condition(90, risk="cvar"))
     assert sentences[1] == "1 other setting is not significantly worse (p ≥ 0.05): MPPI, var."
     assert sentences[2].startswith(
         "The next that is significantly worse is MPPI, mean with 40 %: the difference is 50.0 points"
@@ -53,7 +53,7 @@ def test_one_that_is_not_worse_and_the_next_that_is() -> None:
 
 
 def test_several_that_are_not_worse_are_named_up_to_six() -> None:
-    sentences = said(*(trial(90 - n // 4, risk=f"r{n}") for n in range(9)), trial(5, risk="bad"))
+    sentences = said(*(condition(90 - n // 4, risk=f"r{n}") for n in range(9)), condition(5, risk="bad"))
     assert sentences[1] == (
         "8 other settings are not significantly worse (p ≥ 0.05): "
         "MPPI, r1; MPPI, r2; MPPI, r3; MPPI, r4; MPPI, r5; MPPI, r6 and 2 more."
@@ -61,7 +61,7 @@ def test_several_that_are_not_worse_are_named_up_to_six() -> None:
 
 
 def test_where_nothing_is_worse_the_run_does_not_say_which_is_best() -> None:
-    sentences = said(trial(90, risk="a"), trial(89, risk="b"), trial(88, risk="c"))
+    sentences = said(condition(90, risk="a"), condition(89, risk="b"), condition(88, risk="c"))
     assert re.fullmatch(
         r"No setting is significantly worse \(max-T sign-flip test by map over 3 settings, p ≥ 0\.\d+; 100 maps detect "
         r"differences of \d points or more with 80 % power\): the run does not say which is best\.",
@@ -71,38 +71,38 @@ def test_where_nothing_is_worse_the_run_does_not_say_which_is_best() -> None:
 
 
 def test_the_interval_is_that_of_the_difference_and_the_power_that_of_the_hardest_pair() -> None:
-    summary = summary_of(trial(40, risk="mean"), trial(90, risk="cvar"))
+    summary = summary_of(condition(40, risk="mean"), condition(90, risk="cvar"))
     row = summary[summary["risk"] == "mean"].iloc[0]
     low, high = 100 * row["best_low"], 100 * row["best_high"]
     told = findings(summary, NONE)[0].sentences[2]
     assert f"(95 % interval of the pair alone {low:.1f} to {high:.1f})" in told
-    alike = summary_of(trial(90, risk="a"), trial(89, risk="b"), [*trial(87, risk="c")])
+    alike = summary_of(condition(90, risk="a"), condition(89, risk="b"), [*condition(87, risk="c")])
     shown = 100 * alike["best_shown"].max()
     assert alike["best_shown"].min() < alike["best_shown"].max()
     assert f"differences of {shown:.0f} points or more" in findings(alike, NONE)[0].sentences[1]
 
 
 def test_settings_that_were_run_on_unlike_maps_are_said_to_be_compared_on_those_they_share() -> None:
-    sentences = said(trial(90, risk="a"), trial(10, of=40, risk="b"))
+    sentences = said(condition(90, risk="a"), condition(10, of=40, risk="b"))
     assert sentences[1] == "The settings are compared on the 40 episodes that all of them have."
-    assert not any("compared on" in line for line in said(trial(90, risk="a"), trial(10, risk="b")))
+    assert not any("compared on" in line for line in said(condition(90, risk="a"), condition(10, risk="b")))
 
 
 def test_a_rate_is_not_rounded_to_all() -> None:
-    assert "99.6 % of its episodes" in said(trial(249, of=250))[0]
+    assert "99.6 % of its episodes" in said(condition(249, of=250))[0]
 
 
 def test_a_single_setting_and_two() -> None:
-    alone = said(trial(100))
+    alone = said(condition(100))
     assert alone[1:] == ["There is no other setting to compare it with.", "It never failed."]
-    two = said(trial(90, risk="a"), trial(10, risk="b"))
+    two = said(condition(90, risk="a"), condition(10, risk="b"))
     assert two[1] == "The other setting is significantly worse: it is the best here."
     assert two[2].endswith("(max-T sign-flip test by map over 2 settings).")
 
 
 def test_failures_are_counted_by_outcome_the_most_frequent_first() -> None:
-    rows = trial(90, of=96, outcome="stuck")
-    own = made.trial()
+    rows = condition(90, of=96, outcome="stuck")
+    own = made.condition()
     rows += [made.row(own, i, None, outcome="out_of_bounds") for i in (96, 97)]
     assert said(rows)[2] == "It failed in 8 of 98 episodes: 6 stuck (75 %), 2 out of bounds (25 %)."
     many = [made.row(own, i, None, outcome="stuck") for i in range(98, 500)]
@@ -110,37 +110,40 @@ def test_failures_are_counted_by_outcome_the_most_frequent_first() -> None:
 
 
 def test_the_ground_of_failures_is_that_of_the_best_alone() -> None:
-    best, other = trial(60, risk="a"), trial(50, risk="b")
+    best, other = condition(60, risk="a"), condition(50, risk="b")
     failures = pd.DataFrame(
         {
-            "trial": [best[0]["trial"]] * 3 + [other[0]["trial"]] * 3,
+            "condition": [best[0]["condition"]] * 3 + [other[0]["condition"]] * 3,
             "last_traversability": [0.02, 0.04, 0.3, 0.7, 0.8, 0.9],
         }
     )
     without = said(best, other, failures=failures)
-    assert "In their last 2 s the robot met λ = 0.04 (median)." in without
-    told = {best[0]["trial"]: np.array([0.5, np.nan, 0.6, 0.9]), other[0]["trial"]: np.array([0.1])}
+    assert "In their last 2 s the robot observed λ = 0.04 (median)." in without
+    told = {best[0]["condition"]: np.array([0.5, np.nan, 0.6, 0.9]), other[0]["condition"]: np.array([0.1])}
     assert (
-        "At the place where they ended, the planner had been told λ̂ = 0.60, and in the last 2 s the robot met λ = 0.04 "
+        "At the place where they ended, the predicted λ̂ was 0.60, and in the last 2 s the robot observed λ = 0.04 "
         "(medians)."
     ) in said(best, other, failures=failures, told=told)
 
 
-def test_what_is_told_the_truth_is_set_beside_it() -> None:
+def test_what_is_privileged_models_is_set_beside_it() -> None:
     sentences = said(
-        trial(50, planner="astar_dwa"), trial(70, planner="astar_dwa", model="oracle", risk="mean"),
-        trial(80, planner="astar_dwa", model="oracle"), trial(99, planner="astar_dwa", model="clairvoyant", risk="–"),
+        condition(50, planner="astar_dwa"), condition(70, planner="astar_dwa", model="oracle", risk="mean"),
+        condition(80, planner="astar_dwa", model="oracle"),
+        condition(99, planner="astar_dwa", model="clairvoyant", risk="–"),
     )  # fmt: skip
     assert sentences[0].startswith("The highest success rate is that of A* + DWA, paper-v1, cvar: 50 %")
     assert sentences[1] == "There is no other setting to compare it with."
     assert sentences[-2:] == [
-        "With the model oracle, which is told the truth, A* + DWA, oracle, cvar reached 80 %.",
-        "With the model clairvoyant, which is told the truth, A* + DWA, clairvoyant reached 99 %.",
+        "With the privileged model oracle A* + DWA, oracle, cvar reached 80 %.",
+        "With the privileged model clairvoyant A* + DWA, clairvoyant reached 99 %.",
     ]
 
 
 def test_each_block_has_its_own_finding() -> None:
-    summary = summary_of(*(trial(n, scenario=s, world=w) for n, s, w in ((90, "std", "a"), (20, "hg", "b"))))
+    summary = summary_of(
+        *(condition(n, scenario=s, world=w) for n, s, w in ((90, "std", "a"), (20, "hg", "b")))
+    )
     found = findings(summary, NONE)
     assert [finding.title for finding in found] == ["std, a", "hg, b"]
     assert "90 %" in found[0].sentences[0]

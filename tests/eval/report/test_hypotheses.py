@@ -30,7 +30,7 @@ OTHER = {
 }  # fmt: skip
 ABOUT = {
     "hypotheses": {"digest": "d1", "episodes": {"a": 80, "b": 80}},
-    "trials": {name: {"draws": [[0, 0, 40], [1, 0, 40]]} for name in "ab"},
+    "conditions": {name: {"draws": [[0, 0, 40], [1, 0, 40]]} for name in "ab"},
 }
 
 
@@ -46,8 +46,8 @@ def test_each_hypothesis_is_said_with_its_numbers() -> None:
 
 
 def test_an_extension_after_the_hypotheses_is_told() -> None:
-    trials = {"a": {"draws": [[0, 0, 200]]}, "b": {"draws": [[0, 0, 80]]}}
-    said = hypothesis_finding(pd.DataFrame([a_test()]), ABOUT | {"trials": trials}, True).sentences
+    conditions = {"a": {"draws": [[0, 0, 200]]}, "b": {"draws": [[0, 0, 80]]}}
+    said = hypothesis_finding(pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, True).sentences
     assert said[-1].startswith(
         "They were fixed for 80 episodes of a condition; the run was extended to 80 to 200 later"
     )
@@ -106,9 +106,9 @@ def test_a_forest_is_drawn_where_no_episode_tells_anything() -> None:
 
 def test_a_report_tests_them_first_and_heads_the_rest_exploratory(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.trial(risk=risk), i, 30.0 + i) for risk in ("mean", "cvar") for i in range(8)
+        made.row(made.condition(risk=risk), i, 30.0 + i) for risk in ("mean", "cvar") for i in range(8)
     )
-    one, other = rows["trial"].unique()[::-1]
+    one, other = rows["condition"].unique()[::-1]
     plain = {name: a_test(one=one, other=other, margin=5.0)[name] for name in
              ("one", "other", "names", "metric", "kind", "direction", "margin", "claim")}  # fmt: skip
     hypotheses = {"tests": [plain], "digest": digest_of_tests([plain]), "episodes": {one: 8, other: 8}}

@@ -45,7 +45,7 @@ def page(tmp_path: Path) -> Page:
         bold=frozenset({(1, 1)}), bold_note="the best", explained=(("planner", EVIL),),
     )  # fmt: skip
     about = {
-        "run_id": "", "commands": [EVIL], "parts": {EVIL: {"origin": EVIL}}, "datasets": {}, "trials": {},
+        "run_id": "", "commands": [EVIL], "parts": {EVIL: {"origin": EVIL}}, "datasets": {}, "conditions": {},
         "code": CODE, "machine": {"processor": "", "cores": 2}, "device": "cpu", "gpu": None,
     }  # fmt: skip
     text = write_page(
@@ -100,7 +100,7 @@ def test_provenance_of_a_run() -> None:
             "risk r.py:f": {"origin": "r.py", "digest": "9e"},
             "x": "y",
         },
-        "trials": {"t": {"seeds": [0, 7]}},
+        "conditions": {"t": {"seeds": [0, 7]}},
     }
     assert provenance_lines(about) == [
         ("run", "r1"), ("sources of benchnav", "abc"), ("version of torch", "2.0"), ("processor", "x86_64 AVX2"),

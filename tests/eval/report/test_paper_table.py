@@ -6,9 +6,9 @@ from benchnav.eval.report.paper_table import paper_table
 from tests.eval.report import made
 
 
-def table_of(*trials: tuple[dict[str, str], int]) -> str:
+def table_of(*conditions: tuple[dict[str, str], int]) -> str:
     rows = made.rows(
-        *([made.row(labels, i, 20.0 if i < n else None) for i in range(40)] for labels, n in trials)
+        *([made.row(labels, i, 20.0 if i < n else None) for i in range(40)] for labels, n in conditions)
     )
     return paper_table(made.summary(rows), "run_1")
 
@@ -21,8 +21,8 @@ def body(text: str) -> list[list[str]]:
 
 def test_settings_stand_down_and_scenarios_across() -> None:
     text = table_of(
-        (made.trial("astar_dwa", "mean"), 40), (made.trial("astar_dwa", "cvar:0.9"), 10),
-        (made.trial("mppi", "mean"), 38), (made.trial("mppi", "mean", scenario="hg"), 20),
+        (made.condition("astar_dwa", "mean"), 40), (made.condition("astar_dwa", "cvar:0.9"), 10),
+        (made.condition("mppi", "mean"), 38), (made.condition("mppi", "mean", scenario="hg"), 20),
     )  # fmt: skip
     titles, heads, *rows = body(text)
     assert titles == ["", "", r"\multicolumn{3}{c}{std}", r"\multicolumn{3}{c}{hg}"]
@@ -43,7 +43,7 @@ def test_settings_stand_down_and_scenarios_across() -> None:
 def test_it_is_a_whole_table_for_booktabs_alone() -> None:
     scenarios = ("std", "hg", "hs", "a_b", "50%")
     text = table_of(
-        *((made.trial("my_planner&", "r_1", scenario=s, model=m), 9) for s in scenarios for m in "ab")
+        *((made.condition("my_planner&", "r_1", scenario=s, model=m), 9) for s in scenarios for m in "ab")
     )
     assert text.count("{") - text.count(r"\{") == text.count("}") - text.count(r"\}")
     for name in ("table*", "tabular"):
@@ -63,7 +63,7 @@ def test_it_is_a_whole_table_for_booktabs_alone() -> None:
 
 
 def test_a_model_is_named_where_there_are_several() -> None:
-    text = table_of((made.trial(model="a"), 30), (made.trial(model="b"), 30))
+    text = table_of((made.condition(model="a"), 30), (made.condition(model="b"), 30))
     assert body(text)[1][:3] == ["Planner", "Model", "Risk"]
     assert [row[:3] for row in body(text)[2:]] == [["MPPI", "a", "cvar"], ["", "b", "cvar"]]
     assert r"\begin{table}[t]" in text
@@ -71,6 +71,6 @@ def test_a_model_is_named_where_there_are_several() -> None:
 
 @pytest.mark.parametrize(("counts", "expected"), [((30,), False), ((30, 29), False), ((30, 29, 5), True)])
 def test_bold_is_used_and_explained_where_something_is_worse(counts: tuple[int, ...], expected: bool) -> None:
-    text = table_of(*((made.trial(risk=f"r{i}"), count) for i, count in enumerate(counts)))
+    text = table_of(*((made.condition(risk=f"r{i}"), count) for i, count in enumerate(counts)))
     assert ("Bold:" in text) == expected
     assert (r"\textbf" in text) == expected

@@ -3,34 +3,41 @@ import re
 import numpy as np
 import pytest
 
+from benchnav.eval.condition import LABELS
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import failures_in_words, result_table
-from benchnav.eval.trial import LABELS
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
 
 
 def table_of(episodes, **notes):  # type: ignore[no-untyped-def]
-    return result_table(made.summary(episodes), made.trials(episodes, **notes))
+    return result_table(made.summary(episodes), made.conditions(episodes, **notes))
 
 
 def test_golden_table() -> None:
     quick = [
         made.row(
-            made.trial("mppi"), i, time, traversability=0.7, planning_ms=2.0 * i, planning_ms_p95=4.0 * i
+            made.condition("mppi"), i, time, traversability=0.7, planning_ms=2.0 * i, planning_ms_p95=4.0 * i
         )
         for i, time in enumerate((20.0, 30.0))
     ]
     slow = [
-        made.row(made.trial("cl_rrt", "mean"), 0, 40.0, traversability=0.9, compiled=False),
-        made.row(made.trial("cl_rrt", "mean"), 1, None, outcome="stuck", traversability=0.5, compiled=False),
+        made.row(made.condition("cl_rrt", "mean"), 0, 40.0, traversability=0.9, compiled=False),
+        made.row(
+            made.condition("cl_rrt", "mean"), 1, None, outcome="stuck", traversability=0.5, compiled=False
+        ),
     ]
     blind = [
-        made.row(made.trial(**BLIND), 0, None, outcome="out_of_bounds", planning_ms=np.nan),
+        made.row(made.condition(**BLIND), 0, None, outcome="out_of_bounds", planning_ms=np.nan),
         made.row(
-            made.trial(**BLIND), 1, None, outcome="planner_failure", traversability=np.nan, planning_ms=np.nan
+            made.condition(**BLIND),
+            1,
+            None,
+            outcome="planner_failure",
+            traversability=np.nan,
+            planning_ms=np.nan,
         ),
     ]
     notes = {"cl_rrt": {"follows": "its own time", "remarks": ["limits 0.5 m/s²"]}}
@@ -51,36 +58,39 @@ def test_golden_table() -> None:
 
 def test_eight_maps_give_times_an_interval() -> None:
     seven, eight = (
-        table_of(made.rows([made.row(made.trial(), i, 20.0 + i) for i in range(n)])).rows[0] for n in (7, 8)
+        table_of(made.rows([made.row(made.condition(), i, 20.0 + i) for i in range(n)])).rows[0]
+        for n in (7, 8)
     )
     assert "23.0" in seven
     assert any(re.fullmatch(r"23\.5 \(21\.\d–4\d\.\d\)", cell) for cell in eight)
 
 
 def test_only_columns_that_are_shown_are_explained_each_in_one_sentence() -> None:
-    table = table_of(made.rows(made.row(made.trial())))
+    table = table_of(made.rows(made.row(made.condition())))
     assert tuple(heading for heading, _ in table.explained) == table.headings
     assert all(text.endswith(".") for _, text in table.explained)
-    earlier = made.rows(made.row(made.trial())).drop(columns=["planning_ms_p95", "planning_start_ms"])
+    earlier = made.rows(made.row(made.condition())).drop(columns=["planning_ms_p95", "planning_start_ms"])
     assert "1¶" in table_of(earlier).rows[0]
 
 
 def test_the_mark_of_compiled_planners_is_explained_wherever_it_stands() -> None:
-    compiled, eager = (table_of(made.rows(made.row(made.trial(), compiled=value))) for value in (True, False))
+    compiled, eager = (
+        table_of(made.rows(made.row(made.condition(), compiled=value))) for value in (True, False)
+    )
     for written in (to_terminal(compiled), to_markdown(compiled), to_latex(compiled, "", "")):
         assert "compiled planner: its time is that of compiled code" in written
     assert not eager.notes
 
 
 def test_tables_without_planning_have_no_column_of_it() -> None:
-    without = table_of(made.rows(made.row(made.trial(), planning_ms=np.nan)))
+    without = table_of(made.rows(made.row(made.condition(), planning_ms=np.nan)))
     assert "per episode of a batch [ms]" not in without.headings
     assert {len(row) for row in without.rows} == {len(without.headings)}
     assert without.rows[0][-1] == "–"
     others = [(name, value, n) for name in LABELS for n, value in enumerate("abc", 1)]
     every = made.rows(
-        *([made.row(made.trial(**{name: value}), i) for i in range(n)] for name, value, n in others),
-        (made.row(made.trial(), 0, seed=seed) for seed in (0, 1)),
+        *([made.row(made.condition(**{name: value}), i) for i in range(n)] for name, value, n in others),
+        (made.row(made.condition(), 0, seed=seed) for seed in (0, 1)),
     )
     assert {*LABELS, "maps", "episodes"} <= {heading for heading, _ in table_of(every).explained}
 
@@ -89,22 +99,22 @@ def test_bold_is_what_is_not_worse_than_the_best_where_another_is() -> None:
     rates = {"mean": 10, "var": 28, "cvar": 30}
     rows = made.rows(
         *(
-            [made.row(made.trial(risk=r), i, 20.0 if i < n else None) for i in range(30)]
+            [made.row(made.condition(risk=r), i, 20.0 if i < n else None) for i in range(30)]
             for r, n in rates.items()
         ),
-        (made.row(made.trial(model="oracle"), i) for i in range(30)),
+        (made.row(made.condition(model="oracle"), i) for i in range(30)),
     )
     table = table_of(rows)
     rate = table.headings.index("Succ. [%]")
     assert table.bold == {(1, rate), (2, rate)}
     assert table.bold_note == (
         "not significantly worse than the highest success rate of its block (max-T sign-flip test by map over the "
-        "block, step by step, p ≥ 0.05); in blocks where nothing is significantly worse none is bold; what is told the "
-        "truth (oracle) does not compete."
+        "block, step by step, p ≥ 0.05); in blocks where nothing is significantly worse none is bold; privileged "
+        "models (oracle) do not compete."
     )
     alike = table_of(rows[rows["risk"].isin(["var", "cvar"]) & (rows["model"] != "oracle")])
     assert (alike.bold, alike.bold_note) == (frozenset(), "")
-    alone = table_of(made.rows(made.row(made.trial())))
+    alone = table_of(made.rows(made.row(made.condition())))
     assert (alone.bold, alone.bold_note) == (frozenset(), "")
 
 
@@ -114,26 +124,31 @@ def test_labels_that_differ_are_shown_and_others_are_not() -> None:
         assert {len(row) for row in table.rows} == {len(table.headings)}
         return table.headings[: table.labels]
 
-    one = made.trial()
+    one = made.condition()
     assert headings(one) == ("scenario", "planner", "risk")
-    assert headings(one, made.trial(**BLIND)) == ("scenario", "planner", "risk")
+    assert headings(one, made.condition(**BLIND)) == ("scenario", "planner", "risk")
     for name in ("data", "world", "robot", "objective", "model"):
-        assert name in headings(one, made.trial(**{name: "another"}))
-    several = headings(one, made.trial(model="mdn"), made.trial(**BLIND), made.trial(world="stakes"))
+        assert name in headings(one, made.condition(**{name: "another"}))
+    several = headings(
+        one, made.condition(model="mdn"), made.condition(**BLIND), made.condition(world="stakes")
+    )
     assert several == ("scenario", "world", "model", "planner", "risk")
 
 
 def test_a_blind_planner_has_neither_risk_nor_model() -> None:
-    table = table_of(made.rows(made.row(made.trial(model=m)) for m in ("a", "b")))
+    table = table_of(made.rows(made.row(made.condition(model=m)) for m in ("a", "b")))
     blind = table_of(
-        made.rows(made.row(labels) for labels in (made.trial(**BLIND), made.trial(), made.trial(model="b")))
+        made.rows(
+            made.row(labels)
+            for labels in (made.condition(**BLIND), made.condition(), made.condition(model="b"))
+        )
     )
     assert [row[1] for row in table.rows] == ["a", "b"]
     assert blind.rows[0][:4] == ("std", "–", "straight", "–")
 
 
 def test_numbers_of_maps_and_episodes_are_shown_where_they_are_not_the_same() -> None:
-    few, many = made.trial("mppi"), made.trial("cl_rrt")
+    few, many = made.condition("mppi"), made.condition("cl_rrt")
     episodes = [made.row(few, i) for i in range(2)]
     same = table_of(made.rows(episodes, (made.row(many, i) for i in range(2))))
     assert "maps" not in same.headings
@@ -149,9 +164,9 @@ def test_numbers_of_maps_and_episodes_are_shown_where_they_are_not_the_same() ->
     assert [row[3] for row in more_seeds.rows] == ["2", "4"]
 
 
-def test_notes_are_numbered_once_and_marked_at_every_trial_they_hold_for() -> None:
+def test_notes_are_numbered_once_and_marked_at_every_condition_they_hold_for() -> None:
     episodes = made.rows(
-        made.row(made.trial(planner, risk), compiled=False)
+        made.row(made.condition(planner, risk), compiled=False)
         for planner in ("mppi", "a", "b")
         for risk in ("mean", "cvar")
     )
@@ -163,7 +178,7 @@ def test_notes_are_numbered_once_and_marked_at_every_trial_they_hold_for() -> No
 
 @pytest.mark.parametrize("follows", ["", "J"])
 def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows: str) -> None:
-    table = table_of(made.rows(made.row(made.trial(), compiled=False)), mppi={"follows": follows})
+    table = table_of(made.rows(made.row(made.condition(), compiled=False)), mppi={"follows": follows})
     assert table.rows[0][1] == "mppi"
     assert table.notes == ()
 
@@ -177,14 +192,14 @@ def test_a_planner_that_follows_the_users_objective_alone_needs_no_note(follows:
     ],
 )
 def test_failures_in_words(outcomes: list[str], expected: str) -> None:
-    labels = made.trial()
+    labels = made.condition()
     failed = (made.row(labels, i, None, outcome=outcome) for i, outcome in enumerate(outcomes))
     summary = made.summarised(made.rows(made.row(labels, 99), failed))
     assert failures_in_words(summary.to_dict("records")[0]) == expected
 
 
 def test_one_failure_of_many_does_not_read_as_none() -> None:
-    labels = made.trial()
+    labels = made.condition()
     episodes = made.rows(made.row(labels, i, 30.0 if i else None) for i in range(200))
     assert table_of(episodes).rows[0][table_of(episodes).labels] == "99.5"
     assert r"99.5 {\scriptsize" in paper_table(made.summary(episodes), "run")
@@ -194,11 +209,11 @@ def test_groups_are_counted_and_named_where_there_are_such() -> None:
     def grouped(labels: dict[str, str], maps: int) -> list[dict]:  # type: ignore[type-arg]
         return [made.row(labels, i, 30.0 if i < 20 else None, group=i // 2) for i in range(maps)]
 
-    table = table_of(made.rows(grouped(made.trial(risk="a"), 40), grouped(made.trial(risk="b"), 36)))
+    table = table_of(made.rows(grouped(made.condition(risk="a"), 40), grouped(made.condition(risk="b"), 36)))
     assert table.headings[3:6] == ("groups", "maps", "episodes")
     assert [row[3:5] for row in table.rows] == [("20", "40"), ("18", "36")]
-    worse = [made.row(made.trial(risk="c"), i, None, group=i // 2) for i in range(40)]
-    text = table_of(made.rows(grouped(made.trial(risk="a"), 40), worse)).bold_note
+    worse = [made.row(made.condition(risk="c"), i, None, group=i // 2) for i in range(40)]
+    text = table_of(made.rows(grouped(made.condition(risk="a"), 40), worse)).bold_note
     assert "by group over the block" in text
-    paper = paper_table(made.summary(made.rows(grouped(made.trial(), 40))), "run")
+    paper = paper_table(made.summary(made.rows(grouped(made.condition(), 40))), "run")
     assert "on 40 maps in 20 groups a scenario" in paper

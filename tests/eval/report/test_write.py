@@ -15,30 +15,35 @@ from tests.eval.report import made
 
 
 def episodes() -> pd.DataFrame:
-    blind = made.trial("straight", "–", model="–")
+    blind = made.condition("straight", "–", model="–")
     return made.rows(
-        (made.row(made.trial(p), i, seed=s) for p in ("mppi", "cl_rrt") for i in range(2) for s in (0, 7)),
+        (
+            made.row(made.condition(p), i, seed=s)
+            for p in ("mppi", "cl_rrt")
+            for i in range(2)
+            for s in (0, 7)
+        ),
         (made.row(blind, i, None, seed=s, outcome="stuck") for i in range(2) for s in (0, 7)),
     )
 
 
 def draws(rows: pd.DataFrame) -> list[list[int]]:
-    """How often a trial was run, as `run.json` says it."""
-    counted = rows.groupby(["seed", "realisation"], sort=False)["instance"].nunique()
+    """How often a condition was run, as `run.json` says it."""
+    counted = rows.groupby(["seed", "realisation"], sort=False)["map"].nunique()
     return [[seed, realisation, count] for (seed, realisation), count in counted.items()]
 
 
 def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
-    """A run folder with what a report reads of it; parts of the trials stand in for any."""
+    """A run folder with what a report reads of it; parts of the conditions stand in for any."""
     parts = {
         kind: {"part": kind, "options": {}} for kind in ("model", "risk", "planner", "robot", "objective")
     }
-    known = made.trials(rows, cl_rrt={"follows": "its own time"})
+    known = made.conditions(rows, cl_rrt={"follows": "its own time"})
     known = {
         name: about
         | {
             "value": {"data": "paper-v1", "split": "test/std", **parts, **made.PAPER},
-            "draws": draws(rows[rows["trial"] == name]),
+            "draws": draws(rows[rows["condition"] == name]),
         }
         for name, about in known.items()
     }
@@ -66,7 +71,7 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
     for line in (
         "- World paper: λ resampled, T = 100 s, free where the risk map is above 0.3.",
         "- Data: paper-v1. Models: paper-v1. Seeds: 0, 7.",
-        "- Each trial: 4 episodes on 2 maps.",
+        "- Each condition: 4 episodes on 2 maps.",
         "¹ minimises, in place of the task's J: its own time",
         "    benchnav-eval run --seeds '[0,7]'",
     ):
@@ -100,9 +105,9 @@ def test_report_has_its_files_and_gives_the_summary(tmp_path: Path) -> None:
 def test_options_of_planners_stand_in_the_header(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", episodes())
     about = json.loads((folder / "run.json").read_text())
-    for trial in about["trials"].values():
-        if trial["labels"]["planner"] == "cl_rrt":
-            trial["changed"] = ["expansions = 64", "follower.speed_mps = 0.5"]
+    for condition in about["conditions"].values():
+        if condition["labels"]["planner"] == "cl_rrt":
+            condition["changed"] = ["expansions = 64", "follower.speed_mps = 0.5"]
     write_run(folder, about)
     line = "Planner options: cl_rrt expansions = 64, cl_rrt follower.speed_mps = 0.5."
     assert line in read_report(folder).header
@@ -111,14 +116,14 @@ def test_options_of_planners_stand_in_the_header(tmp_path: Path) -> None:
 def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
     rows = episodes()
     folder = run_folder(tmp_path / "run", rows)
-    for name, group in rows.groupby("trial", sort=False):
+    for name, group in rows.groupby("condition", sort=False):
         labels = {
             label: group[label].iloc[0] for label in ("planner", "risk", "scenario", "model", "data", "world")
         }
         about = {
-            "trial": str(name),
+            "condition": str(name),
             **labels,
-            "instance": "0",
+            "map": "0",
             "seed": "0",
             "realisation": "0",
             "outcome": "stuck",
@@ -133,9 +138,11 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
 
 
 def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
-    rows = made.rows(made.row(made.trial(world="stakes"), i, None, outcome="immobilised") for i in range(5))
+    rows = made.rows(
+        made.row(made.condition(world="stakes"), i, None, outcome="immobilised") for i in range(5)
+    )
     folder = run_folder(tmp_path / "run", rows)
-    about = {**made.held_recording().about, "trial": rows["trial"][0]}
+    about = {**made.held_recording().about, "condition": rows["condition"][0]}
     write_playback(folder, "a", made.held_recording(about=about))
     write_report(folder)
     text = (folder / "summary.md").read_text()
@@ -144,7 +151,7 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("outcome", ["planner_error", "model_error"])
 def test_tracebacks_are_pointed_at(outcome: str, tmp_path: Path) -> None:
-    rows = made.rows(made.row(made.trial(), 0), made.row(made.trial(), 1, None, outcome=outcome))
+    rows = made.rows(made.row(made.condition(), 0), made.row(made.condition(), 1, None, outcome=outcome))
     folder = run_folder(tmp_path / "run", rows)
     warning = read_report(folder).warnings[0]
     assert warning.startswith("In 1 episode a planner or model failed")
@@ -179,32 +186,32 @@ def test_an_unfinished_run_and_no_run_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_share_of_lambda_drawn_again_is_that_of_frozen_worlds_whatever_failed(tmp_path: Path) -> None:
-    """Two trials met the same three draws, of which one was the third; one of a resampled world met none."""
+    """Two conditions met the same three draws, of which one was the third; one of a resampled world met none."""
     worlds = {"a": "frozen", "b": "frozen", "c": "resampled"}
-    trials = {name: {"value": {"world": {"noise": noise}}} for name, noise in worlds.items()}
+    conditions = {name: {"value": {"world": {"noise": noise}}} for name, noise in worlds.items()}
     rows = pd.DataFrame(
         {
-            "trial": ["a"] * 2 + ["b"] * 2 + ["c"] * 2,
+            "condition": ["a"] * 2 + ["b"] * 2 + ["c"] * 2,
             "data": "d", "scenario": "std", "seed": 0, "realisation": 0,
             "world": ["stakes"] * 4 + ["paper"] * 2,
-            "instance": [0, 1] * 3,
-            "redrawn": [0, 0, 2, 0, 0, 0],  # the model of the first failed: it drew nothing
+            "map": [0, 1] * 3,
+            "rejected_draws": [0, 0, 2, 0, 0, 0],  # the model of the first failed: it drew nothing
         }
     )  # fmt: skip
-    (line,) = write._redrawn(rows, trials)
+    (line,) = write._rejected_draws(rows, conditions)
     assert line.startswith("Of the draws of λ 50.0 %")
-    assert write._redrawn(rows[rows["trial"] == "c"], trials) == []
+    assert write._rejected_draws(rows[rows["condition"] == "c"], conditions) == []
 
 
 def test_a_sweep_has_its_figure(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.trial(risk=f"cvar:{level}"), i) for level in (0.5, 0.8, 0.9) for i in range(2)
+        made.row(made.condition(risk=f"cvar:{level}"), i) for level in (0.5, 0.8, 0.9) for i in range(2)
     )
     folder = run_folder(tmp_path / "run", rows)
     about = json.loads((folder / "run.json").read_text())
-    for trial in about["trials"].values():
-        part, _, level = trial["labels"]["risk"].partition(":")
-        trial["value"]["risk"] = {"part": part, "options": {"level": float(level)}}
+    for condition in about["conditions"].values():
+        part, _, level = condition["labels"]["risk"].partition(":")
+        condition["value"]["risk"] = {"part": part, "options": {"level": float(level)}}
     write_run(folder, about)
     write_report(folder)
     assert (folder / "figures" / "over-level.pdf").stat().st_size > 1000

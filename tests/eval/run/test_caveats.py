@@ -18,13 +18,13 @@ from benchnav.share import Share
 
 FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
 LINE = "left out: planner Steering with robot bicycle, which it cannot steer"
-WARNING = "warning: in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"
+WARNING = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within T"
 
 
 def suite_on(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": (FREE, STEERING), "risks": ("mean", "cvar:0.5"),
-        "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "instances": 2, "record": "none", "steps": "none",
+        "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "maps": 2, "record": "none", "steps": "none",
         "time_budget_s": 3.0,
     }  # fmt: skip
     return Suite(**(given | changes))
@@ -38,7 +38,9 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     list(run_suite(suite_on(dataset_path), folder, say=said.append))
     assert {LINE, WARNING} <= set(said)
     run = open_run(folder)
-    pairs = {(trial.labels["planner"], trial.labels["robot"]) for trial, _ in run.trials.values()}
+    pairs = {
+        (condition.labels["planner"], condition.labels["robot"]) for condition, _ in run.conditions.values()
+    }
     assert pairs == {("Faulty", "unicycle"), ("Faulty", "bicycle"), ("Steering", "unicycle")}
     (dropped,) = run.about["dropped"]
     assert (dropped["planner"], dropped["robot"]) == ("Steering", "bicycle")
@@ -55,7 +57,7 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
         assert line in text.partition("|---|")[2]
         assert line in page
         assert line in (folder / "summary.tex").read_text()
-    # The family of tests is that of the trials that were run.
+    # The family of tests is that of the conditions that were run.
     compared, shown = compare_runs([folder], "", "mean", {}, 0.05)
     assert len(compared) == 3
     assert {LINE, WARNING} <= set(shown.notes)

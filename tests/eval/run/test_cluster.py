@@ -30,7 +30,7 @@ distributed = pytest.importorskip("distributed")
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 600  # a busy machine takes its time to start processes
-KEYS = ["trial", "seed", "realisation", "instance"]
+KEYS = ["condition", "seed", "realisation", "map"]
 
 
 class Cluster:
@@ -83,7 +83,7 @@ def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
     held = {"part": "tests.eval.parts:Held", "label": "held", "options": {"log": str(log)}}
     given = {
         "data": str(dataset), "model": "oracle", "planners": (held,), "risks": ("mean", "cvar"),
-        "scenarios": ("std", "hs"), "instances": 2, "seeds": (0, 1), "noise": "stored", "time_budget_s": 30.0,
+        "scenarios": ("std", "hs"), "maps": 2, "seeds": (0, 1), "noise": "stored", "time_budget_s": 30.0,
     } | changes  # fmt: skip
     return Suite(**given)  # type: ignore[arg-type]
 
@@ -188,8 +188,8 @@ def test_a_worker_is_told_all_that_its_maps_have_to_be(dataset_path: Path, tmp_p
     suite = suite_on(dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,))
     list(run_suite(suite, tmp_path / "run"))
     run = open_run(tmp_path / "run")
-    (unit,) = units(run.trials, Keep())
-    assert cluster._subset(run.about, unit)["datasets"] == provenance.describe_maps(run.trials)
+    (unit,) = units(run.conditions, Keep())
+    assert cluster._subset(run.about, unit)["datasets"] == provenance.describe_maps(run.conditions)
 
 
 def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
@@ -213,7 +213,7 @@ def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
             "--overwrite",
         )
         words += (
-            "--instances",
+            "--maps",
             "1",
             "--out",
             str(tmp_path / "run"),
@@ -294,7 +294,7 @@ def test_a_worker_runs_units_on_the_device_of_the_run(
     suite = suite_on(dataset_path, tmp_path / "log", scenarios=("std",), seeds=(0,))
     list(run_suite(suite, tmp_path / "run"))
     run = open_run(tmp_path / "run")
-    unit = next(iter(units(run.trials, Keep())))
+    unit = next(iter(units(run.conditions, Keep())))
     worker = SimpleNamespace(
         address="tcp://w", local_directory=str(tmp_path), state=SimpleNamespace(nthreads=1)
     )

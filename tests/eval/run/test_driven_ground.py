@@ -19,8 +19,8 @@ PLANNERS = ("straight", "tests.eval.parts:Faulty")
 
 
 def on_map(folder: Path, about: Mapping[str, Any]) -> list[Recording]:
-    """The recordings of a run on one map under one draw of luck."""
-    named = ("scenario", "seed", "realisation", "instance")
+    """The recordings of a run on one map under one draw of λ."""
+    named = ("scenario", "seed", "realisation", "map")
     return [one for one in recordings(folder) if all(one.about[name] == str(about[name]) for name in named)]
 
 
@@ -33,27 +33,27 @@ def test_the_map_that_is_kept_is_the_telling_one_with_λ_as_robots_met_it(
     same = on_map(folder, kept.about)
     assert len(same) == 2
     for recording in same:
-        for name in ("field", "holding", "rgb", "goal_m"):
+        for name in ("field", "immobilising", "rgb", "goal_m"):
             np.testing.assert_array_equal(getattr(kept, name), getattr(recording, name))
 
 
-def test_whichever_map_is_telling_is_kept_under_its_own_luck(dataset: Path, tmp_path: Path) -> None:
-    folder = run(dataset, tmp_path / "run", planners=PLANNERS, risks=("mean",), instances=2, realisations=2)
+def test_whichever_map_is_telling_is_kept_under_its_own_noise(dataset: Path, tmp_path: Path) -> None:
+    folder = run(dataset, tmp_path / "run", planners=PLANNERS, risks=("mean",), maps=2, realisations=2)
     rows = pd.read_parquet(folder / "episodes.parquet")
     fields = set()
-    for seed, realisation, instance in itertools.product(SEEDS, range(2), range(2)):
-        here = (rows["seed"] == seed) & (rows["realisation"] == realisation) & (rows["instance"] == instance)
+    for seed, realisation, map_index in itertools.product(SEEDS, range(2), range(2)):
+        here = (rows["seed"] == seed) & (rows["realisation"] == realisation) & (rows["map"] == map_index)
         # All succeed but one of the two on this map.
         arrived = ~here | (rows["planner"] == "straight")
         forge_rows(folder, rows.assign(outcome=np.where(arrived, "success", "timeout")))
         keep_ground(folder)
         kept = DrivenGround.load(folder / GROUND)
-        asked = {"seed": seed, "realisation": realisation, "instance": instance}
+        asked = {"seed": seed, "realisation": realisation, "map": map_index}
         assert {name: kept.about[name] for name in asked} == asked
         same = on_map(folder, kept.about)
         assert len(same) == 2
         for recording in same:
-            for name in ("field", "holding", "rgb", "goal_m"):
+            for name in ("field", "immobilising", "rgb", "goal_m"):
                 np.testing.assert_array_equal(getattr(kept, name), getattr(recording, name))
         assert kept.field is not None
         fields.add(kept.field.tobytes())

@@ -17,7 +17,7 @@ def run(
     faulty = {"part": "tests.eval.parts:Faulty", "label": "faulty", "options": {"fault": fault}}
     given = {
         "data": str(dataset_path), "model": "oracle", "planners": (faulty,), "risks": ("mean",),
-        "scenarios": ("std",), "instances": 2, "noise": "stored", "time_budget_s": 30.0, "record": "none",
+        "scenarios": ("std",), "maps": 2, "noise": "stored", "time_budget_s": 30.0, "record": "none",
     } | changes  # fmt: skip
     for _ in run_suite(Suite(**given), folder, jobs, planner_limit_s=limit_s):  # type: ignore[arg-type]
         pass
@@ -151,7 +151,7 @@ def test_a_raise_in_a_process_of_its_own_keeps_its_traceback(dataset_path: Path,
     assert 'raise RuntimeError("no way on")' in (tmp_path / "run" / ERRORS).read_text()
 
 
-def test_a_model_that_raises_ends_its_own_trials_alone(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_model_that_raises_ends_its_own_conditions_alone(dataset_path: Path, tmp_path: Path) -> None:
     rows = run(dataset_path, tmp_path / "run", "none", jobs=2, models=("oracle", "tests.eval.parts:Broken"))
     by_model = {model: set(group["outcome"]) for model, group in rows.groupby("model")}
     assert by_model.pop("oracle") == {"success"}

@@ -17,7 +17,7 @@ from benchnav.eval.suite import Suite
 from benchnav.share import Share
 from tests.eval.conftest import MOST_STEPS
 
-INSTANCES = 3
+MAPS = 3
 
 
 @pytest.fixture(autouse=True)
@@ -28,13 +28,13 @@ def whole(monkeypatch: pytest.MonkeyPatch) -> None:
 def suite_on(dataset: Path, *planners: Any, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": planners, "risks": ("mean",), "record": "none",
-        "scenarios": ("std",), "instances": INSTANCES - 1, "steps": "none", "time_budget_s": 4.0,
+        "scenarios": ("std",), "maps": MAPS - 1, "steps": "none", "time_budget_s": 4.0,
     }  # fmt: skip
     return Suite(**(given | changes))
 
 
 def latencies(folder: Path) -> list[Any]:
-    return [entry.get("latency") for entry in open_run(folder).about["trials"].values()]
+    return [entry.get("latency") for entry in open_run(folder).about["conditions"].values()]
 
 
 def test_a_step_of_one_robot_is_timed_with_its_replanning_and_without_the_first(
@@ -47,8 +47,8 @@ def test_a_step_of_one_robot_is_timed_with_its_replanning_and_without_the_first(
     list(run_suite(suite, tmp_path / "run"))
     found = latencies(tmp_path / "run")
     by_planner = {
-        trial.labels["planner"]: entry
-        for (trial, _), entry in zip(open_run(tmp_path / "run").trials.values(), found, strict=True)
+        condition.labels["planner"]: entry
+        for (condition, _), entry in zip(open_run(tmp_path / "run").conditions.values(), found, strict=True)
     }
     assert by_planner["bad"] is None
     assert found.count(by_planner["timed"]) == 2  # one measurement for both risk settings
@@ -56,7 +56,7 @@ def test_a_step_of_one_robot_is_timed_with_its_replanning_and_without_the_first(
     assert timed_ms["steps"] == 39
     assert 4 <= timed_ms["median_ms"] < 30
     assert 40 <= timed_ms["p95_ms"] <= timed_ms["max_ms"]
-    # Each trial's batch of two, then one robot alone, once.
+    # Each condition's batch of two, then one robot alone, once.
     sizes = [line.split()[0] for line in log.read_text().splitlines()]
     assert sizes == ["2"] * 80 + ["1"] * 40
     report = read_report(tmp_path / "run")
@@ -70,11 +70,11 @@ def test_long_episodes_are_left_and_what_was_measured_stays(dataset_path: Path, 
     plain = {"part": "tests.eval.parts:Faulty", "label": "plain", "options": {"fault": "none"}}
     slow = {"part": "unicycle", "label": "slow", "options": {"speed_mps": [0.0, 0.1]}}
     still = {"part": "tests.eval.parts:Still", "label": "still"}
-    suite = suite_on(dataset_path, still, time_budget_s=30.0, instances=1)
+    suite = suite_on(dataset_path, still, time_budget_s=30.0, maps=1)
     list(run_suite(suite, tmp_path / "run"))
     (first,) = latencies(tmp_path / "run")
     assert first["steps"] == 100
-    more = suite_on(dataset_path, still, plain, time_budget_s=30.0, instances=1, robots=("unicycle", slow))
+    more = suite_on(dataset_path, still, plain, time_budget_s=30.0, maps=1, robots=("unicycle", slow))
     list(run_suite(more, tmp_path / "run"))
     found = latencies(tmp_path / "run")
     assert found[0] == first
@@ -83,7 +83,7 @@ def test_long_episodes_are_left_and_what_was_measured_stays(dataset_path: Path, 
 
 def test_shards_measure_their_own_and_their_run_has_all(dataset_path: Path, tmp_path: Path) -> None:
     plain = {"part": "tests.eval.parts:Faulty", "label": "plain"}
-    suite = suite_on(dataset_path, plain, "straight", seeds=(0, 1), instances=1)
+    suite = suite_on(dataset_path, plain, "straight", seeds=(0, 1), maps=1)
     parts = [tmp_path / "1", tmp_path / "2"]
     for index, part in enumerate(parts, start=1):
         list(run_suite(suite, part, shard=Share(index=index, of=2)))
@@ -97,7 +97,7 @@ def test_the_planner_is_run_as_its_episodes_are(limit: float, dataset_path: Path
     folder = tmp_path / "pids"
     folder.mkdir()
     held = {"part": "tests.eval.parts:Held", "options": {"log": str(folder / "log")}}
-    list(run_suite(suite_on(dataset_path, held, instances=1), tmp_path / "run", planner_limit_s=limit))
+    list(run_suite(suite_on(dataset_path, held, maps=1), tmp_path / "run", planner_limit_s=limit))
     processes = (folder / "log").read_text().split()
     assert len(processes) == 2
     assert processes.count(str(os.getpid())) == (0 if limit else 2)

@@ -50,10 +50,10 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
         for label, gain in GAINS.items()
     )
     suite = Suite(
-        data=str(dataset.path), scenarios=SCENARIOS, planners=spies, risks=tuple(RISKS), instances=0,
+        data=str(dataset.path), scenarios=SCENARIOS, planners=spies, risks=tuple(RISKS), maps=0,
         seeds=SEEDS, realisations=REALISATIONS, time_budget_s=0.6,
         model={"part": "oracle", "label": "truth"}, record="none",
-        trials=({"world": [{"noise": "resampled"}, {"noise": "stored"}]},),
+        conditions=({"world": [{"noise": "resampled"}, {"noise": "stored"}]},),
     )  # fmt: skip
     for _ in run_suite(suite, folder / "run", jobs=2):
         pass
@@ -66,23 +66,23 @@ def risk_maps(dataset: TerrainDataset, scenario: str, risk: str) -> torch.Tensor
     return RISKS[risk](dataset.terrain(f"test/{scenario}").truth)
 
 
-def luck(
-    dataset: TerrainDataset, scenario: str, instance: int, seed: int, realisation: int, noise: str
+def expected_noise(
+    dataset: TerrainDataset, scenario: str, map_index: int, seed: int, realisation: int, noise: str
 ) -> np.ndarray:
     """λ of the first three steps at the start, from the streams."""
-    terrain = dataset.terrain(f"test/{scenario}", [instance])
+    terrain = dataset.terrain(f"test/{scenario}", [map_index])
     row, column = int(4.0 // 0.5), int(3.0 // 0.5)
     if noise == "stored":
         return np.full(3, float(terrain.traversability[0, row, column]))
     names = (f"test/{scenario}", realisation) if realisation else (f"test/{scenario}",)
-    key = rng.stream_key(rng.stream_key(seed, "simulation", *names), instance)
+    key = rng.stream_key(rng.stream_key(seed, "simulation", *names), map_index)
     drawn = rng.normal(key, np.zeros(1, np.int64), (6,))[0, :3]
     mean, std = (t[0, 0, row, column] for t in (terrain.truth.means, terrain.truth.stds))
     return np.clip(float(mean) + float(std) * drawn, 0, 1)
 
 
 def identify(dataset: TerrainDataset, note: dict[str, Any]) -> tuple[str, str, tuple[int, ...]]:
-    """Scenario, risk and instances of a unit, told by the maps it was given."""
+    """Scenario, risk and maps of a unit, told by the maps it was given."""
     for scenario in SCENARIOS:
         for risk in RISKS:
             maps = risk_maps(dataset, scenario, risk)
@@ -98,12 +98,12 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
     notes, _ = ran
     met: Counter[tuple[Any, ...]] = Counter()
     for note in notes:
-        scenario, risk, instances = identify(dataset, note)
-        terrain = dataset.terrain(f"test/{scenario}", instances)
+        scenario, risk, maps = identify(dataset, note)
+        terrain = dataset.terrain(f"test/{scenario}", maps)
         assert torch.equal(note["rgb"], terrain.rgb)
         torch.testing.assert_close(note["motion_map"], note["risk_map"].clamp(min=0.3))
         away = note["free"] != (note["risk_map"] > 0.3)
-        assert away.sum() <= 40 * len(instances)  # the goal's disc alone
+        assert away.sum() <= 40 * len(maps)  # the goal's disc alone
         (seed,) = (
             s
             for s in SEEDS
@@ -113,20 +113,22 @@ def test_each_unit_meets_its_own_maps_risk_seed_noise_and_options(
         (realisation,) = (
             r for r in range(REALISATIONS) if _planner_seed(seed, scenario, r) == note["generator"]
         )
-        felt = note["felt"].numpy()
+        observed = note["observed"].numpy()
         noises = [
             noise
             for noise in WORLDS.values()
             if np.allclose(
-                felt,
-                np.stack([luck(dataset, scenario, i, seed, realisation, noise) for i in instances], axis=1),
+                observed,
+                np.stack(
+                    [expected_noise(dataset, scenario, i, seed, realisation, noise) for i in maps], axis=1
+                ),
                 atol=1e-5,
             )
         ]
-        assert len(noises) == 1, "λ met is that of no noise under this unit's seed and instances"
-        met[scenario, risk, instances, seed, realisation, noises[0], note["gain"]] += 1
-        assert note["goal_m"].tolist() == [[15.0, 9.0]] * len(instances)
-        assert note["start"][:, :2].tolist() == [[3.0, 4.0]] * len(instances)
+        assert len(noises) == 1, "observed λ is that of no noise under this unit's seed and maps"
+        met[scenario, risk, maps, seed, realisation, noises[0], note["gain"]] += 1
+        assert note["goal_m"].tolist() == [[15.0, 9.0]] * len(maps)
+        assert note["start"][:, :2].tolist() == [[3.0, 4.0]] * len(maps)
         assert note["time_budget_s"] == pytest.approx(0.6)
         assert note["components"] == 1
     blocks = (tuple(range(50)), tuple(range(50, MAPS)))
@@ -155,21 +157,23 @@ def test_each_row_is_that_of_its_own_episode(
 ) -> None:
     _, rows = ran
     assert len(rows) == 2 * 2 * 2 * 2 * 2 * 2 * MAPS
-    keys = ["scenario", "risk", "planner", "world", "seed", "realisation", "instance"]
+    keys = ["scenario", "risk", "planner", "world", "seed", "realisation", "map"]
     assert not rows.duplicated(keys).any()
     assert set(rows["planner"]) == set(GAINS)
     assert set(rows["risk"]) == set(RISKS)
     assert set(rows["world"]) == set(WORLDS)
     assert set(rows["model"]) == {"truth"}
-    assert rows["trial"].nunique() == 16
+    assert rows["condition"].nunique() == 16
     assert set(rows["outcome"]) == {"stalled"} or set(rows["outcome"]) == {"timeout"}
     stored = rows[rows["world"].str.contains("stored")]
     for row in stored.sample(40, random_state=0).to_dict("records"):
-        expected = luck(dataset, row["scenario"], row["instance"], row["seed"], row["realisation"], "stored")
+        expected = expected_noise(
+            dataset, row["scenario"], row["map"], row["seed"], row["realisation"], "stored"
+        )
         assert row["traversability"] == pytest.approx(expected[0], abs=1e-5)
     drawn = rows[~rows["world"].str.contains("stored")]
-    # Planners and risk settings meet the same luck; seeds, realisations and instances do not.
-    same = drawn.groupby(["scenario", "seed", "realisation", "instance"])["traversability"].nunique()
+    # Planners and risk settings meet the same noise; seeds, realisations and maps do not.
+    same = drawn.groupby(["scenario", "seed", "realisation", "map"])["traversability"].nunique()
     assert set(same) == {1}
-    other = drawn.groupby(["scenario", "instance"])["traversability"].nunique()
+    other = drawn.groupby(["scenario", "map"])["traversability"].nunique()
     assert set(other) == {len(SEEDS) * REALISATIONS}

@@ -22,7 +22,7 @@ from benchnav.eval.suite import Suite
 from tests import factories
 
 MAPS, SEEDS, REALISATIONS, RATIO = 53, (3, 4), 2, 0.05
-WORLDS = {0.5: 0.05, 2.0: 0.6}  # ℓ in metres, and what λ holds a robot
+WORLDS = {0.5: 0.05, 2.0: 0.6}  # ℓ in metres, and what λ immobilises a robot
 BLOCKS = (tuple(range(50)), tuple(range(50, MAPS)))
 
 
@@ -52,7 +52,7 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
     suite = Suite(
         data=str(dataset.path), scenarios=("std",), models=("oracle", "clairvoyant"), risks=("mean", "cvar:0.5"),
         planners=({"part": "tests.eval.parts:Spy", "options": {"log": str(folder / "log")}},),
-        seeds=SEEDS, realisations=REALISATIONS, instances=0, record="none", trials=({"world": worlds},),
+        seeds=SEEDS, realisations=REALISATIONS, maps=0, record="none", conditions=({"world": worlds},),
     )  # fmt: skip
     for _ in run_suite(suite, folder / "run", jobs=2):
         pass
@@ -71,15 +71,15 @@ def has_way(ground: np.ndarray, start: tuple[int, int], goal: tuple[int, int]) -
 
 
 def field(
-    dataset: TerrainDataset, instance: int, seed: int, realisation: int, length: float
+    dataset: TerrainDataset, map_index: int, seed: int, realisation: int, length: float
 ) -> tuple[torch.Tensor, int]:
     """λ of an episode, and how often it was drawn again."""
-    terrain = dataset.terrain("test/std", [instance])
-    places = dataset.read("test/std", [instance], ["start_m", "goal_m"])
+    terrain = dataset.terrain("test/std", [map_index])
+    places = dataset.read("test/std", [map_index], ["start_m", "goal_m"])
     names = ("test/std", realisation) if realisation else ("test/std",)
-    luck = rng.stream_key(seed, "simulation", *names)
+    noise = rng.stream_key(seed, "simulation", *names)
     for attempt in range(100):
-        key = rng.stream_key(luck, instance, "field", attempt)
+        key = rng.stream_key(noise, map_index, "field", attempt)
         normal = correlated_normal(key, np.zeros(1, np.int64), (32, 32), length / 0.5)[0]
         mean, std = (t[0, 0].double().numpy() for t in (terrain.truth.means, terrain.truth.stds))
         met = np.clip(mean + std * normal, 0, 1)
@@ -88,7 +88,7 @@ def field(
     raise AssertionError("no way in a hundred draws")
 
 
-def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_instances(
+def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_maps(
     dataset: TerrainDataset, ran: tuple[list[Any], pd.DataFrame]
 ) -> None:
     notes, _ = ran
@@ -115,15 +115,16 @@ def test_each_unit_meets_the_field_of_its_own_world_seed_realisation_and_instanc
         # Free by the mean, whatever the risk setting; motion at no less than 0.05.
         mean = truth.select(torch.tensor(rows)).mean()
         torch.testing.assert_close(note["motion_map"], note["risk_map"].clamp(min=0.05))
-        felt = note["felt"][0].double()
+        observed = note["observed"][0].double()
         starts = [cell(position) for position in places["start_m"][rows]]
         fitting = [
             key
             for key, known in fields.items()
-            if key[3] == block and np.allclose(felt, [known[b][at] for b, at in enumerate(starts)], atol=1e-5)
+            if key[3] == block
+            and np.allclose(observed, [known[b][at] for b, at in enumerate(starts)], atol=1e-5)
         ]
         assert len(fitting) == 1
-        assert torch.equal(note["felt"], note["felt"][:1].expand_as(note["felt"]))
+        assert torch.equal(note["observed"], note["observed"][:1].expand_as(note["observed"]))
         known = fields[fitting[0]]
         if torch.allclose(note["risk_map"].double(), known, atol=1e-5):
             setting = "clairvoyant"
@@ -148,10 +149,10 @@ def test_rows_tell_what_was_drawn_again_and_the_clairvoyant_runs_once(
     assert set(zip(rows["model"], rows["risk"], strict=True)) == {
         ("oracle", "mean"), ("oracle", "cvar:0.5"), ("clairvoyant", "–"),
     }  # fmt: skip
-    assert rows["redrawn"].max() > 0
+    assert rows["rejected_draws"].max() > 0
     for row in (
         rows[rows["world"].str.contains("correlation_m=2")].sample(20, random_state=1).to_dict("records")
     ):
-        told = field(dataset, row["instance"], row["seed"], row["realisation"], 2.0)
-        assert row["redrawn"] == told[1]
+        told = field(dataset, row["map"], row["seed"], row["realisation"], 2.0)
+        assert row["rejected_draws"] == told[1]
         assert row["total_time_s"] == pytest.approx(RATIO * row["reference_time_s"], rel=1e-4)

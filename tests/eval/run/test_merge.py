@@ -25,7 +25,7 @@ from benchnav.eval.suite import Suite
 from benchnav.share import Share
 
 OF = 3
-KEYS = ["trial", "seed", "realisation", "instance"]
+KEYS = ["condition", "seed", "realisation", "map"]
 BAD = {"part": "tests.eval.parts:Faulty", "label": "bad", "options": {"fault": "raise"}}
 
 
@@ -34,7 +34,7 @@ def suite(dataset_path: Path) -> Suite:
     """12 units of planners that need no time, of which one fails."""
     return Suite(
         data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty", BAD), risks=("mean",),
-        scenarios=("std", "hs"), instances=2, seeds=(0, 1, 2), noise="stored", time_budget_s=30.0,
+        scenarios=("std", "hs"), maps=2, seeds=(0, 1, 2), noise="stored", time_budget_s=30.0,
     )  # fmt: skip
 
 
@@ -99,7 +99,7 @@ def test_merged_shards_are_the_run_of_one_process(whole: Path, parts: list[Path]
     same(whole, tmp_path / "all")
     first, merged = open_run(whole), open_run(tmp_path / "all")
     assert merged.shard is None
-    assert merged.trials == first.trials
+    assert merged.conditions == first.conditions
     assert merged.about["run_id"] not in {open_run(part).about["run_id"] for part in parts}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["all", *(part.name for part in parts)]
 
@@ -196,12 +196,12 @@ def change_run(part: Path, change: Callable[[dict], None]) -> None:  # type: ign
         (lambda about: about["parts"]["model oracle"].update(digest="0"), "model oracle"),
         (lambda about: next(iter(about["datasets"].values()))["maps"]["test/hs"].reverse(), "maps of .* test/hs"),
         (lambda about: about["shard"].update(of=4), "number of shards"),
-        (lambda about: about["trials"].popitem(), "lacks .*hs .*bad"),
+        (lambda about: about["conditions"].popitem(), "lacks .*hs .*bad"),
         (
-            lambda about: [(t["draws"].pop(), t["seeds"].pop()) for t in about["trials"].values()],
-            "seeds, realisations or instances",
+            lambda about: [(t["draws"].pop(), t["seeds"].pop()) for t in about["conditions"].values()],
+            "seeds, realisations or maps",
         ),
-        (lambda about: [t["labels"].update(risk="other") for t in about["trials"].values()], "labels"),
+        (lambda about: [t["labels"].update(risk="other") for t in about["conditions"].values()], "labels"),
     ],
 )  # fmt: skip
 def test_shards_of_other_runs_are_refused_by_what_differs(
@@ -261,7 +261,7 @@ def test_the_commands(  # type: ignore[no-untyped-def]
 
     run = (
         "run", "--data", str(dataset_path), "--model", "oracle", "--planners", "[tests.eval.parts:Faulty]",
-        "--risks", "[mean]", "--scenarios", "[std,hs]", "--instances", "2", "--time_budget_s", "30",
+        "--risks", "[mean]", "--scenarios", "[std,hs]", "--maps", "2", "--time_budget_s", "30",
         "--realisations", "2",
     )  # fmt: skip
     out = [str(tmp_path / name) for name in ("one", "two", "all")]

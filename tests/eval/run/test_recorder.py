@@ -44,7 +44,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(dataset: Path, folder: Path, say: Any = lambda line: None, **changes: Any) -> Path:
     stakes = {"preset": "stakes", "immobile": {"below": BELOW, "for_s": HELD_S}, "time_budget_ratio": 2.0}
-    given: dict[str, Any] = {"world": stakes, "instances": 4, "seeds": SEEDS, "record": "all"} | changes
+    given: dict[str, Any] = {"world": stakes, "maps": 4, "seeds": SEEDS, "record": "all"} | changes
     given = {"planners": ("straight",)} | given
     suite = Suite(data=str(dataset), scenarios=("std",), model="oracle", **given)
     for _ in run_suite(suite, folder, say=say):
@@ -57,14 +57,14 @@ def recordings(folder: Path) -> list[Recording]:
 
 
 def recorded(folder: Path) -> list[tuple[str, str, str]]:
-    """Which episodes are recorded, each with a file for the viewer: risk setting, seed and instance."""
+    """Which episodes are recorded, each with a file for the viewer: risk setting, seed and map."""
     stems = sorted(path.stem for path in (folder / "playback").glob("*.rrd"))
     assert stems == sorted(path.stem for path in (folder / "playback").glob("*.npz"))
-    return sorted((r.about["risk"], r.about["seed"], r.about["instance"]) for r in recordings(folder))
+    return sorted((r.about["risk"], r.about["seed"], r.about["map"]) for r in recordings(folder))
 
 
-def again(folder: Path, seed: int, instance: int) -> Recording:
-    ((unit, member),) = find_episodes(folder, {}, seed, 0, instance)
+def again(folder: Path, seed: int, map_index: int) -> Recording:
+    ((unit, member),) = find_episodes(folder, {}, seed, 0, map_index)
     return find_recording(folder, unit, member)
 
 
@@ -93,13 +93,13 @@ def test_a_recorded_field_is_what_the_robot_met_in_its_own_episode(stakes: Path)
 
 def test_a_recording_holds_the_problem_of_its_own_episode(dataset: Path, tmp_path: Path) -> None:
     task = {"free_space": {"by": "mean", "above": 0.6}}
-    folder = run(dataset, tmp_path / "run", instances=3, realisations=2, seeds=(3,), task=task)
-    ((trial, _),) = open_run(folder).trials.values()
+    folder = run(dataset, tmp_path / "run", maps=3, realisations=2, seeds=(3,), task=task)
+    ((condition, _),) = open_run(folder).conditions.values()
     taken = recordings(folder)
-    episodes = [tuple(int(r.about[name]) for name in ("seed", "realisation", "instance")) for r in taken]
+    episodes = [tuple(int(r.about[name]) for name in ("seed", "realisation", "map")) for r in taken]
     assert sorted(episodes) == list(itertools.product((3,), range(2), range(3)))
-    for recording, (seed, realisation, instance) in zip(taken, episodes, strict=True):
-        unit = Unit(trial=trial, seed=seed, realisation=realisation, instances=(instance,))
+    for recording, (seed, realisation, map_index) in zip(taken, episodes, strict=True):
+        unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=(map_index,))
         problem, simulation = build(unit, "again")
         assert simulation.field is not None
         for found, expected in (
@@ -123,9 +123,9 @@ def test_cells_that_hold_a_robot_are_those_under_the_worlds_own_limit(stakes: Pa
     ends = []
     for recording in recordings(stakes):
         assert recording.field is not None
-        np.testing.assert_array_equal(recording.holding, recording.field < np.float32(BELOW))
-        assert recording.holding.any()
-        held = recording.holding[cells(recording)]
+        np.testing.assert_array_equal(recording.immobilising, recording.field < np.float32(BELOW))
+        assert recording.immobilising.any()
+        held = recording.immobilising[cells(recording)]
         last = round(HELD_S / recording.dt_s)
         assert held[-last:].all() == (recording.about["outcome"] == "immobilised")
         ends.append(recording.about["outcome"])
@@ -137,14 +137,14 @@ def test_soft_ground_is_that_of_classes_with_soft_spots_on_the_episodes_own_map(
 ) -> None:
     assert len(recordings(stakes)) > 2
     for recording in recordings(stakes):
-        classes = TerrainDataset(dataset).read("test/std", [int(recording.about["instance"])], ["class_id"])
+        classes = TerrainDataset(dataset).read("test/std", [int(recording.about["map"])], ["class_id"])
         np.testing.assert_array_equal(recording.soft, np.isin(classes["class_id"][0], SOFT))
         assert 0 < recording.soft.mean() < 1
 
 
 def test_the_true_mean_is_that_of_the_episodes_own_map(dataset: Path, stakes: Path) -> None:
     for recording in recordings(stakes):
-        terrain = TerrainDataset(dataset).terrain("test/std", [int(recording.about["instance"])])
+        terrain = TerrainDataset(dataset).terrain("test/std", [int(recording.about["map"])])
         np.testing.assert_allclose(recording.true_mean, terrain.truth.mean()[0].numpy(), atol=1e-6)
         # The oracle's mean is the truth's.
         assert recording.true_mean.shape == recording.predicted.shape
@@ -155,10 +155,8 @@ def test_an_episode_that_is_run_again_is_recorded_on_its_own_ground(
 ) -> None:
     folder = run(dataset, tmp_path / "run", record="none")
     found = again(folder, SEEDS[0], 1)
-    (first,) = [
-        r for r in recordings(stakes) if (r.about["instance"], r.about["seed"]) == ("1", str(SEEDS[0]))
-    ]
-    for name in ("field", "soft", "holding", "states", "true_mean", "predicted", "free"):
+    (first,) = [r for r in recordings(stakes) if (r.about["map"], r.about["seed"]) == ("1", str(SEEDS[0]))]
+    for name in ("field", "soft", "immobilising", "states", "true_mean", "predicted", "free"):
         np.testing.assert_array_equal(getattr(found, name), getattr(first, name))
     assert (found.about, found.free_by, found.free_above) == (first.about, "mean", 0.1)
     assert recorded(folder) == [("–", str(SEEDS[0]), "1")]
@@ -169,12 +167,12 @@ def test_an_episode_that_is_run_again_is_recorded_on_its_own_ground(
 
 def test_what_is_recorded_is_not_run_again(stakes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchnav.eval.run.recorder.build", None)
-    assert again(stakes, SEEDS[1], 2).about["instance"] == "2"
+    assert again(stakes, SEEDS[1], 2).about["map"] == "2"
 
 
 @pytest.mark.parametrize("name", ["path_length_m", "traversability", "end_time_s", "outcome"])
 def test_an_episode_that_does_not_repeat_is_refused(name: str, dataset: Path, tmp_path: Path) -> None:
-    folder = run(dataset, tmp_path / "run", record="none", seeds=(), instances=2)
+    folder = run(dataset, tmp_path / "run", record="none", seeds=(), maps=2)
     again(folder, 0, 0)
     rows = pd.read_parquet(folder / "episodes.parquet")
     rows[name] = "planner_failure" if name == "outcome" else rows[name] + 0.1
@@ -186,10 +184,10 @@ def test_an_episode_that_does_not_repeat_is_refused(name: str, dataset: Path, tm
 @pytest.mark.parametrize(
     ("record", "expected"),
     [
-        ("none", lambda rows: rows["instance"] < 0),
-        ("first", lambda rows: (rows["instance"] == 0) & (rows["seed"] == SEEDS[0])),
+        ("none", lambda rows: rows["map"] < 0),
+        ("first", lambda rows: (rows["map"] == 0) & (rows["seed"] == SEEDS[0])),
         ("failures", lambda rows: ~rows["success"]),
-        ("all", lambda rows: rows["instance"] >= 0),
+        ("all", lambda rows: rows["map"] >= 0),
     ],
 )
 def test_what_is_asked_for_is_recorded(record: str, expected: Any, dataset: Path, tmp_path: Path) -> None:
@@ -199,14 +197,14 @@ def test_what_is_asked_for_is_recorded(record: str, expected: Any, dataset: Path
     given: dict[str, Any] = {"planners": (faulty,), "task": {"goal_radius_m": 30.0}, "record": record}
     folder = run(dataset, tmp_path / "run", risks=("mean", "cvar"), **given)
     rows = pd.read_parquet(folder / "episodes.parquet")
-    assert rows.groupby("instance")["success"].mean().tolist() == [0, 1, 1, 1]
-    asked = rows[expected(rows)].astype({"seed": str, "instance": str})
-    wanted = sorted(zip(asked["risk"], asked["seed"], asked["instance"], strict=True))
+    assert rows.groupby("map")["success"].mean().tolist() == [0, 1, 1, 1]
+    asked = rows[expected(rows)].astype({"seed": str, "map": str})
+    wanted = sorted(zip(asked["risk"], asked["seed"], asked["map"], strict=True))
     assert recorded(folder) == wanted
     other = tmp_path / "other"
-    run(dataset, other, risks=("mean",), **given | {"record": "none"}, instances=3)
+    run(dataset, other, risks=("mean",), **given | {"record": "none"}, maps=3)
     said: list[str] = []
-    run(dataset, other, risks=("mean",), **given, instances=3, say=said.append)
+    run(dataset, other, risks=("mean",), **given, maps=3, say=said.append)
     assert any("run again" in line for line in said) == (record != "none")
     run(dataset, other, risks=("mean", "cvar"), **given)
     assert recorded(other) == wanted
@@ -237,20 +235,20 @@ def test_plans_after_the_moment_of_figures_are_thinned(stakes: Path) -> None:
     ("world", "stays"),
     [("paper", False), ({"noise": "stored"}, True), ({"preset": "stakes", "immobile": None}, True)],
 )
-def test_where_nothing_holds_a_robot_no_cell_does(
+def test_where_nothing_immobilises_a_robot_no_cell_does(
     world: Any, stays: bool, dataset: Path, tmp_path: Path
 ) -> None:
     taken = recordings(run(dataset, tmp_path / "run", world=world, seeds=(), record="first"))
     assert len(taken) == 1
     for recording in taken:
         assert (recording.field is not None) == stays
-        assert not recording.holding.any()
+        assert not recording.immobilising.any()
         assert recording.soft.any()
 
 
 def test_ground_without_soft_spots_is_not_soft(dataset_path: Path, tmp_path: Path) -> None:
     (recording,) = recordings(
-        run(dataset_path, tmp_path / "run", world="paper", seeds=(), instances=2, record="first")
+        run(dataset_path, tmp_path / "run", world="paper", seeds=(), maps=2, record="first")
     )
     assert recording.soft.shape == (32, 32)
     assert not recording.soft.any()

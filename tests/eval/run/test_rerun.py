@@ -33,7 +33,7 @@ def suite(dataset_path: Path, tmp_path: Path) -> Suite:
     (tmp_path / "mine.py").write_text(MINE)
     shutil.copy(dataset_path, tmp_path / "tiny.h5")
     return Suite(
-        data=str(tmp_path / "tiny.h5"), model="oracle", risks=("mean",), scenarios=("std",), instances=2,
+        data=str(tmp_path / "tiny.h5"), model="oracle", risks=("mean",), scenarios=("std",), maps=2,
         planners=("tests.eval.parts:Faulty", f"{tmp_path / 'mine.py'}:Mine"), time_budget_s=30.0, noise="stored",
         record="none",
     )  # fmt: skip
@@ -59,7 +59,7 @@ def change_rows(run: Path, changes: Mapping[str, object], where: str) -> None:
 
 def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp_path: Path) -> None:
     run = finish(suite, tmp_path / "run")
-    finish(replace(suite, seeds=(3,), instances=1), run)
+    finish(replace(suite, seeds=(3,), maps=1), run)
     finish(replace(suite, scenarios=("hs",), realisations=2), run)
     comparison = repeat(run, tmp_path / "again")
     assert comparison.same
@@ -69,7 +69,7 @@ def test_a_run_that_was_extended_by_commands_is_repeated_whole(suite: Suite, tmp
         "nothing that is known of the environment differs",
     )
     first, second = open_run(run), open_run(tmp_path / "again")
-    assert second.trials == first.trials
+    assert second.conditions == first.conditions
     assert second.about["run_id"] != first.about["run_id"]
 
 
@@ -109,12 +109,12 @@ def test_rows_that_differ_are_counted_and_the_first_named(suite: Suite, tmp_path
     assert not comparison.same
     assert len(comparison.different) == 6
     lines = comparison.lines
-    assert lines[0] == "6 of 16 rows came out differently, in 1 of 2 trials:"
+    assert lines[0] == "6 of 16 rows came out differently, in 1 of 2 conditions:"
     assert "planner Mine" in lines[1]
     assert lines[1].endswith("6 rows")
     named = [line for line in lines if "outcome timeout → success" in line]
     assert len(named) == 5
-    assert "seed 1, realisation 0, instance 0: " in named[0]
+    assert "seed 1, realisation 0, map 0: " in named[0]
     assert "total_time_s 12.5 → " in named[0]
     time_s = pd.read_parquet(tmp_path / "again" / "episodes.parquet").query("planner == 'Mine' and seed > 0")
     greatest = (time_s["total_time_s"] - 12.5).abs().max()
@@ -222,11 +222,11 @@ def test_a_dataset_with_fewer_maps_is_told(suite: Suite, tmp_path: Path) -> None
         repeat(run, tmp_path / "again")
 
 
-def test_a_folder_of_other_trials_is_left_as_it_is(suite: Suite, tmp_path: Path) -> None:
+def test_a_folder_of_other_conditions_is_left_as_it_is(suite: Suite, tmp_path: Path) -> None:
     run = finish(suite, tmp_path / "run")
     other = finish(replace(suite, risks=("cvar",)), tmp_path / "other")
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
-    with pytest.raises(ConfigError, match="has other trials"):
+    with pytest.raises(ConfigError, match="has other conditions"):
         repeat(run, other)
     assert {path: path.read_bytes() for path in other.rglob("*") if path.is_file()} == before
 
@@ -286,7 +286,7 @@ def test_the_command_ends_with_0_1_or_2(  # type: ignore[no-untyped-def]
     assert status == 0
     assert "all 4 rows came out the same" in printed
     assert (tmp_path / "run-rerun" / "episodes.parquet").exists()
-    change_rows(run, {"score": 0.25}, "instance == 1")
+    change_rows(run, {"score": 0.25}, "map == 1")
     status, printed, error = call(str(run))
     assert status == 1
     assert "2 of 2 units were there already" in error

@@ -104,14 +104,14 @@ class Homing:
 
     def __init__(self) -> None:
         self.asked: list[list[float]] = []
-        self.felt: list[list[float]] = []
+        self.traversability: list[list[float]] = []
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:
         return problem
 
     def plan(self, step: Step, plan_state: Problem) -> Any:
         self.asked.append(plan_state.goal_m[:, 0].tolist())
-        self.felt.append(step.felt.tolist())
+        self.traversability.append(step.traversability.tolist())
         action = steer_toward(step.state, plan_state.goal_m, plan_state.robot)
         path = plan_state.goal_m[:, None]
         return action, plan_state, Plan.empty(len(action), path=path)
@@ -159,9 +159,11 @@ def test_episodes_that_have_ended_are_planned_for_no_more_and_nothing_else_chang
     assert leaving.asked[-1] == [7.0]
     assert part.planned.tolist() == [len(goals) for goals in leaving.asked]
     assert whole.planned.tolist() == [4] * len(staying.asked)
-    for number, (goals, felt) in enumerate(zip(leaving.asked[1:], leaving.felt[1:], strict=True)):
+    for number, (goals, observed) in enumerate(
+        zip(leaving.asked[1:], leaving.traversability[1:], strict=True)
+    ):
         members = [GOALS[:, 0].tolist().index(goal) for goal in goals]
-        assert felt == part.traversability[members, number].tolist()
+        assert observed == part.traversability[members, number].tolist()
     assert bool((whole.outcome == Outcome.SUCCESS).all())
     for name in ("states", "actions", "traversability", "outcome", "steps"):
         mine, other = getattr(part, name), getattr(whole, name)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchnav.eval.condition import conditions_of
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, score
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import trials_of
 from benchnav.eval.unit import Unit
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -14,8 +14,8 @@ from tests import factories
 
 def unit(**changes: object) -> Unit:
     suite = Suite(model="oracle", planners=("tests.eval.parts:Faulty",), risks=("cvar",), scenarios=("std",))
-    (trial,) = trials_of(suite, lambda data: ["std"])
-    given = {"trial": trial, "seed": 7, "realisation": 2, "instances": (4, 9)} | changes
+    (condition,) = conditions_of(suite, lambda data: ["std"])
+    given = {"condition": condition, "seed": 7, "realisation": 2, "maps": (4, 9)} | changes
     return Unit(**given)  # type: ignore[arg-type]
 
 
@@ -43,8 +43,8 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
     problem, episodes = made(time_budget_s=torch.tensor([50.0, 70.0]))
     table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
     first, second = table.to_dict("records")
-    assert (first["instance"], first["outcome"], first["success"]) == (4, "success", True)
-    assert (first["seed"], first["realisation"], first["trial"]) == (7, 2, unit().trial.id)
+    assert (first["map"], first["outcome"], first["success"]) == (4, "success", True)
+    assert (first["seed"], first["realisation"], first["condition"]) == (7, 2, unit().condition.id)
     assert (first["risk"], first["scenario"], first["robot"]) == ("cvar", "std", "unicycle")
     assert first["total_time_s"] == pytest.approx(0.2)
     assert first["time_ratio"] == pytest.approx(2.0)
@@ -58,9 +58,9 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
     assert (second["planning_ms"], second["planning_ms_p95"]) == (pytest.approx(100), pytest.approx(370))
     assert first["planning_start_ms"] == second["planning_start_ms"] == pytest.approx(800)
     assert (first["compiled"], first["error"]) == (True, "")
-    assert (second["instance"], second["outcome"], second["success"]) == (9, "stuck", False)
+    assert (second["map"], second["outcome"], second["success"]) == (9, "stuck", False)
     assert second["total_time_s"] == 70.0
-    assert (first["redrawn"], second["redrawn"]) == (0, 3)
+    assert (first["rejected_draws"], second["rejected_draws"]) == (0, 3)
     assert second["end_time_s"] == pytest.approx(0.4)
     assert np.isnan(second["time_ratio"])
     assert second["score"] == 0

@@ -38,14 +38,14 @@ BUDGETS = {
     "mppi": {"samples": 64, "horizon_s": 1.5},
 }
 PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")
-KEYS = ["scenario", "planner", "risk", "seed", "realisation", "instance"]
+KEYS = ["scenario", "planner", "risk", "seed", "realisation", "map"]
 # What a wall clock says is no result.
 TIMING = ["planning_ms", "planning_ms_p95", "planning_start_ms"]
 
 
 def suite_on(dataset: Path, **changes: object) -> Suite:
     made = Suite(
-        data=str(dataset), model="oracle", instances=2, time_budget_s=12.0, planner_options=BUDGETS,
+        data=str(dataset), model="oracle", maps=2, time_budget_s=12.0, planner_options=BUDGETS,
         risks=("cvar", "mean"), scenarios=("std", "hs"),
     )  # fmt: skip
     return replace(made, **changes)  # type: ignore[arg-type]
@@ -99,15 +99,15 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     assert len(pd.read_csv(folder / "summary.csv")) == 14
     assert not list(folder.rglob("*partial*"))
     assert not list(folder.parent.glob(".*"))
-    # A unit is one file, in the folder of its trial.
-    assert sorted(p.parent.name for p in folder.glob("units/*/*")) == sorted(about["trials"])
+    # A unit is one file, in the folder of its condition.
+    assert sorted(p.parent.name for p in folder.glob("units/*/*")) == sorted(about["conditions"])
 
 
 def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
     recordings = sorted((folder / "playback").glob("*.rrd"))
-    trials = open_run(folder).trials
-    assert len(recordings) == len(trials) == (1 + 3 * 2) * 2
+    conditions = open_run(folder).conditions
+    assert len(recordings) == len(conditions) == (1 + 3 * 2) * 2
     paths = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     subprocess.run(
         ["rerun", "rrd", "verify", *map(str, recordings)], check=True, capture_output=True, env=paths
@@ -116,7 +116,7 @@ def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]
         ((unit, member),) = find_episodes(folder, {"planner": [planner]}, None, 0, 0)
         path = playback_path(folder, unit.stem(member))
         assert path in recordings
-        episode = read_steps(folder, trial=unit.trial.id, instance=0)
+        episode = read_steps(folder, condition=unit.condition.id, map=0)
         times, positions = read_path(path)
         np.testing.assert_allclose(times, episode["time_s"], atol=1e-6)
         np.testing.assert_array_equal(positions[:, :2], episode[["x_m", "y_m"]].to_numpy())
@@ -191,7 +191,7 @@ def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("change", "trials", "rows", "kept"),
+    ("change", "conditions", "rows", "kept"),
     [
         ({"risks": ("cvar", "mean", "var")}, 6, 12, 4),
         ({"risks": ("var",)}, 6, 12, 4),
@@ -199,27 +199,27 @@ def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_p
         ({"models": ("oracle", "tests.eval.parts:Gaussian")}, 8, 16, 4),
         ({"seeds": (0, 5)}, 4, 16, 4),
         ({"seed": 5}, 4, 16, 4),
-        ({"seed": 5, "instances": 1}, 4, 12, 4),
+        ({"seed": 5, "maps": 1}, 4, 12, 4),
         ({"realisations": 3}, 4, 24, 4),
         ({"scenarios": ("hg",)}, 6, 12, 4),
         ({"noise": "stored"}, 8, 16, 4),
     ],
 )
 def test_a_run_is_extended_by_what_is_missing(
-    change: dict[str, object], trials: int, rows: int, kept: int, dataset_path: Path, tmp_path: Path
+    change: dict[str, object], conditions: int, rows: int, kept: int, dataset_path: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
     finish(quick(dataset_path), folder)
     before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
     run_id = open_run(folder).about["run_id"]
     extended = finish(quick(dataset_path, **change), folder)
-    assert (extended["trial"].nunique(), len(extended)) == (trials, rows)
+    assert (extended["condition"].nunique(), len(extended)) == (conditions, rows)
     assert sum(path.stat().st_mtime_ns == when for path, when in before.items()) == kept == len(before)
     assert open_run(folder).about["run_id"] == run_id
     # What was there and what came make the rows of a run that had all at once.
     fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
     fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
-    if not {"scenarios", "noise", "instances"} & set(change):
+    if not {"scenarios", "noise", "maps"} & set(change):
         same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
 
 
@@ -227,11 +227,11 @@ def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
     dataset = factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=53))
     folder, suite = tmp_path / "run", quick(dataset, scenarios=("std",), risks=("mean",))
     sizes = []
-    for instances in (50, 52, 0, 4):
-        rows = finish(replace(suite, instances=instances), folder)
+    for maps in (50, 52, 0, 4):
+        rows = finish(replace(suite, maps=maps), folder)
         sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
     assert sizes == [(50, 1), (52, 2), (53, 2), (53, 2)]
-    same(rows, finish(replace(suite, instances=0), tmp_path / "fresh"))
+    same(rows, finish(replace(suite, maps=0), tmp_path / "fresh"))
 
 
 def test_a_run_is_extended_by_another_dataset(dataset_path: Path, tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, 
     asked = {"planner": ["astar_dwa"], "risk": ["mean"], "scenario": ["hs"]}
     ((unit, member),) = find_episodes(folder, asked, None, 0, 1)
     recording = find_recording(folder, unit, member)
-    steps = read_steps(folder, planner="astar_dwa", risk="mean", scenario="hs", instance=1)
+    steps = read_steps(folder, planner="astar_dwa", risk="mean", scenario="hs", map=1)
     np.testing.assert_array_equal(recording.states[:, :2], steps[["x_m", "y_m"]].to_numpy())
     _, positions = read_path(playback_path(folder, unit.stem(member)))
     np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
@@ -426,7 +426,7 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ({"data": "no-such-data"}, "no-such-data"),
         ({"noise": "loud"}, "loud"),
         ({"noise": "frozen"}, "stored"),
-        ({"instances": 9}, "0 takes all"),
+        ({"maps": 9}, "0 takes all"),
         ({"time_budget_s": 0.01}, "time budget of at least one time step"),
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
@@ -434,9 +434,12 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ({"robots": ("tests.eval.parts:Faulty",)}, "without dt_s"),
         ({"planners": ("benchnav.planning.robots:Unicycle",)}, "without init"),
         ({"objectives": ("benchnav.planning.robots:Unicycle",)}, "without stage"),
-        ({"trials": ({"task": 3},)}, "mapping"),
-        ({"trials": ({"planners": []},)}, "at least one trial"),
-        ({"trials": ({"planners": "mppi"},), "planner_options": {"mpi": {"samples": 8}}}, "planner_options"),
+        ({"conditions": ({"task": 3},)}, "mapping"),
+        ({"conditions": ({"planners": []},)}, "at least one condition"),
+        (
+            {"conditions": ({"planners": "mppi"},), "planner_options": {"mpi": {"samples": 8}}},
+            "planner_options",
+        ),
         ({"model": {"part": "paper-v1", "lable": "mine"}}, "lable"),
     ):
         for place in (tmp_path / "run", tmp_path / "new"):
@@ -491,8 +494,8 @@ def test_a_run_that_lacks_maps_tells_how_they_are_made(tmp_path: Path) -> None:
     path = factories.tiny_dataset(tmp_path / "few.h5", replace(recipe, splits=few))
     made = "All maps of tiny-v1 are made with `benchnav-datagen create tiny-v1`"
     for changes, told in (
-        ({"instances": 3}, True),
-        ({"instances": 5}, False),
+        ({"maps": 3}, True),
+        ({"maps": 5}, False),
         ({"scenarios": ("hs",)}, True),
         ({"scenarios": ("night",)}, False),
     ):
@@ -506,7 +509,7 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
     def told(budget: float, robot: str | dict[str, Any] = "unicycle") -> list[str]:
         lines: list[str] = []
         suite = Suite(
-            data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), instances=2,
+            data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), maps=2,
             time_budget_s=budget, robots=(robot,), record="none",
         )  # fmt: skip
         for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
@@ -514,7 +517,7 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
         return [line for line in lines if "within T" in line]
 
     # 8 m by 8 m to the goal, of which the last metre is not driven: 10.3 s at 1 m/s.
-    line = "warning: in 2 of 2 instances of test/std a robot of 1 m/s cannot reach the goal within T"
+    line = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the goal within T"
     assert told(10.2) == [line]
     assert told(10.4) == []
     assert told(10.2, {"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}}) == []
@@ -528,13 +531,13 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
         model="oracle",
         planners=("straight",),
         scenarios=("std",),
-        instances=2,
+        maps=2,
         record="none",
     )
     before = finish(suite, tmp_path / "run")
     for world, expected in (
         ({"noise": "frozen", "correlation_m": 4.1}, r"`world.correlation_m` of at most 4 m.* got 4.1 m"),
-        ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for instance"),
+        ({"noise": "frozen", "immobile": {"below": 0.99}}, "none for example"),
     ):
         for place in ("run", "new"):
             with pytest.raises(ConfigError, match=expected):
@@ -548,7 +551,7 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
-        scenarios=("std",), instances=1, record="none", time_budget_s=1.0,
+        scenarios=("std",), maps=1, record="none", time_budget_s=1.0,
     )  # fmt: skip
     with pytest.raises(ConfigError, match="without `group`"):
         finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
@@ -558,8 +561,8 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
 def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: Path) -> None:
     config = tmp_path / "suite.yaml"
     data = factories.tiny_dataset(tmp_path / "d.h5")
-    config.write_text(f"data: {data}\nscenarios: [std]\ninstances: 1\nrecord: none\nsteps: none\n"
-                      "trials:\n  - {planners: [straight]}\n")  # fmt: skip
+    config.write_text(f"data: {data}\nscenarios: [std]\nmaps: 1\nrecord: none\nsteps: none\n"
+                      "conditions:\n  - {planners: [straight]}\n")  # fmt: skip
     code = "from benchnav.eval import cli; cli._finish = cli._failed; cli.main()"
     words = ["run", "--config", str(config), "--jobs", "2", "--out", str(tmp_path / "run")]
     ran = subprocess.run(
@@ -580,7 +583,10 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(dataset_path: Path,
     fixed = about["hypotheses"]
     assert not list(folder.glob("units/*/*"))
     (test,) = fixed["tests"]
-    assert [about["trials"][test[side]]["labels"]["risk"] for side in ("one", "other")] == ["mean", "cvar"]
+    assert [about["conditions"][test[side]]["labels"]["risk"] for side in ("one", "other")] == [
+        "mean",
+        "cvar",
+    ]
     assert fixed["episodes"] == {test["one"]: 2, test["other"]: 2}
     list(steps)
     finish(quick(dataset_path, scenarios=("std",), seed=5), folder)  # without them the run goes on

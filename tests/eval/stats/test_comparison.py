@@ -19,7 +19,7 @@ def pair(
     budgets_s: tuple[float, float] = (100.0, 100.0),
 ) -> Pair:
     """Times of two conditions by episode, T of a failure; `draws` episodes in a row are on one map."""
-    episodes = pd.DataFrame({"instance": np.arange(len(one)) // draws})
+    episodes = pd.DataFrame({"map": np.arange(len(one)) // draws})
     for suffix, times, budget_s in (("", one, budgets_s[0]), ("_other", other, budgets_s[1])):
         episodes[f"success{suffix}"] = np.array(times) < budget_s
         episodes[f"total_time_s{suffix}"] = times
@@ -54,7 +54,7 @@ def test_a_pair_of_one_episode_a_map() -> None:
     # Both arrived on the first, fifth and seventh map, each a second later.
     assert (row["arrival_time_difference_s"], row["arrival_time_n_maps"]) == (1, 3)
     std = float(standard_deviation(gain, 1))
-    assert row["success_shown"] == pytest.approx(smallest_difference(std, 8, 0.05))
+    assert row["success_detectable"] == pytest.approx(smallest_difference(std, 8, 0.05))
     assert row["maps_needed"] == maps_needed(std, 0.05, 0.05)
 
 
@@ -82,7 +82,7 @@ def test_holm_is_over_all_pairs_for_each_measure() -> None:
     alone = compare(pairs[:1])
     assert alone["success_p_holm"][0] == alone["success_p"][0]
     # What can be shown is at the level of the first step.
-    assert table["success_shown"][0] > alone["success_shown"][0]
+    assert table["success_detectable"][0] > alone["success_detectable"][0]
     assert table["maps_needed"][0] > alone["maps_needed"][0]
 
 
@@ -125,10 +125,10 @@ def test_intervals_of_a_difference_of_time_cover_it_on_few_maps(maps: int) -> No
     generator = np.random.default_rng(8)
     held, count, rates = 0, 150, (0.85, 0.95)
     for _ in range(count):
-        hard, luck = generator.standard_normal(maps), generator.random(maps)
+        hard, noise = generator.standard_normal(maps), generator.random(maps)
         taken = [
             np.where(
-                luck < rate,
+                noise < rate,
                 np.minimum(33 * np.exp(0.2 * hard + 0.2 * generator.standard_normal(maps)), 99),
                 100,
             )
@@ -153,7 +153,7 @@ def test_maps_with_unequally_many_draws_all_count() -> None:
     """Twenty maps under seed 0, of which nine under seed 1 too: a map that both arrived on more often has its share."""
     one, other = [30.0] * 29, [30.0] * 20 + [100.0] * 9
     given = pair(one, other)
-    given.episodes["instance"] = [*range(20), *range(9)]
+    given.episodes["map"] = [*range(20), *range(9)]
     (row,) = compare([given]).to_dict("records")
     assert (row["n_maps"], row["n_episodes"]) == (20, 29)
     assert row["success_difference"] == pytest.approx(9 / 29)

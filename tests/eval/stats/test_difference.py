@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest, permutation_test, t, ttest_1samp
+from scipy.stats import PermutationMethod, binomtest, permutation_test, t, ttest_1samp, wilcoxon
 
 from benchnav.eval.stats.difference import (
     by_map,
@@ -36,7 +36,7 @@ def test_sign_flips_agree_with_scipy_on_many_maps() -> None:
     assert sign_flip_p(gain) == pytest.approx(drawn.pvalue, abs=4 * (drawn.pvalue / 20_000) ** 0.5)
 
 
-def test_difference_with_one_episode_a_map_is_that_of_bonett_and_price() -> None:
+def test_difference_with_one_episode_a_map_is_that_of_bonett_and_penalty() -> None:
     # Their formula, on 30 maps of which 8 were won and 3 lost.
     won, lost, maps = (8 + 1) / 32, (3 + 1) / 32, 32
     half = t.ppf(0.975, 29) * ((won + lost - (won - lost) ** 2) / maps) ** 0.5
@@ -59,7 +59,7 @@ def test_difference_takes_episodes_a_map_into_account() -> None:
     assert np.all(wide[2] > high)
 
 
-def test_two_trials_that_ended_alike_everywhere_may_still_differ() -> None:
+def test_two_conditions_that_ended_alike_everywhere_may_still_differ() -> None:
     mean, low, high = success_interval(np.zeros(50, dtype=int), 1)
     assert (mean, low) == (0, pytest.approx(-high))
     assert 0.04 < high < 0.1
@@ -132,3 +132,15 @@ def test_time_is_tested_by_ranks() -> None:
     assert signed_rank_p(np.zeros(9)) == 1
     # All eight differences have one sign: 2 of 2^8 ways are as far out.
     assert signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(2 / 2**8)
+
+
+@pytest.mark.parametrize("maps", [2, 5, 9, 13, 14, 40, 60])
+def test_ranks_are_tested_as_scipy_does(maps: int) -> None:
+    chance = np.random.default_rng(maps)
+    for values in (chance.normal(0.3, 1, maps), chance.integers(-2, 4, maps), chance.integers(0, 3, maps)):
+        if not values.any():
+            continue
+        expected = wilcoxon(
+            values, method=PermutationMethod(n_resamples=np.inf) if maps < 10 else "auto"
+        ).pvalue
+        assert signed_rank_p(values.astype(float)) == pytest.approx(expected, rel=1e-9)

@@ -6,22 +6,22 @@ import pytest
 from scipy.stats import binomtest, ttest_1samp
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import Condition, conditions_of
 from benchnav.eval.hypotheses import Hypothesis, fix_hypotheses
 from benchnav.eval.stats.difference import success_interval
 from benchnav.eval.stats.hypotheses import p_of
 from benchnav.eval.stats.hypotheses import test_hypotheses as run_tests
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import Trial, trials_of
-from tests.eval.report.made import row, rows, trial
+from tests.eval.report.made import condition, row, rows
 
 WORLD = {"time_budget_s": 100.0}
 MEAN, CVAR = {"planner": "mppi", "risk": "mean"}, {"planner": "mppi", "risk": "cvar:0.9"}
 
 
-def conditions(**changes: Any) -> dict[str, Trial]:
+def conditions(**changes: Any) -> dict[str, Condition]:
     given = {"planners": ("straight", "mppi"), "risks": ("mean", "cvar:0.9"), "models": ("oracle",)}
     suite = Suite(**{**given, "scenarios": ("std",), **changes})
-    return {one.id: one for one in trials_of(suite, lambda data: ["std", "hg"])}
+    return {one.id: one for one in conditions_of(suite, lambda data: ["std", "hg"])}
 
 
 def fixed(*given: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def hypothesis(**changes: Any) -> Hypothesis:
 
 def beside(one: np.ndarray, other: np.ndarray, column: str = "score") -> pd.DataFrame:
     """A metric of two conditions, an episode a map."""
-    return pd.DataFrame({"instance": np.arange(len(one)), column: one, f"{column}_other": other})
+    return pd.DataFrame({"map": np.arange(len(one)), column: one, f"{column}_other": other})
 
 
 def test_two_conditions_are_named_by_their_labels() -> None:
@@ -173,12 +173,12 @@ def test_a_difference_is_tested_by_sign_flips_either_way_or_one() -> None:
 
 def ran(metric: str, one: list[dict[str, Any]], other: list[dict[str, Any]], **changes: Any) -> pd.Series:
     about = {"tests": [vars(hypothesis(metric=metric, **changes)) | {"claim": "c"}]}
-    episodes = rows([r | {"trial": "a"} for r in one], [r | {"trial": "b"} for r in other])
+    episodes = rows([r | {"condition": "a"} for r in one], [r | {"condition": "b"} for r in other])
     return run_tests(about, episodes, {"a": WORLD, "b": WORLD}).iloc[0]
 
 
 def test_each_metric_is_compared_in_its_unit_on_shared_episodes() -> None:
-    labels = trial()
+    labels = condition()
     one = [row(labels, i, 30.0 + i % 2, traversability=0.8, path_length_m=25.0) for i in range(9)]
     one += [row(labels, 9, None, traversability=np.nan, path_length_m=3.0), row(labels, 77)]
     other = [row(labels, i, 35.0, traversability=0.7, path_length_m=22.0) for i in range(10)]
@@ -198,14 +198,16 @@ def test_each_metric_is_compared_in_its_unit_on_shared_episodes() -> None:
         < found["success"]["high_90"]
         < found["success"]["high"]
     )
-    groups = [[r | {"group": r["instance"] // 2} for r in side] for side in (one, other)]
+    groups = [[r | {"group": r["map"] // 2} for r in side] for side in (one, other)]
     assert ran("success", *groups)["n_maps"] == 5
 
 
 def test_holm_is_over_the_list() -> None:
-    labels = trial()
+    labels = condition()
     sides = [[row(labels, i, 30.0 if i < count else None) for i in range(30)] for count in (30, 23)]
-    episodes = rows(*([r | {"trial": name} for r in side] for name, side in zip("ab", sides, strict=True)))
+    episodes = rows(
+        *([r | {"condition": name} for r in side] for name, side in zip("ab", sides, strict=True))
+    )
     tests = [vars(hypothesis(direction=d)) | {"claim": d} for d in ("", "higher", "lower")]
     table = run_tests({"tests": tests}, episodes, {"a": WORLD, "b": WORLD})
     p = 2 / 2**7

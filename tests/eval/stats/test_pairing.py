@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.stats.pairing import Compared, Pair, check_one_value_each, find_pairs
-from benchnav.eval.trial import NOT_USED
-from tests.eval.report.made import row, rows, trial
+from tests.eval.report.made import condition, row, rows
 
 STAKES = {
     "noise": "frozen",
@@ -15,7 +15,7 @@ STAKES = {
     "immobile": {"below": 0.1, "for_s": 2.0},
     "time_budget_s": 100.0,
 }
-RULES = {"free_space": {"by": "risk", "above": 0.1}, "slowest": 0.1, "goal_radius_m": 1.0}
+RULES = {"free_space": {"by": "risk", "above": 0.1}, "min_traversability": 0.1, "goal_radius_m": 1.0}
 
 
 def value_of(labels: Mapping[str, str], **changes: Any) -> dict[str, Any]:
@@ -36,10 +36,10 @@ def compared(planner: str = "mppi", risk: str = "mean", **changes: Any) -> Compa
     labels = {
         name: value for name, value in given.items() if name not in ("maps", "episodes", "run", "value")
     }
-    names = trial(planner, risk, **labels)
+    names = condition(planner, risk, **labels)
     episodes = given["episodes"]
     if episodes is None:
-        episodes = [row(names, instance) for instance in range(4)]
+        episodes = [row(names, map_index) for map_index in range(4)]
     return Compared(
         labels={**names, "run": given["run"]},
         value=value_of(names, **given["value"]),
@@ -54,8 +54,10 @@ def names(pairs: list[Pair]) -> list[tuple[str, str]]:
 
 
 def test_all_pairs_of_settings_with_all_else_alike() -> None:
-    trials = [compared(planner, risk) for risk in ("mean", "var", "cvar") for planner in ("mppi", "cl_rrt")]
-    pairs = find_pairs(trials)
+    conditions = [
+        compared(planner, risk) for risk in ("mean", "var", "cvar") for planner in ("mppi", "cl_rrt")
+    ]
+    pairs = find_pairs(conditions)
     each = [("var", "mean"), ("cvar", "mean"), ("cvar", "var")]
     assert names(pairs) == each * 2
     assert [pair.shared["planner"] for pair in pairs] == ["mppi"] * 3 + ["cl_rrt"] * 3
@@ -63,36 +65,36 @@ def test_all_pairs_of_settings_with_all_else_alike() -> None:
 
 
 def test_all_against_one() -> None:
-    trials = [compared(risk=risk) for risk in ("cvar", "mean", "var")]
-    assert names(find_pairs(trials, against="mean")) == [("cvar", "mean"), ("var", "mean")]
-    assert names(find_pairs(trials, against="cvar")) == [("mean", "cvar"), ("var", "cvar")]
+    conditions = [compared(risk=risk) for risk in ("cvar", "mean", "var")]
+    assert names(find_pairs(conditions, against="mean")) == [("cvar", "mean"), ("var", "mean")]
+    assert names(find_pairs(conditions, against="cvar")) == [("mean", "cvar"), ("var", "cvar")]
 
 
 def test_by_follows_what_is_compared_with() -> None:
-    trials = [compared("mppi", "mean"), compared("mppi", "cvar"), compared("cl_rrt", "mean")]
-    assert names(find_pairs(trials, against="cl_rrt")) == [("mppi", "cl_rrt")]
-    assert names(find_pairs(trials, by="planner")) == [("cl_rrt", "mppi")]
+    conditions = [compared("mppi", "mean"), compared("mppi", "cvar"), compared("cl_rrt", "mean")]
+    assert names(find_pairs(conditions, against="cl_rrt")) == [("mppi", "cl_rrt")]
+    assert names(find_pairs(conditions, by="planner")) == [("cl_rrt", "mppi")]
 
 
 def test_a_blind_planner_goes_with_every_setting_and_model() -> None:
     blind = compared("straight", NOT_USED, model=NOT_USED)
-    trials = [
+    conditions = [
         blind,
         compared("mppi", "mean"),
         compared("mppi", "cvar"),
         compared("mppi", "cvar", model="oracle"),
     ]
-    pairs = find_pairs(trials, against="straight")
+    pairs = find_pairs(conditions, against="straight")
     assert [(pair.shared["model"], pair.shared["risk"]) for pair in pairs] == [
         ("paper-v1", "mean"),
         ("paper-v1", "cvar"),
         ("oracle", "cvar"),
     ]
     # Compared by what it does not use it has no part.
-    assert names(find_pairs(trials)) == [("cvar", "mean")]
+    assert names(find_pairs(conditions)) == [("cvar", "mean")]
 
 
-def test_luck_is_matched_episode_by_episode() -> None:
+def test_noise_is_matched_episode_by_episode() -> None:
     def timed(labels: dict[str, str], late: float) -> list[dict[str, Any]]:
         return [
             row(labels, i, 30.0 + i + 10 * draw + 40 * seed + late, seed=seed, realisation=draw)
@@ -101,43 +103,43 @@ def test_luck_is_matched_episode_by_episode() -> None:
             for i in range(3)
         ]
 
-    one = compared(risk="cvar", episodes=timed(trial("mppi", "cvar"), 0.5))
-    backwards = timed(trial("mppi", "mean"), 0.0)[::-1]
+    one = compared(risk="cvar", episodes=timed(condition("mppi", "cvar"), 0.5))
+    backwards = timed(condition("mppi", "mean"), 0.0)[::-1]
     (pair,) = find_pairs([compared(episodes=backwards), one])
     assert len(pair.episodes) == 12
     assert (pair.episodes["total_time_s"] - pair.episodes["total_time_s_other"]).eq(0.5).all()
     assert pair.left_out == 0
 
 
-def test_what_only_one_trial_met_is_left_out_and_counted() -> None:
-    more = [row(trial("mppi", "cvar"), instance, seed=seed) for seed in (0, 1) for instance in range(4)]
+def test_what_only_one_condition_met_is_left_out_and_counted() -> None:
+    more = [row(condition("mppi", "cvar"), map_index, seed=seed) for seed in (0, 1) for map_index in range(4)]
     (pair,) = find_pairs([compared(), compared(risk="cvar", episodes=more)])
     assert (len(pair.episodes), pair.left_out) == (4, 4)
     # A map that one met under one seed of two counts with that one.
-    both = [row(trial(), instance, seed=seed) for seed in (0, 1) for instance in range(3)]
-    part = [row(trial("mppi", "cvar"), i, seed=s) for s, i in ((0, 0), (1, 0), (0, 1), (0, 2), (1, 2))]
+    both = [row(condition(), map_index, seed=seed) for seed in (0, 1) for map_index in range(3)]
+    part = [row(condition("mppi", "cvar"), i, seed=s) for s, i in ((0, 0), (1, 0), (0, 1), (0, 2), (1, 2))]
     (pair,) = find_pairs([compared(episodes=both), compared(risk="cvar", episodes=part)])
-    assert sorted(pair.episodes["instance"]) == [0, 0, 1, 2, 2]
+    assert sorted(pair.episodes["map"]) == [0, 0, 1, 2, 2]
     assert pair.left_out == 6 + 5 - 2 * 5
 
 
 def test_a_map_that_was_met_more_often_leaves_the_others_in() -> None:
-    again = [[row(trial("mppi", risk), 0, seed=5)] for risk in ("mean", "cvar")]
-    plain = [[row(trial("mppi", risk), instance) for instance in range(4)] for risk in ("mean", "cvar")]
+    again = [[row(condition("mppi", risk), 0, seed=5)] for risk in ("mean", "cvar")]
+    plain = [[row(condition("mppi", risk), map_index) for map_index in range(4)] for risk in ("mean", "cvar")]
     (pair,) = find_pairs(
         [
             compared(risk=risk, episodes=own + more)
             for risk, own, more in zip(("mean", "cvar"), plain, again, strict=True)
         ]
     )
-    assert sorted(pair.episodes["instance"]) == [0, 0, 1, 2, 3]
+    assert sorted(pair.episodes["map"]) == [0, 0, 1, 2, 3]
     assert pair.left_out == 0
 
 
-def test_runs_that_share_trials_are_compared_with_each_other() -> None:
-    trials = [compared(run=run, risk=risk) for run in ("before", "after") for risk in ("mean", "var")]
-    assert names(find_pairs(trials)) == [("after", "before")] * 2
-    assert names(find_pairs(trials, against="before")) == [("after", "before")] * 2
+def test_runs_that_share_conditions_are_compared_with_each_other() -> None:
+    conditions = [compared(run=run, risk=risk) for run in ("before", "after") for risk in ("mean", "var")]
+    assert names(find_pairs(conditions)) == [("after", "before")] * 2
+    assert names(find_pairs(conditions, against="before")) == [("after", "before")] * 2
 
 
 @pytest.mark.parametrize(
@@ -155,7 +157,11 @@ def test_runs_that_share_trials_are_compared_with_each_other() -> None:
             "differ in their risk and in nothing else",
         ),
         ({"maps": ["a", "b", "x", "d"]}, {}, "other digests"),
-        ({"episodes": [row(trial("mppi", "cvar"), 0, seed=7)]}, {}, "seeds 7, realisations 0 and seeds 0"),
+        (
+            {"episodes": [row(condition("mppi", "cvar"), 0, seed=7)]},
+            {},
+            "seeds 7, realisations 0 and seeds 0",
+        ),
         ({"scenario": "hg"}, {}, "differ in their risk and in nothing else"),
         (
             {"risk": "mean", "planner": "cl_rrt"},
@@ -176,8 +182,8 @@ def test_what_cannot_be_paired_is_refused_with_the_reason(
         find_pairs([compared(), compared(**{"risk": "cvar", **changes})], **asked)
 
 
-def test_a_shorter_trial_is_paired_on_the_maps_it_met() -> None:
-    short = [row(trial("mppi", "cvar"), instance) for instance in range(2)]
+def test_a_shorter_condition_is_paired_on_the_maps_it_met() -> None:
+    short = [row(condition("mppi", "cvar"), map_index) for map_index in range(2)]
     (pair,) = find_pairs([compared(), compared(risk="cvar", maps=["a", "b"], episodes=short)])
     assert (len(pair.episodes), pair.left_out) == (2, 2)
 
@@ -208,9 +214,9 @@ def test_worlds_are_paired_where_the_same_λ_is_drawn() -> None:
 
 def test_values_decide_and_labels_are_for_people() -> None:
     one_value = {"risk": {"part": "cvar", "options": {"level": 0.5}}}
-    trials = [compared(risk="cvar:0.5", value=one_value), compared(risk="half", value=one_value)]
+    conditions = [compared(risk="cvar:0.5", value=one_value), compared(risk="half", value=one_value)]
     with pytest.raises(ConfigError, match="differ in their risk and in nothing else"):
-        find_pairs(trials)
+        find_pairs(conditions)
 
 
 @pytest.mark.parametrize(
@@ -226,11 +232,11 @@ def test_values_decide_and_labels_are_for_people() -> None:
     ],
 )
 def test_two_values_under_one_label_are_refused(kind: str, value: dict[str, Any]) -> None:
-    trials = [compared(run="a"), compared(run="b", value=value)]
+    conditions = [compared(run="a"), compared(run="b", value=value)]
     with pytest.raises(
         ConfigError, match=rf"one {kind} under each label, got two that a and b call .*level None and 0\.9"
     ):
-        check_one_value_each(trials)
+        check_one_value_each(conditions)
     check_one_value_each([compared(run="a"), compared(run="b")])
 
 
@@ -245,13 +251,13 @@ def test_what_is_not_used_needs_no_one_value() -> None:
 
 def test_pairs_hold_the_group_of_each_map_where_a_table_has_it() -> None:
     """Tables of earlier versions have none."""
-    grouped = [row(trial("mppi", "cvar"), i, group=i // 2 + 7) for i in range(4)]
-    for trials in (
+    grouped = [row(condition("mppi", "cvar"), i, group=i // 2 + 7) for i in range(4)]
+    for conditions in (
         [compared(), compared(risk="cvar", episodes=grouped)],
         [compared(risk="cvar", episodes=grouped)],
     ):
-        (pair,) = find_pairs([*trials, *([] if len(trials) > 1 else [compared(risk="mean")])])
-        assert list(pair.episodes.sort_values("instance")["group"]) == [7, 7, 8, 8]
+        (pair,) = find_pairs([*conditions, *([] if len(conditions) > 1 else [compared(risk="mean")])])
+        assert list(pair.episodes.sort_values("map")["group"]) == [7, 7, 8, 8]
         assert pair.episodes["group"].dtype == np.int64
     (pair,) = find_pairs([compared(), compared(risk="cvar")])
     assert "group" not in pair.episodes
@@ -259,7 +265,7 @@ def test_pairs_hold_the_group_of_each_map_where_a_table_has_it() -> None:
 
 def test_pairs_hold_every_measure_of_both() -> None:
     other = [
-        row(trial("mppi", "cvar"), i, score=0.25, path_length_m=9.0, traversability=0.5) for i in range(4)
+        row(condition("mppi", "cvar"), i, score=0.25, path_length_m=9.0, traversability=0.5) for i in range(4)
     ]
     (pair,) = find_pairs([compared(), compared(risk="cvar", episodes=other)])
     first = pair.episodes.iloc[0]

@@ -12,7 +12,7 @@ from benchnav.eval.stats.summary import (
     wilson_interval,
 )
 from tests.eval.report import made
-from tests.eval.report.made import row, rows, trial
+from tests.eval.report.made import condition, row, rows
 
 
 @pytest.mark.parametrize(("successes", "n"), [(0, 20), (18, 20), (20, 20), (7, 13)])
@@ -105,7 +105,7 @@ def summary_of(*episodes: dict) -> pd.Series:  # type: ignore[type-arg]
 
 def test_success_and_times() -> None:
     times = (30.0, 40.0, None, 44.0)
-    found = summary_of(*(row(trial(), instance, time) for instance, time in enumerate(times)))
+    found = summary_of(*(row(condition(), map_index, time) for map_index, time in enumerate(times)))
     assert (found["n_episodes"], found["n_maps"]) == (4, 4)
     assert found["success_rate"] == 0.75
     assert (found["success_low"], found["success_high"]) == pytest.approx(wilson_interval(0.75, 4))
@@ -120,8 +120,10 @@ def test_success_and_times() -> None:
 
 def test_what_an_episode_does_not_have_is_not_averaged() -> None:
     names = ("traversability", "path_length_m", "stuck_share", "roughness_radps2")
-    at_once = row(trial(), 1, None, outcome="planner_failure", **dict.fromkeys(names, np.nan))
-    found = summary_of(row(trial(), 0, traversability=0.6), at_once, row(trial(), 2, traversability=0.8))
+    at_once = row(condition(), 1, None, outcome="planner_failure", **dict.fromkeys(names, np.nan))
+    found = summary_of(
+        row(condition(), 0, traversability=0.6), at_once, row(condition(), 2, traversability=0.8)
+    )
     assert found["traversability_mean"] == pytest.approx(0.7)
     assert found["path_length_mean_m"] == 22
     assert found["stuck_share_mean"] == pytest.approx(0.1)
@@ -143,7 +145,9 @@ def test_failures_are_counted_by_their_outcome() -> None:
         "stalled",
     ]
     outcomes += ["planner_error", "model_error", "model_error"]
-    found = summary_of(*(row(trial(), i, None, outcome=o) for i, o in enumerate(outcomes)), row(trial(), 99))
+    found = summary_of(
+        *(row(condition(), i, None, outcome=o) for i, o in enumerate(outcomes)), row(condition(), 99)
+    )
     assert {name: found[f"{name}_count"] for name in dict.fromkeys(outcomes)} == {
         "timeout": 1, "stuck": 2, "out_of_bounds": 1, "planner_failure": 1, "stalled": 3, "planner_error": 1,
         "model_error": 2,
@@ -153,15 +157,19 @@ def test_failures_are_counted_by_their_outcome() -> None:
 
 def test_episodes_of_one_map_are_not_maps() -> None:
     # Under five seeds each, one of two maps is always solved: that is two maps, not ten.
-    episodes = [row(trial(), m, 30.0 if m else None, seed=seed) for m in (0, 1) for seed in range(5)]
+    episodes = [row(condition(), m, 30.0 if m else None, seed=seed) for m in (0, 1) for seed in range(5)]
     found = summary_of(*episodes)
     assert (found["n_episodes"], found["n_maps"]) == (10, 2)
     assert found["design_effect"] == pytest.approx(5)
     assert (found["success_low"], found["success_high"]) == pytest.approx(wilson_interval(0.5, 2))
 
 
-def test_a_row_a_trial_in_order_of_appearance() -> None:
-    order = [trial("mppi", scenario="std"), trial("cl_rrt", scenario="std"), trial("cl_rrt", scenario="hg")]
+def test_a_row_a_condition_in_order_of_appearance() -> None:
+    order = [
+        condition("mppi", scenario="std"),
+        condition("cl_rrt", scenario="std"),
+        condition("cl_rrt", scenario="hg"),
+    ]
     summary = made.summarised(rows(*(row(labels, i) for i in range(2) for labels in order)))
     assert summary[["planner", "scenario"]].to_numpy().tolist() == [
         ["mppi", "std"], ["cl_rrt", "std"], ["cl_rrt", "hg"]
@@ -173,7 +181,9 @@ def test_a_row_a_trial_in_order_of_appearance() -> None:
 def test_planning_time_is_the_median_and_compilation_a_share() -> None:
     found = summary_of(
         *(
-            row(trial(), i, planning_ms=ms, planning_ms_p95=10 * ms, planning_start_ms=-ms, compiled=i > 0)
+            row(
+                condition(), i, planning_ms=ms, planning_ms_p95=10 * ms, planning_start_ms=-ms, compiled=i > 0
+            )
             for i, ms in enumerate((1.0, 2.0, 9.0, 3.0))
         )
     )
@@ -183,13 +193,13 @@ def test_planning_time_is_the_median_and_compilation_a_share() -> None:
     assert found["compiled_share"] == 0.75
 
 
-def test_time_has_the_interval_of_its_own_trial_over_maps() -> None:
+def test_time_has_the_interval_of_its_own_condition_over_maps() -> None:
     generator = np.random.default_rng(4)
     taken = {name: generator.uniform(20, 60, (12, 3)) + late for name, late in (("mppi", 0), ("cl_rrt", 30))}
     taken["cl_rrt"][2, 1] = taken["cl_rrt"][7] = 100
     summary = made.summarised(
         rows(
-            row(trial(name), m, time if (time := taken[name][m, seed]) < 100 else None, seed=seed)
+            row(condition(name), m, time if (time := taken[name][m, seed]) < 100 else None, seed=seed)
             for seed in range(3)
             for m in range(12)
             for name in taken
@@ -210,18 +220,18 @@ def test_a_time_budget_that_is_a_ratio_is_that_of_each_map() -> None:
     reference = np.array([20.0, 30.0, 40.0])
     found = time_budgets(
         rows(
-            row(trial(), 0, 12.0, time_ratio=12 / (20 / 2)),
-            row(trial(), 1, 30.0, time_ratio=30 / (30 / 2)),
-            row(trial(), 2, None, total_time_s=3 * 40 / 2, time_ratio=np.nan),
+            row(condition(), 0, 12.0, time_ratio=12 / (20 / 2)),
+            row(condition(), 1, 30.0, time_ratio=30 / (30 / 2)),
+            row(condition(), 2, None, total_time_s=3 * 40 / 2, time_ratio=np.nan),
         ),
         {"time_budget_ratio": 3.0},
     )
     np.testing.assert_allclose(found, 3 * reference / 2)
-    assert list(time_budgets(rows(row(trial())), {"time_budget_s": 70.0})) == [70.0]
+    assert list(time_budgets(rows(row(condition())), {"time_budget_s": 70.0})) == [70.0]
 
 
 def test_rare_failures_that_were_not_met_widen_the_interval_by_what_they_would_cost() -> None:
-    arrived = [row(trial(), i, 30.0 + i % 3) for i in range(20)]
+    arrived = [row(condition(), i, 30.0 + i % 3) for i in range(20)]
     tight, dear = (
         made.summarised(rows(*arrived), {"time_budget_s": budget}).iloc[0] for budget in (40.0, 400.0)
     )
@@ -233,7 +243,7 @@ def test_rare_failures_that_were_not_met_widen_the_interval_by_what_they_would_c
 
 
 def test_what_never_arrived_has_an_interval_up_to_its_budget() -> None:
-    found = summary_of(*(row(trial(), i, None) for i in range(10)))
+    found = summary_of(*(row(condition(), i, None) for i in range(10)))
     assert found["total_time_high_s"] == 100
     assert found["total_time_low_s"] == pytest.approx(100 * (1 - found["success_high"]))
 
@@ -250,7 +260,7 @@ def test_intervals_of_total_time_cover_it_on_few_maps(maps: int, each: int, rate
         )
         table = pd.DataFrame(
             {
-                "instance": np.repeat(np.arange(maps), each),
+                "map": np.repeat(np.arange(maps), each),
                 "success": success.ravel(),
                 "total_time_s": taken.ravel(),
             }
@@ -264,9 +274,9 @@ def test_intervals_of_total_time_cover_it_on_few_maps(maps: int, each: int, rate
 
 def test_maps_of_one_group_are_one_unit() -> None:
     """Ten maps of five groups; all maps of a group end alike, so that five is what they tell."""
-    labels = trial()
+    labels = condition()
     alone = [row(labels, i, 30.0 + i // 2 if i >= 2 else None) for i in range(10)]
-    grouped = [{**one, "group": one["instance"] // 2} for one in alone]
+    grouped = [{**one, "group": one["map"] // 2} for one in alone]
     by_map, by_group = summary_of(*alone), summary_of(*grouped)
     assert (by_map["n_maps"], by_map["n_groups"]) == (10, 10)
     assert (by_group["n_maps"], by_group["n_groups"]) == (10, 5)

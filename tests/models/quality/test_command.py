@@ -88,7 +88,7 @@ def test_a_folder_holds_report_page_and_figures(
         "maps-test-std.png", "maps-test-hs.png",
     }  # fmt: skip
     printed = capfd.readouterr().out
-    assert "no ladder" in printed
+    assert "no series" in printed
     assert printed.splitlines()[-1] == f"what the columns and figures mean: {out}/quality.md"
     page = (out / "quality.md").read_text()
     assert all(f"(figures/{name})" in page for name in figures)
@@ -108,7 +108,7 @@ def test_a_folder_holds_report_page_and_figures(
     assert "accuracy" not in json.loads((out / "quality.json").read_text())["splits"]["test/hs"]
 
 
-def test_a_ladder_is_drawn_where_there_is_one(
+def test_a_series_is_drawn_where_there_is_one(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
@@ -122,8 +122,8 @@ def test_a_ladder_is_drawn_where_there_is_one(
     )
     asked = ["oracle", "--data", dataset.path, "--splits", "[test/std,test/hs-100]", "--maps", 0]
     assert call(monkeypatch, *asked, "--out", tmp_path / "q") == 0
-    assert (tmp_path / "q" / "figures" / "ladder.png").is_file()
-    assert list(json.loads((tmp_path / "q" / "quality.json").read_text())["ladders"]) == ["test/hs"]
+    assert (tmp_path / "q" / "figures" / "severity.png").is_file()
+    assert list(json.loads((tmp_path / "q" / "quality.json").read_text())["series"]) == ["test/hs"]
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,11 @@ from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.figures import (
     confusion_figure,
-    ladder_figure,
     latent_figure,
     pit_figure,
     reliability_figure,
     save_figure,
+    severity_figure,
 )
 from benchnav.models.quality.measure import Quality, Reliability, evaluate
 from benchnav.models.slope_gp.table import SoftModes
@@ -126,29 +126,29 @@ def test_the_pit_departs_from_one_by_its_counts(qualities: Qualities) -> None:
     assert "calibrated" in labels
 
 
-def test_the_ladder_draws_quality_over_severity(qualities: Qualities) -> None:
-    ladders = {
+def test_the_series_draws_quality_over_severity(qualities: Qualities) -> None:
+    all_series = {
         "hg": [(0.0, "test/std"), (0.5, "valid")],
         "hs": [(0.0, "test/std"), (0.5, "train"), (1.0, "test/hs")],
     }
-    figure = ladder_figure(ladders, qualities)
+    figure = severity_figure(all_series, qualities)
     for title, values in (
-        ("Accuracy", [qualities[split].classes[0].accuracy for _, split in ladders["hs"]]),
-        ("CRPS", [qualities[split].traversability.crps for _, split in ladders["hs"]]),
-        ("Under VaR", [qualities[split].traversability.tail_rate for _, split in ladders["hs"]]),
+        ("Accuracy", [qualities[split].classes[0].accuracy for _, split in all_series["hs"]]),
+        ("CRPS", [qualities[split].traversability.crps for _, split in all_series["hs"]]),
+        ("Under VaR", [qualities[split].traversability.tail_rate for _, split in all_series["hs"]]),
     ):
         np.testing.assert_allclose(line(panel(figure, title), marker="s"), [[0, 0.5, 1], values])
     np.testing.assert_allclose(line(panel(figure, "In the 90"), linestyle="--")[1], 0.9)
     np.testing.assert_allclose(line(panel(figure, "Under VaR"), linestyle="--")[1], 0.1)
     dotted = line(panel(figure, "AUROC"), marker="s", linestyle=":")[1]
     np.testing.assert_allclose(
-        dotted, [qualities[split].classes[0].mutual_information_auroc for _, split in ladders["hs"]]
+        dotted, [qualities[split].classes[0].mutual_information_auroc for _, split in all_series["hs"]]
     )
 
 
-def test_a_ladder_without_classes_is_of_traversability_alone(dataset: TerrainDataset) -> None:
+def test_a_series_without_classes_is_of_traversability_alone(dataset: TerrainDataset) -> None:
     found = dict(evaluate(Oracle(), dataset))
-    figure = ladder_figure({"hs": [(0.0, "test/std"), (1.0, "test/hs")]}, found)
+    figure = severity_figure({"hs": [(0.0, "test/std"), (1.0, "test/hs")]}, found)
     assert len(figure.axes) == 4
     np.testing.assert_allclose(
         line(panel(figure, "CRPS"), marker="o")[1][1], found["test/hs"].traversability.crps

@@ -120,8 +120,8 @@ def test_a_class_that_is_only_predicted_counts_in_the_measure_named_for_it_alone
     assert classes.accuracy == pytest.approx(254 / 256)
     assert classes.miou == pytest.approx((126 / 128 + 1) / 2)
     assert classes.miou_predicted == pytest.approx((126 / 128 + 1 + 0) / 3)
-    assert classes.twins
-    assert classes.twins.twin_miou == pytest.approx((126 / 128 + 128 / 130) / 2)
+    assert classes.look_alikes
+    assert classes.look_alikes.look_alike_miou == pytest.approx((126 / 128 + 128 / 130) / 2)
 
 
 def test_uncertainty_is_ranked_over_all_maps(dataset: TerrainDataset) -> None:
@@ -282,9 +282,9 @@ def test_cells_without_a_class_count_in_no_measure_of_classes() -> None:
     )  # fmt: skip
     for name in names:
         assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6), name
-    assert found.twins is not None
-    assert expected.twins is not None
-    assert astuple(found.twins) == pytest.approx(astuple(expected.twins))
+    assert found.look_alikes is not None
+    assert expected.look_alikes is not None
+    assert astuple(found.look_alikes) == pytest.approx(astuple(expected.look_alikes))
 
 
 def test_where_no_class_is_known_the_measured_traversability_counts_and_the_expected_does_not() -> None:

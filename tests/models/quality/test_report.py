@@ -12,7 +12,7 @@ from benchnav.models.quality.command import _figures
 from benchnav.models.quality.measure import Quality, evaluate
 from benchnav.models.quality.report import (
     HEADINGS,
-    TWINS,
+    LOOK_ALIKES,
     numbers,
     quality_csv,
     quality_json,
@@ -82,7 +82,7 @@ def test_json_holds_everything_and_nothing_that_is_no_json(qualities: Qualities)
     found = json.loads(quality_json({"model": "m"}, whole), parse_constant=refuse)
     assert found["model"] == "m"
     assert found["splits"]["valid"]["mutual_information"] is None
-    assert found["ladders"] == {
+    assert found["series"] == {
         "test/hs": [{"severity": 0.0, "split": "test/std"}, {"severity": 0.5, "split": "test/hs-050"}]
     }
     split, quality = found["splits"]["test/std"], qualities["test/std"]
@@ -90,7 +90,7 @@ def test_json_holds_everything_and_nothing_that_is_no_json(qualities: Qualities)
     assert split["accuracy"] == quality.classes[0].accuracy
     assert tuple(split["pit"]) == quality.traversability.pit
     assert sum(map(sum, split["confusion"])) == sum(split["reliability"]["cells"]) == sum(split["pit"])
-    assert set(HEADINGS) - set(TWINS) <= set(split)
+    assert set(HEADINGS) - set(LOOK_ALIKES) <= set(split)
 
 
 def test_csv_has_scenario_severity_and_every_number(qualities: Qualities) -> None:
@@ -101,7 +101,7 @@ def test_csv_has_scenario_severity_and_every_number(qualities: Qualities) -> Non
     for row in rows:
         quality = qualities[row["split"]]
         assert row["maps"] == str(quality.maps)
-        found = {name: float(row[name]) for name in HEADINGS if name not in TWINS}
+        found = {name: float(row[name]) for name in HEADINGS if name not in LOOK_ALIKES}
         assert found == pytest.approx(numbers(quality), rel=1e-5)
 
 
@@ -147,5 +147,5 @@ def test_every_figure_has_a_caption(dataset: TerrainDataset, qualities: Qualitie
         for name, _ in _figures("m on d", ColourModel(), dataset, dict(evaluate(ColourModel(), dataset)), 1)
     ]
     assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(named)
-    captions = [caption(name, dataset.splits) for name in (*named, "ladder")]
+    captions = [caption(name, dataset.splits) for name in (*named, "severity")]
     assert len({title for title, _ in captions}) == len(captions)

@@ -36,7 +36,7 @@ def first(problem: Problem, draw: bool = False) -> Step:
 
 
 def step_at(state: Tensor, draw: bool = False) -> Step:
-    return Step(state=state, felt=torch.full_like(state[:, 0], torch.nan), time_s=0.0, draw=draw)
+    return Step(state=state, traversability=torch.full_like(state[:, 0], torch.nan), time_s=0.0, draw=draw)
 
 
 def with_start(problem: Problem, *start: float) -> Problem:
@@ -49,18 +49,18 @@ def drive(planner: Any, problem: Problem, truth: Tensor | None = None, time_budg
     ground = problem.risk_map if truth is None else truth
     terrain = replace(factories.terrain(ground, 0.05), grid=problem.grid)
     world = World(time_budget_s=time_budget_s)
-    luck = rng.stream_key(0, "luck")
+    noise = rng.stream_key(0, "noise")
     simulation = Simulation(
-        terrain, problem.task, world, factories.places(problem.goal_m), luck, range(len(problem))
+        terrain, problem.task, world, factories.places(problem.goal_m), noise, range(len(problem))
     )
     now = simulation.init(problem.start)
     plan_state = planner.init(problem, generator())
     states, actions = [now.state], []
-    felt = torch.full_like(problem.start[:, 0], torch.nan)
+    observed = torch.full_like(problem.start[:, 0], torch.nan)
     while bool(now.running.any()):
-        step = Step(state=now.state, felt=felt, time_s=len(actions) * problem.dt_s)
+        step = Step(state=now.state, traversability=observed, time_s=len(actions) * problem.dt_s)
         action, plan_state, _ = planner.plan(step, plan_state)
-        now, felt = simulation.step(now, action)
+        now, observed = simulation.step(now, action)
         states.append(now.state)
         actions.append(action)
     return Drive(now.outcome, now.step, torch.stack(states, 1), torch.stack(actions, 1))

@@ -119,7 +119,7 @@ class Scaled(GoalDistance):
 def test_by_default_the_unit_of_the_objective_changes_nothing(temperature: float | None, same: bool) -> None:
     actions = []
     for objective in (GoalDistance(), Scaled()):
-        # A short horizon: 1000 times what it costs stays below the price of ground that is not free.
+        # A short horizon: 1000 times what it costs stays below the penalty of ground that is not free.
         problem = factories.problem(torch.full((1, 16, 16), 0.8), (5.75, 5.75), objective=objective)
         planner = MPPI(replace(SMALL, horizon_s=0.5, temperature=temperature))
         actions.append(planner.plan(first(problem), planner.init(problem, generator()))[0])
@@ -282,7 +282,7 @@ def test_it_drives_at_the_target_that_it_is_given() -> None:
     ]
     assert turns[1] - turns[0] > 0.03
     assert torch.equal(planner.plan(first(problem), state)[1].mean[0, :, 1].mean(), turns[0])
-    assert planner.took(state, aside) is state
+    assert planner.commit_action(state, aside) is state
 
 
 @pytest.mark.parametrize("robot", [Unicycle(), DifferentialDrive(), Bicycle()])

@@ -121,7 +121,7 @@ def test_a_closed_wall_that_can_be_passed_in_truth_is_crossed(planner: str, robo
     # Head on: a bicycle, which needs room to turn, may leave the map where it comes upon a wall aslant.
     places = {"start": (4.1, 1.25), "goal": (4.1, 8.75)}
     if planner == "mppi":
-        # The price of crossing lies within its horizon and what is won by it beyond: it waits before the wall.
+        # The penalty of crossing lies within its horizon and what is won by it beyond: it waits before the wall.
         driven = run(planner, robot, predicted, truth, time_budget_s=12.0, **places)
         assert driven.outcome.tolist() == [Outcome.TIMEOUT] * 2
     else:

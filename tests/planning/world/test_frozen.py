@@ -17,9 +17,9 @@ from benchnav.planning.world.world import Immobile, World
 from benchnav.terrain import Terrain
 from tests import factories
 
-KEY = rng.stream_key(0, "luck")
+KEY = rng.stream_key(0, "noise")
 FREE = World(noise="frozen")
-HOLDING = World(noise="frozen", immobile=Immobile(below=0.1))
+IMMOBILISING = World(noise="frozen", immobile=Immobile(below=0.1))
 
 
 def ground(batch: int, *components: tuple[float, float, float], size: int = 16) -> Terrain:
@@ -74,13 +74,13 @@ def test_the_correlation_of_the_gaussian_field_is_that_of_the_world(correlation_
         assert float((here * other).mean()) == pytest.approx(expected, abs=0.03)
 
 
-def test_a_field_is_keyed_by_root_and_instance_whatever_the_batch() -> None:
+def test_a_field_is_keyed_by_root_and_map_whatever_the_batch() -> None:
     terrain = ground(4, *SOFT)
-    together, _ = draw_frozen(terrain, HOLDING, across(4), KEY, [3, 5, 7, 9])
-    alone, _ = draw_frozen(terrain.select(torch.tensor([2])), HOLDING, across(1), KEY, [7])
+    together, _ = draw_frozen(terrain, IMMOBILISING, across(4), KEY, [3, 5, 7, 9])
+    alone, _ = draw_frozen(terrain.select(torch.tensor([2])), IMMOBILISING, across(1), KEY, [7])
     assert torch.equal(alone[0], together[2])
     assert len({float(values.sum()) for values in together}) == 4
-    other, _ = draw_frozen(terrain, HOLDING, across(4), rng.stream_key(1, "luck"), [3, 5, 7, 9])
+    other, _ = draw_frozen(terrain, IMMOBILISING, across(4), rng.stream_key(1, "noise"), [3, 5, 7, 9])
     assert not (other == together).flatten(1).all(dim=1).any()
 
 
@@ -93,7 +93,7 @@ def test_another_correlation_filters_the_same_white_noise() -> None:
     assert float(torch.corrcoef(torch.stack((near, far)))[0, 1]) > 0.9
 
 
-def wall_with_luck(batch: int) -> Terrain:
+def wall_with_noise(batch: int) -> Terrain:
     """Firm ground crossed by a wall that lets through in about one draw of three."""
     terrain = ground(batch, (1.0, 0.8, 0.01))
     terrain.truth.means[:, :, :, 8] = 0.1 - 0.6
@@ -101,9 +101,9 @@ def wall_with_luck(batch: int) -> Terrain:
     return terrain
 
 
-def test_ground_that_holds_the_robot_on_every_way_is_drawn_again() -> None:
-    terrain, places = wall_with_luck(300), across(300)
-    field, attempts = draw_frozen(terrain, HOLDING, places, KEY, range(300))
+def test_ground_that_immobilises_the_robot_on_every_way_is_drawn_again() -> None:
+    terrain, places = wall_with_noise(300), across(300)
+    field, attempts = draw_frozen(terrain, IMMOBILISING, places, KEY, range(300))
     assert joined(field >= 0.1, terrain.grid, places).all()
     assert 2 < attempts.double().mean() < 6
     assert attempts.min() == 1
@@ -115,18 +115,20 @@ def test_ground_that_holds_the_robot_on_every_way_is_drawn_again() -> None:
     assert not joined(first[~kept] >= 0.1, terrain.grid, places.select(torch.nonzero(~kept)[:, 0])).any()
 
 
-def test_what_holds_the_robot_counts_in_drawing_again() -> None:
-    terrain, places = wall_with_luck(100), across(100)
-    hard = replace(HOLDING, immobile=Immobile(below=0.3))
-    easier, harder = (draw_frozen(terrain, world, places, KEY, range(100))[1] for world in (HOLDING, hard))
+def test_what_immobilises_the_robot_counts_in_drawing_again() -> None:
+    terrain, places = wall_with_noise(100), across(100)
+    hard = replace(IMMOBILISING, immobile=Immobile(below=0.3))
+    easier, harder = (
+        draw_frozen(terrain, world, places, KEY, range(100))[1] for world in (IMMOBILISING, hard)
+    )
     assert harder.double().mean() > easier.double().mean()
 
 
-def test_ground_without_any_way_is_refused_with_the_instance() -> None:
+def test_ground_without_any_way_is_refused_with_the_map() -> None:
     terrain = ground(2, (1.0, 0.8, 0.01))
     terrain.truth.means[1, :, :, 8] = -1.0
-    with pytest.raises(ConfigError, match=r"none for instance 41\. Lower `immobile\.below`"):
-        draw_frozen(terrain, HOLDING, across(2), KEY, [40, 41])
+    with pytest.raises(ConfigError, match=r"none for example 41\. Lower `immobile\.below`"):
+        draw_frozen(terrain, IMMOBILISING, across(2), KEY, [40, 41])
 
 
 def test_ground_is_joined_over_edges_and_not_corners() -> None:

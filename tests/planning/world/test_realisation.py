@@ -10,13 +10,13 @@ from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
 from tests import factories
 
-KEY = rng.stream_key(0, "luck")
+KEY = rng.stream_key(0, "noise")
 PLACES = factories.places(torch.tensor([[6.0, 6.0]]))
 MIDDLE = torch.tensor([[4.0, 4.0, 0.0]])
 
 
 def realisation(mean: torch.Tensor, std: float = 0.1, noise: str = "resampled", steps: int = 200, **given):  # type: ignore[no-untyped-def]
-    settings = {"key": KEY, "instances": range(len(mean)), **given}
+    settings = {"key": KEY, "maps": range(len(mean)), **given}
     places = factories.places(torch.full((len(mean), 2), 6.0))
     return Realisation(factories.terrain(mean, std), World(noise=noise), places, steps, **settings)
 
@@ -39,25 +39,25 @@ def test_resampled_noise_has_the_latent_distribution_at_each_step() -> None:
     assert len(drawn.unique()) > 7900
 
 
-def test_luck_is_keyed_by_instance_and_step_whatever_the_batch() -> None:
+def test_noise_is_keyed_by_map_and_step_whatever_the_batch() -> None:
     together = met(realisation(even(40)), 40, 5)
-    alone = met(realisation(even(1), instances=[7]), 1, 5)
+    alone = met(realisation(even(1), maps=[7]), 1, 5)
     assert torch.equal(alone[:, 0], together[:, 7])
-    turned = met(realisation(even(2), instances=[9, 7]), 2, 5)
+    turned = met(realisation(even(2), maps=[9, 7]), 2, 5)
     assert torch.equal(turned, together[:, [9, 7]])
 
 
-def test_another_root_is_another_luck() -> None:
-    first, second = (met(realisation(even(3), key=rng.stream_key(seed, "luck")), 3, 4) for seed in (0, 1))
+def test_another_root_is_another_noise() -> None:
+    first, second = (met(realisation(even(3), key=rng.stream_key(seed, "noise")), 3, 4) for seed in (0, 1))
     assert not (first == second).any()
 
 
-def test_another_time_budget_leaves_the_luck_as_it_is() -> None:
+def test_another_time_budget_leaves_the_noise_as_it_is() -> None:
     short, long = (met(realisation(even(2), steps=steps), 2, 10) for steps in (10, 1000))
     assert torch.equal(short, long)
 
 
-def test_luck_scales_with_each_cells_standard_deviation_and_mean() -> None:
+def test_noise_scales_with_each_cells_standard_deviation_and_mean() -> None:
     narrow, wide = (met(realisation(even(2, 0.5), std), 2, 20) - 0.5 for std in (0.01, 0.1))
     torch.testing.assert_close(10 * narrow, wide, atol=1e-5, rtol=0)
     lower = met(realisation(even(2, 0.4), 0.01), 2, 20)
@@ -103,7 +103,7 @@ def test_stored_noise_needs_every_cell_observed() -> None:
 def test_some_episodes_are_exchanged_and_the_others_stay(noise: str) -> None:
     ground = torch.rand(3, 16, 16)
     one = realisation(ground, noise=noise)
-    other = realisation(torch.rand(2, 16, 16), noise=noise, instances=[20, 21])
+    other = realisation(torch.rand(2, 16, 16), noise=noise, maps=[20, 21])
     before, given = met(one, 3, 5), ground.clone()
     field = None if one.field is None else one.field.clone()
     one.exchange_(torch.tensor([2, 0]), other)

@@ -12,7 +12,7 @@ from benchnav.planning.world.simulation import Simulation, SimulationState, end
 from benchnav.planning.world.world import Immobile, World
 from tests import factories
 
-KEY = rng.stream_key(0, "luck")
+KEY = rng.stream_key(0, "noise")
 AHEAD = torch.tensor([[1.0, 0.0]])
 FAR = (90.0, 90.0)
 
@@ -202,7 +202,7 @@ def test_a_robot_is_held_whatever_was_commanded() -> None:
 
 
 def test_a_break_begins_the_count_anew() -> None:
-    """Two soft cells of 0.5 m, each crossed in less time than holds a robot, with firm ground between."""
+    """Two soft cells of 0.5 m, each crossed in less time than immobilises a robot, with firm ground between."""
     ground = even(0.5)
     ground[:, :, [4, 6]] = 0.09
     crossing_s = 0.5 / 0.09

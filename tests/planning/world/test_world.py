@@ -11,7 +11,9 @@ from benchnav.planning.world.world import PRESETS, Immobile, World
 def test_the_papers_world() -> None:
     paper = PRESETS["paper"]
     assert paper.world == World(noise="resampled", time_budget_s=100.0)
-    assert paper.rules == Rules(free_space=FreeSpace(by="risk", above=0.3), slowest=0.3, goal_radius_m=1.0)
+    assert paper.rules == Rules(
+        free_space=FreeSpace(by="risk", above=0.3), min_traversability=0.3, goal_radius_m=1.0
+    )
 
 
 def test_the_world_with_stakes() -> None:
@@ -20,7 +22,9 @@ def test_the_world_with_stakes() -> None:
         noise="frozen", correlation_m=1.5, immobile=Immobile(below=0.1, for_s=2.0), time_budget_s=None,
         time_budget_ratio=3.0,
     )  # fmt: skip
-    assert stakes.rules == Rules(free_space=FreeSpace(by="mean", above=0.1), slowest=0.05, goal_radius_m=1.0)
+    assert stakes.rules == Rules(
+        free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05, goal_radius_m=1.0
+    )
 
 
 def test_a_time_budget_is_in_seconds_or_in_reference_times_at_top_speed() -> None:

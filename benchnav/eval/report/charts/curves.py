@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.charts.sweeps import SEVERITY, Line, Sweep
 from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, display_name
-from benchnav.eval.trial import NOT_USED
 
 _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
@@ -44,7 +44,7 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
         sweep: from `find_sweeps`.
         summary: of the run.
     """
-    rows = {row["trial"]: row for row in summary.to_dict("records")}
+    rows = {row["condition"]: row for row in summary.to_dict("records")}
     groups = _panels(sweep, rows)
     across = min(len(groups), _MOST_ACROSS)
     down = -(-len(groups) // across)
@@ -84,7 +84,7 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
 
 
 def _panels(sweep: Sweep, rows: Mapping[str, Labels]) -> list[tuple[str, list[Line]]]:
-    """Titles and lines of the panels: split until no panel holds more lines than can be told apart."""
+    """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish."""
     for split in (("model",), ("model", "planner"), ("model", "planner", "risk")):
         groups: Groups = {}
         for line in sweep.lines:
@@ -100,7 +100,7 @@ def _panels(sweep: Sweep, rows: Mapping[str, Labels]) -> list[tuple[str, list[Li
 
 
 def _with_blind(groups: Groups) -> Groups:
-    """Puts what looks at nothing predicted into the panels of the models that it stands beside."""
+    """Puts what is blind into the panels of the models that it stands beside."""
     found: Groups = {}
     for key, lines in groups.items():
         beside = [other for other in groups if other != key and _without_model(other) == _without_model(key)]
@@ -117,7 +117,7 @@ def _without_model(key: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _place(sweep: Sweep, line: Line, rows: Mapping[str, Labels], split: Sequence[str]) -> tuple[str, ...]:
-    row = rows[line.trials[0]]
+    row = rows[line.conditions[0]]
     scenario = str(line.rest["split"]).removeprefix("test/")
     world = row["world"].split(" ")[0] if sweep.number.startswith(("world.", "rules.")) else row["world"]
     parts = [_label(sweep, line, row, name) for name in (*split, "robot", "objective")]
@@ -135,17 +135,17 @@ def _name(sweep: Sweep, line: Line, rows: Mapping[str, Labels]) -> str:
     """What a line is called: planner and risk setting, and what its labels do not say where that is needed."""
     name = _words(sweep, line, rows)
     place = _place(sweep, line, rows, ("model",))
-    twins = [
+    look_alikes = [
         other
         for other in sweep.lines
         if _words(sweep, other, rows) == name and _place(sweep, other, rows, ("model",)) == place
     ]
-    differing = [key for key in line.rest if len({repr(other.rest.get(key)) for other in twins}) > 1]
+    differing = [key for key in line.rest if len({repr(other.rest.get(key)) for other in look_alikes}) > 1]
     return ", ".join([name, *(f"{sweep_name(key)} {line.rest[key]}" for key in differing)])
 
 
 def _words(sweep: Sweep, line: Line, rows: Mapping[str, Labels]) -> str:
-    row = rows[line.trials[0]]
+    row = rows[line.conditions[0]]
     words = [_label(sweep, line, row, name) for name in ("planner", "risk")]
     return ", ".join(word for word in words if word != NOT_USED)
 
@@ -168,7 +168,7 @@ def _draw_line(
     look: tuple[str, str],
 ) -> None:
     rate, low, high = (
-        [columns[3] * float(rows[trial][name]) for trial in line.trials] for name in columns[:3]
+        [columns[3] * float(rows[condition][name]) for condition in line.conditions] for name in columns[:3]
     )
     places = _places(number, line.values)
     panel.fill_between(places, low, high, color=look[0], alpha=0.15, lw=0)
@@ -187,15 +187,15 @@ def _draw_references(
     """Draws the settings that have no such number, each in the colour of its planner's line."""
     if not sweep.number.startswith("risk."):
         return
-    swept = {trial for line in sweep.lines for trial in line.trials}
+    swept = {condition for line in sweep.lines for condition in line.conditions}
     same = ("data", "scenario", "world", "robot", "objective")
     for line in lines:
-        first = rows[line.trials[0]]
-        for trial, row in rows.items():
+        first = rows[line.conditions[0]]
+        for condition, row in rows.items():
             blind = row["model"] == NOT_USED
             alike = all(row[name] == first[name] for name in same)
             mine = all(row[name] == first[name] for name in ("model", "planner")) or blind
-            if trial in swept or not alike or not mine:
+            if condition in swept or not alike or not mine:
                 continue
             colour = "0.5" if blind else colours[_name(sweep, line, rows)][0]
             label = display_name(row["planner"]) if blind else row["risk"]

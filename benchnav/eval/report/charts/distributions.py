@@ -1,4 +1,4 @@
-"""The figure of distributions: time and λ̄ of every episode of each trial."""
+"""The figure of distributions: time and λ̄ of every episode of each condition."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from benchnav.eval.report.charts.panels import lay_out
 
-_QUANTITIES = {"total_time_s": "T_total [s], a failure counts as T", "traversability": "λ̄, mean λ met"}
+_QUANTITIES = {"total_time_s": "T_total [s], a failure counts as T", "traversability": "λ̄, mean observed λ"}
 _SUCCESS, _FAILURE = "#0072B2", "#D55E00"
 _SPREAD = 0.32  # of a row's height, to either side
 
@@ -22,12 +22,12 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
         summary: from `summary.summarise`.
         episodes: the rows it was made of.
     """
-    groups = dict(list(episodes.groupby("trial", sort=False)))
+    groups = dict(list(episodes.groupby("condition", sort=False)))
     layout = lay_out(summary, list(_QUANTITIES.values()), legend_in=0.15)
     names = list(_QUANTITIES)
     for place, (panel, rows) in enumerate(layout.panels):
         name = names[place % len(names)]
-        _draw(panel, [(height, groups[row["trial"]]) for height, row in layout.rows(rows)], name)
+        _draw(panel, [(height, groups[row["condition"]]) for height, row in layout.rows(rows)], name)
     layout.panels[0][0].set_xlim(left=0)
     layout.panels[1][0].set_xlim(0, 1)
     handles = [
@@ -42,7 +42,7 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
 
 
 def _draw(panel: Axes, rows: Sequence[tuple[float, pd.DataFrame]], name: str) -> None:
-    """Draws a quantity of the episodes of several trials, each trial at its height; all dots at once."""
+    """Draws a quantity of the episodes of several conditions, each condition at its height; all dots at once."""
     dots, middles = [], []
     for height, episodes in rows:
         values = episodes[name].to_numpy(dtype=float)

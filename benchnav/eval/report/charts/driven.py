@@ -12,19 +12,19 @@ import pandas as pd
 from benchnav.errors import ConfigError
 from benchnav.eval.folder.folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
-from benchnav.eval.report.contenders import NAMING, contender_names, trial_colours
-from benchnav.eval.report.recorded.ground import HOLDING
+from benchnav.eval.report.contenders import NAMING, condition_colours, contender_names
+from benchnav.eval.report.recorded.ground import IMMOBILISING
 from benchnav.files import replacing
 
 if TYPE_CHECKING:  # runs keep the map of the figure, and draw nothing
     from matplotlib.figure import Figure
 
 GROUND = "ground.npz"
-# What one map under one draw of luck is known by.
-MAP = ("data", "scenario", "world", "seed", "realisation", "instance")
+# What one map under one draw of λ is known by.
+MAP = ("data", "scenario", "world", "seed", "realisation", "map")
 MOST_PATHS = 16
 
-_ARRAYS = ("rgb", "holding", "goal_m")
+_ARRAYS = ("rgb", "immobilising", "goal_m")
 _STYLES = ("solid", "dashed")
 _DARKEST = 0.35  # grey of λ = 0
 
@@ -34,11 +34,11 @@ class DrivenGround:
     """The map of the figure.
 
     Args:
-        about: which map and luck, by the names of `MAP`.
+        about: which map and draw, by the names of `MAP`.
         resolution_m: edge length of a cell.
         rgb: uint8, shape [3, H, W].
         field: λ as it was, shape [H, W]; None where it was resampled.
-        holding: cells of the field that hold a robot for good, bool, shape [H, W].
+        immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
         goal_m: (x, y).
     """
 
@@ -46,7 +46,7 @@ class DrivenGround:
     resolution_m: float
     rgb: np.ndarray
     field: np.ndarray | None
-    holding: np.ndarray
+    immobilising: np.ndarray
     goal_m: np.ndarray
 
     def save(self, path: Path) -> None:
@@ -67,9 +67,9 @@ class DrivenGround:
 
 
 def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
-    """Chooses the map and the draw of luck on which about as many trials succeed as fail.
+    """Chooses the map and the draw of λ on which about as many conditions succeed as fail.
 
-    Of several such the one that most trials were run on, then the first.
+    Of several such the one that most conditions were run on, then the first.
 
     Args:
         episodes: rows of a run.
@@ -78,9 +78,9 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
         What the map is known by, by the names of `MAP`.
     """
     groups = episodes.groupby(list(MAP), sort=False)["success"]
-    counted = pd.DataFrame({"trials": groups.size(), "successes": groups.sum()}).reset_index()
-    counted["differing"] = np.minimum(counted["successes"], counted["trials"] - counted["successes"])
-    best = counted.sort_values(["differing", "trials"], ascending=False, kind="stable").iloc[0]
+    counted = pd.DataFrame({"conditions": groups.size(), "successes": groups.sum()}).reset_index()
+    counted["differing"] = np.minimum(counted["successes"], counted["conditions"] - counted["successes"])
+    best = counted.sort_values(["differing", "conditions"], ascending=False, kind="stable").iloc[0]
     return {
         name: value.item() if hasattr(value, "item") else value for name, value in best[list(MAP)].items()
     }
@@ -100,22 +100,22 @@ def write_driven(folder: Path, out: Path) -> dict[str, str]:
     for name in MAP:
         rows = rows[rows[name] == ground.about[name]]
     tracks = {}
-    for trial in rows["trial"]:
-        place = {name: ground.about[name] for name in ("seed", "realisation", "instance")}
-        steps = read_steps(folder, trial=trial, **place)
+    for condition in rows["condition"]:
+        place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
+        steps = read_steps(folder, condition=condition, **place)
         if len(steps):
-            tracks[trial] = steps[["x_m", "y_m"]].to_numpy()
+            tracks[condition] = steps[["x_m", "y_m"]].to_numpy()
     from benchnav.eval.report.figure_style import save
 
-    shown = rows[rows["trial"].isin(tracks)].iloc[:MOST_PATHS]
+    shown = rows[rows["condition"].isin(tracks)].iloc[:MOST_PATHS]
     if shown.empty:
         return {}
     save(
-        driven_figure(ground, shown, [tracks[trial] for trial in shown["trial"]]),
+        driven_figure(ground, shown, [tracks[condition] for condition in shown["condition"]]),
         out / "figures" / "driven.png",
     )
     about = ground.about
-    words = [f"Whole driven paths on {about['scenario']} {about['instance']}, seed {about['seed']},"]
+    words = [f"Whole driven paths on {about['scenario']} {about['map']}, seed {about['seed']},"]
     differ = rows["success"].nunique() > 1
     words += [
         f"realisation {about['realisation']}: "
@@ -125,7 +125,7 @@ def write_driven(folder: Path, out: Path) -> dict[str, str]:
             else "on no map did outcomes differ."
         )
     ]
-    words += [f"{len(shown)} of {len(rows)} trials."] if len(shown) < len(rows) else []
+    words += [f"{len(shown)} of {len(rows)} conditions."] if len(shown) < len(rows) else []
     return {"driven": " ".join(words)}
 
 
@@ -134,19 +134,19 @@ def driven_figure(ground: DrivenGround, rows: pd.DataFrame, tracks: Sequence[np.
 
     Args:
         ground: the map.
-        rows: an episode a trial.
+        rows: an episode a condition.
         tracks: positions of each, shape [N + 1, 2].
     """
     from matplotlib.figure import Figure
 
     if rows.empty:
         raise ConfigError("Expected one or more driven paths, got none.")
-    high, wide = (count * ground.resolution_m for count in ground.holding.shape)
+    high, wide = (count * ground.resolution_m for count in ground.immobilising.shape)
     figure = Figure(figsize=(6.6, max(3.6, min(3.8 * high / wide + 0.3, 7.0))), layout="constrained")
     panel = figure.subplots()
     panel.imshow(_backdrop(ground), origin="lower", extent=(0, wide, 0, high), interpolation="nearest")
     names = contender_names(rows[list(NAMING)].to_dict("records"))
-    colours = trial_colours(len(rows))
+    colours = condition_colours(len(rows))
     for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
         colour = tuple(value / 255 for value in colours[place])
         # Later ones are thinner, so that paths that coincide are all seen.
@@ -174,7 +174,7 @@ def _title(ground: DrivenGround) -> str:
     if ground.field is None:
         return "terrain, faded"
     return "λ as it was: the lighter the faster" + (
-        "; dark red holds a robot" if ground.holding.any() else ""
+        "; dark red immobilises a robot" if ground.immobilising.any() else ""
     )
 
 
@@ -183,5 +183,5 @@ def _backdrop(ground: DrivenGround) -> np.ndarray:
     if ground.field is None:
         return 0.4 * np.moveaxis(ground.rgb, 0, -1) / 255 + 0.6
     grey = _DARKEST + (1 - _DARKEST) * np.repeat(ground.field[..., None], 3, axis=-1)
-    grey[ground.holding] = [value / 255 for value in HOLDING]
+    grey[ground.immobilising] = [value / 255 for value in IMMOBILISING]
     return grey

@@ -1,4 +1,4 @@
-"""A sheet of failures: small maps of what the planner was told, the path driven on them, and where it ended.
+"""A sheet of failures: small maps of what was predicted, the path driven on them, and where it ended.
 
 Letters in shapes: N episodes, H×W cells.
 """
@@ -14,24 +14,24 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, TWO_COLUMNS_IN
-from benchnav.eval.report.recorded.ground import HOLDING
+from benchnav.eval.report.recorded.ground import IMMOBILISING
 
 ACROSS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class FailedGround:
-    """The ground of failed episodes of one trial.
+    """The ground of failed episodes of one condition.
 
     Args:
         predicted: λ̂, the map the planner was given, shape [N, H, W].
-        holding: cells that hold a robot for good, bool, shape [N, H, W]; false where λ was resampled.
+        immobilising: cells that immobilise a robot, bool, shape [N, H, W]; false where λ was resampled.
         resolution_m: edge length of a cell.
         goal_m: (x, y), shape [N, 2].
     """
 
     predicted: np.ndarray
-    holding: np.ndarray
+    immobilising: np.ndarray
     resolution_m: float
     goal_m: np.ndarray
 
@@ -47,10 +47,10 @@ class FailedGround:
 
 @dataclass(frozen=True, kw_only=True)
 class Shown:
-    """A line of the sheet: failures of one trial.
+    """A line of the sheet: failures of one condition.
 
     Args:
-        name: of the trial.
+        name: of the condition.
         failures: rows of `failures.failures_table`, at most `ACROSS`.
         ground: of these.
         tracks: driven positions of each, shape [steps, 2].
@@ -73,7 +73,7 @@ def choose(failures: pd.DataFrame) -> pd.DataFrame:
 
 
 def failure_sheet(lines: Sequence[Shown]) -> Figure:
-    """Draws the sheet, a line a trial.
+    """Draws the sheet, a line a condition.
 
     Args:
         lines: one or more.
@@ -89,20 +89,20 @@ def failure_sheet(lines: Sequence[Shown]) -> Figure:
             _draw(across[place], line, place)
             told = line.ground.told(line.failures[["x_m", "y_m"]].to_numpy())[place]
             across[place].set_title(
-                f"{row['scenario']} {row['instance']}: {row['outcome'].replace('_', ' ')}, "
+                f"{row['scenario']} {row['map']}: {row['outcome'].replace('_', ' ')}, "
                 f"{row['end_time_s']:.0f} s\n{_words(told, row['last_traversability'])}",
                 fontsize=6.5,
             )
         across[0].set_ylabel(f"{line.name}\n({len(line.failures)} of {line.among} failures)", fontsize=6.5)
     colours = panels.flat[0].images[0]
-    figure.colorbar(colours, ax=panels, fraction=0.02, aspect=30, label="λ̂ that the planner was told")
+    figure.colorbar(colours, ax=panels, fraction=0.02, aspect=30, label="predicted λ̂")
     figure.legend(handles=_legend(lines), loc="outside lower center", ncols=5)
     return figure
 
 
 def _words(told: float, met: float) -> str:
-    known = "outside the map" if np.isnan(told) else f"told λ̂ = {told:.2f}"
-    return f"{known}, met λ = {met:.2f}" if not np.isnan(met) else known
+    known = "outside the map" if np.isnan(told) else f"λ̂ = {told:.2f}"
+    return f"{known}, observed λ = {met:.2f}" if not np.isnan(met) else known
 
 
 def _draw(panel: Axes, line: Shown, place: int) -> None:
@@ -113,9 +113,9 @@ def _draw(panel: Axes, line: Shown, place: int) -> None:
     panel.imshow(
         ground.predicted[place], origin="lower", extent=extent, cmap=TRAVERSABILITY_COLOURS, vmin=0, vmax=1
     )
-    if ground.holding[place].any():
-        held = np.zeros((*ground.holding.shape[1:], 4))
-        held[ground.holding[place]] = [*(value / 255 for value in HOLDING), 0.75]
+    if ground.immobilising[place].any():
+        held = np.zeros((*ground.immobilising.shape[1:], 4))
+        held[ground.immobilising[place]] = [*(value / 255 for value in IMMOBILISING), 0.75]
         panel.imshow(held, origin="lower", extent=extent)
     track = line.tracks[place]
     for colour, thick in (("white", 2.4), ("black", 1.1)):
@@ -133,7 +133,7 @@ def _legend(lines: Sequence[Shown]) -> list[Line2D | Patch]:
         for marker, size, label in (("o", 4, "start"), ("*", 8, "goal"), ("X", 6, "end"))
     ]
     marks.append(Line2D([], [], color="black", lw=1.1, label="driven"))
-    if any(line.ground.holding.any() for line in lines):
-        red, green, blue = (value / 255 for value in HOLDING)
-        marks.append(Patch(color=(red, green, blue), label="ground that holds a robot"))
+    if any(line.ground.immobilising.any() for line in lines):
+        red, green, blue = (value / 255 for value in IMMOBILISING)
+        marks.append(Patch(color=(red, green, blue), label="ground that immobilises a robot"))
     return marks

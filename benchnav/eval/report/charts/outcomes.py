@@ -1,4 +1,4 @@
-"""The figure of outcomes: how the episodes of each trial ended, as shares of a bar."""
+"""The figure of outcomes: how the episodes of each condition ended, as shares of a bar."""
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -22,7 +22,7 @@ SUCCESS_COLOUR = "#E4E4E4"
 
 
 def outcome_figure(summary: pd.DataFrame) -> Figure:
-    """Draws the shares of outcomes, a bar a trial, in one order for all: failures first, then success.
+    """Draws the shares of outcomes, a bar a condition, in one order for all: failures first, then success.
 
     Args:
         summary: from `summary.summarise`.

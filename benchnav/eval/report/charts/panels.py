@@ -1,4 +1,4 @@
-"""The layout that charts of trials share: a panel a block of the run, a row a setting.
+"""The layout that charts of conditions share: a panel a block of the run, a row a setting.
 
 Any number of planners, models and risk settings fits, since their names stand on the left.
 """
@@ -10,9 +10,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, trial_name
+from benchnav.eval.condition import NOT_USED
+from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, condition_name
 from benchnav.eval.stats.best import BLOCK
-from benchnav.eval.trial import NOT_USED
 
 _ROW_IN, _GAP_ROWS = 0.145, 0.6
 _PANELS_A_LINE = 4
@@ -47,12 +47,12 @@ def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
 
 
 def several_models(summary: pd.DataFrame) -> list[str]:
-    """The label that names a trial beside planner and risk: its model, where those that look at one differ."""
+    """The label that names a condition beside planner and risk: its model, where those that look at one differ."""
     return ["model"] if summary.loc[summary["model"] != NOT_USED, "model"].nunique() > 1 else []
 
 
 def planner_colours(summary: pd.DataFrame) -> dict[str, str]:
-    """A colour a planner; grey for those that look at nothing predicted."""
+    """A colour a planner; grey for those that are blind."""
     blind = set(summary.loc[summary["model"] == NOT_USED, "planner"])
     seeing = [planner for planner in summary["planner"].unique() if planner not in blind]
     colours = {planner: OKABE_ITO[place % len(OKABE_ITO)] for place, planner in enumerate(seeing)}
@@ -90,7 +90,7 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
         axes.flat[place].set_xlabel(measures[place % columns])
     several = several_models(summary)
     names = [
-        trial_name(dict(zip(("planner", "model", "risk"), setting, strict=True)), several)
+        condition_name(dict(zip(("planner", "model", "risk"), setting, strict=True)), several)
         for setting in heights
     ]
     axes.flat[0].set_yticks(list(heights.values()), names)

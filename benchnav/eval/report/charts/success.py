@@ -7,24 +7,24 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.charts.panels import lay_out, planner_colours
-from benchnav.eval.trial import NOT_USED
 
 
 def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figure:
-    """Draws the success rate of every trial with its 95 % interval, a panel a block of the run.
+    """Draws the success rate of every condition with its 95 % interval, a panel a block of the run.
 
-    A planner that looks at nothing predicted is drawn as a line through its panel, the floor that others are
+    A planner that is blind is drawn as a line through its panel, the floor that others are
     seen against.
 
     Args:
         summary: from `summary.summarise`.
-        marked: trials whose points are filled, as `best_marked` of `best.against_best` has them.
+        marked: conditions whose points are filled, as `best_marked` of `best.against_best` has them.
     """
     layout, colours = lay_out(summary, ["success [%]"]), planner_colours(summary)
     for panel, rows in layout.panels:
         for height, row in layout.rows(rows):
-            _draw(panel, height, row, colours[str(row["planner"])], row["trial"] in marked)
+            _draw(panel, height, row, colours[str(row["planner"])], row["condition"] in marked)
         panel.set_xticks(np.arange(0, 101, 25))
     layout.panels[0][0].set_xlim(-4, 104)
     return layout.figure

@@ -1,4 +1,4 @@
-"""Finds the sweeps of a run: trials that are equal in all but one number, which takes three values or more."""
+"""Finds the sweeps of a run: conditions that are equal in all but one number, which takes three values or more."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav.models.quality.ladders import find_ladders
+from benchnav.models.quality.series import find_series
 
 SEVERITY = "severity"
 LEAST_VALUES = 3
@@ -14,16 +14,16 @@ LEAST_VALUES = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Trials of one sweep that differ in its number alone.
+    """Conditions of one sweep that differ in its number alone.
 
     Args:
         values: of the number, ascending.
-        trials: ids, one a value.
-        rest: all else that the trials are, by name with dots.
+        conditions: ids, one a value.
+        rest: all else that the conditions are, by name with dots.
     """
 
     values: tuple[float, ...]
-    trials: tuple[str, ...]
+    conditions: tuple[str, ...]
     rest: Mapping[str, Any]
 
 
@@ -49,19 +49,23 @@ def flatten(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     return flat
 
 
-def find_sweeps(trials: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
+def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
     """Finds the sweeps of a run.
 
     A number that others follow, such as two that were changed together, makes no sweep.
 
     Args:
-        trials: by id, with `value`, as `run.json` holds them; those of format version 1 say too little of
+        conditions: by id, with `value`, as `run.json` holds them; those of format version 1 say too little of
             themselves and make none.
 
     Returns:
         By name of the number.
     """
-    flat = {trial: flatten(about["value"]) for trial, about in trials.items() if "split" in about["value"]}
+    flat = {
+        condition: flatten(about["value"])
+        for condition, about in conditions.items()
+        if "split" in about["value"]
+    }
     numbers = sorted({name for one in flat.values() for name, value in one.items() if _is_number(value)})
     sweeps = [Sweep(number=name, lines=tuple(_lines(_along(flat, name)))) for name in numbers]
     sweeps.append(Sweep(number=SEVERITY, lines=tuple(_lines(_along_severity(flat)))))
@@ -76,28 +80,32 @@ Found = Iterator[tuple[str, float, dict[str, Any]]]
 
 
 def _along(flat: Mapping[str, Mapping[str, Any]], name: str) -> Found:
-    """Trials with their value of a number, and all else."""
-    for trial, one in flat.items():
+    """Conditions with their value of a number, and all else."""
+    for condition, one in flat.items():
         if _is_number(one.get(name)):
-            yield trial, float(one[name]), {key: value for key, value in one.items() if key != name}
+            yield condition, float(one[name]), {key: value for key, value in one.items() if key != name}
 
 
 def _along_severity(flat: Mapping[str, Mapping[str, Any]]) -> Found:
-    for scenario, rungs in find_ladders(dict.fromkeys(one["split"] for one in flat.values())).items():
-        severities = {split: severity for severity, split in rungs}
-        for trial, one in flat.items():
+    for scenario, pairs in find_series(dict.fromkeys(one["split"] for one in flat.values())).items():
+        severities = {split: severity for severity, split in pairs}
+        for condition, one in flat.items():
             if one["split"] in severities:
-                yield trial, severities[one["split"]], {**one, "split": scenario}
+                yield condition, severities[one["split"]], {**one, "split": scenario}
 
 
 def _lines(found: Found) -> Iterator[Line]:
-    table = pd.DataFrame([(trial, value, repr(sorted(rest.items())), rest) for trial, value, rest in found])
+    table = pd.DataFrame(
+        [(condition, value, repr(sorted(rest.items())), rest) for condition, value, rest in found]
+    )
     if table.empty:
         return
-    table.columns = pd.Index(["trial", "value", "key", "rest"])
+    table.columns = pd.Index(["condition", "value", "key", "rest"])
     for _, group in table.groupby("key", sort=False):
         if group["value"].nunique() >= LEAST_VALUES:
             ordered = group.sort_values("value", kind="stable")
             yield Line(
-                values=tuple(ordered["value"]), trials=tuple(ordered["trial"]), rest=group["rest"].iloc[0]
+                values=tuple(ordered["value"]),
+                conditions=tuple(ordered["condition"]),
+                rest=group["rest"].iloc[0],
             )

@@ -12,10 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, trial_name
+from benchnav.eval.condition import NOT_USED
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, condition_name
 from benchnav.eval.report.recorded.drawn_plan import STYLES, LayerStyle
 from benchnav.eval.report.recorded.ground import (
-    HOLDING,
+    IMMOBILISING,
     SOFT,
     field_colours,
     hatching,
@@ -23,7 +24,6 @@ from benchnav.eval.report.recorded.ground import (
     outline,
 )
 from benchnav.eval.report.recorded.snapshot import Snapshot
-from benchnav.eval.trial import NOT_USED
 
 MOST_PANELS = 8
 _PANELS_A_LINE = 4
@@ -32,34 +32,36 @@ _CLOSED = "0.25"
 _MARKS = {"start": ("o", "red", 8.0), "goal": ("X", "magenta", 10.0), "robot": ("o", "black", 7.0)}
 _IMMOBILISED: dict[str, Any] = {"marker": "X", "color": "black", "mec": "white", "ms": 13.0, "ls": "none"}
 _SOFT_WIDTH = 0.5
-_MAP = ("data", "scenario", "instance", "seed", "realisation")
+_MAP = ("data", "scenario", "map", "seed", "realisation")
 
 
-def choose(snapshots: Sequence[Snapshot], trials: Sequence[str]) -> list[Snapshot]:
-    """Chooses one snapshot a trial, all of one map where there are such, at most `MOST_PANELS`.
+def choose(snapshots: Sequence[Snapshot], conditions: Sequence[str]) -> list[Snapshot]:
+    """Chooses one snapshot a condition, all of one map where there are such, at most `MOST_PANELS`.
 
-    Of the maps that the first trial was recorded on it is the first on which outcomes differ, if there is one;
+    Of the maps that the first condition was recorded on it is the first on which outcomes differ, if there is one;
     else the first on which an episode failed.
 
     Args:
         snapshots: all there are.
-        trials: ids in the order wanted.
+        conditions: ids in the order wanted.
     """
-    order = {trial: place for place, trial in enumerate(trials)}
-    known = [snapshot for snapshot in snapshots if snapshot.about["trial"] in order]
-    known.sort(key=lambda s: (order[s.about["trial"]], int(s.about["instance"])))
+    order = {condition: place for place, condition in enumerate(conditions)}
+    known = [snapshot for snapshot in snapshots if snapshot.about["condition"] in order]
+    known.sort(key=lambda s: (order[s.about["condition"]], int(s.about["map"])))
     outcomes: dict[tuple[str, ...], set[str]] = {}
     for snapshot in known:
         outcomes.setdefault(_map(snapshot), set()).add(snapshot.about["outcome"])
-    maps = [_map(snapshot) for snapshot in known if snapshot.about["trial"] == known[0].about["trial"]]
+    maps = [
+        _map(snapshot) for snapshot in known if snapshot.about["condition"] == known[0].about["condition"]
+    ]
     differ = [place for place in maps if len(outcomes[place]) > 1]
     failed = [place for place in maps if outcomes[place] != {"success"}]
     shown = next(iter([*differ, *failed, *maps]), ())
     known.sort(key=lambda s: _map(s) != shown)
     first: dict[str, Snapshot] = {}
     for snapshot in known:
-        first.setdefault(snapshot.about["trial"], snapshot)
-    return sorted(first.values(), key=lambda s: order[s.about["trial"]])[:MOST_PANELS]
+        first.setdefault(snapshot.about["condition"], snapshot)
+    return sorted(first.values(), key=lambda s: order[s.about["condition"]])[:MOST_PANELS]
 
 
 def _map(snapshot: Snapshot) -> tuple[str, ...]:
@@ -105,7 +107,7 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
 
 def _title(snapshot: Snapshot, several: Sequence[str]) -> str:
     about = snapshot.about
-    heading = f"{trial_name(about, several)}, {about['scenario']} {about['instance']}"
+    heading = f"{condition_name(about, several)}, {about['scenario']} {about['map']}"
     return f"{heading}\nt = {snapshot.time_s:g} s; outcome: {about['outcome'].replace('_', ' ')}"
 
 
@@ -148,7 +150,7 @@ def _draw_plan(panel: Axes, snapshot: Snapshot) -> None:
 
 
 def _draw_driven(panel: Axes, snapshot: Snapshot) -> LineCollection:
-    """Draws the path driven by that moment over the terrain, coloured by the λ met."""
+    """Draws the path driven by that moment over the terrain, coloured by the observed λ."""
     driven = snapshot.track[: snapshot.now + 1]
     segments = np.stack((driven[:-1], driven[1:]), axis=1)
     lines = LineCollection(list(segments), cmap=TRAVERSABILITY_COLOURS, linewidths=3, capstyle="round")
@@ -161,14 +163,14 @@ def _draw_driven(panel: Axes, snapshot: Snapshot) -> LineCollection:
 
 
 def _draw_black(panel: Axes, track: np.ndarray) -> None:
-    """Draws a driven path over a map of λ, whose colours those of the λ met would be lost on."""
+    """Draws a driven path over a map of λ, whose colours those of the observed λ would be lost on."""
     for colour, width in (("white", 4.0), ("black", 2.2)):
         panel.plot(*track.T, color=colour, lw=width, solid_capstyle="round")
 
 
 def _draw_field(panel: Axes, snapshot: Snapshot, field: np.ndarray) -> None:
     """Draws λ as it was, and the whole driven path over it."""
-    panel.imshow(field_colours(field, snapshot.holding), origin="lower", extent=_extent(snapshot))
+    panel.imshow(field_colours(field, snapshot.immobilising), origin="lower", extent=_extent(snapshot))
     _draw_black(panel, snapshot.track)
     _draw_marks(panel, snapshot, snapshot.track[-1])
     held = immobilised_at(snapshot.about, snapshot.track)
@@ -205,7 +207,7 @@ def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
         Line2D([], [], marker=marker, color=colour, mec="white", ms=size, ls="none", label=name)
         for name, (marker, colour, size) in _MARKS.items()
     ]
-    marks.append(Line2D([], [], color="black", lw=2.2, label="driven; above in the colour of the λ met"))
+    marks.append(Line2D([], [], color="black", lw=2.2, label="driven; above in the colour of the observed λ"))
     lines: list[Artist] = [
         Line2D(
             [], [], color=_looks(style)["colors"], lw=max(_LINE_WIDTH * style.width, 1), label=style.label,
@@ -227,8 +229,8 @@ def _ground_legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
         entries.append(
             Patch(fc="0.45", ec=_unit(SOFT), hatch="////", label="soft ground, which does not show")
         )
-    if any(snapshot.holding.any() for snapshot in known):
-        entries.append(Patch(color=_unit(HOLDING), label="holds a robot"))
+    if any(snapshot.immobilising.any() for snapshot in known):
+        entries.append(Patch(color=_unit(IMMOBILISING), label="immobilises a robot"))
     if any(immobilised_at(snapshot.about, snapshot.track) is not None for snapshot in known):
         entries.append(Line2D([], [], **_IMMOBILISED, label="immobilised"))
     return entries

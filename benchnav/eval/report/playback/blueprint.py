@@ -15,7 +15,7 @@ def arrange(drivers: Sequence[Driver]) -> Any:
 
     series = [
         rrb.TimeSeriesView(
-            name="Traversability λ met", origin="/series/traversability", axis_y=rrb.ScalarAxis(range=(0, 1))
+            name="Observed λ", origin="/series/traversability", axis_y=rrb.ScalarAxis(range=(0, 1))
         ),
         rrb.TimeSeriesView(name="Distance to the goal [m]", origin="/series/goal"),
     ]
@@ -52,7 +52,7 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         "Mean λ in truth": ["/map/true_mean", *own, _ALL, _PLACES],
     }
     if recording.field is not None:
-        views["λ as it was, dark red: holds a robot"] = ["/map/field", *own, _ALL, _PLACES]
+        views["λ as it was, dark red: immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
     for driver in drivers:
         name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
         shown = driver.entity("/map/overlay", "**")
@@ -61,4 +61,4 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 
 def _name(drivers: Sequence[Driver]) -> str:
-    return drivers[0].recording.title if len(drivers) == 1 else "All trials"
+    return drivers[0].recording.title if len(drivers) == 1 else "All conditions"

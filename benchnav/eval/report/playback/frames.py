@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from benchnav.eval.report.contenders import contender_names
-from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, trial_name
+from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, condition_name
 from benchnav.eval.report.recorded.drawn_plan import STYLES
 from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, immobilised_at, outline
 from benchnav.eval.report.recorded.recording import Recording
@@ -94,7 +94,7 @@ class Frames:
         bar.tick_params(labelsize=8, length=2)
         words = ["traversability λ"]
         words += ["hatched: soft ground"] if any(r.soft.any() for r in recordings) else []
-        words += ["dark red: holds a robot"] if any(r.holding.any() for r in recordings) else []
+        words += ["dark red: immobilises a robot"] if any(r.immobilising.any() for r in recordings) else []
         words += ["grey: not free"] if any(r.field is None for r in recordings) else []
         self._figure.text(_GAP / self.size[0], 10 / self.size[1], "; ".join(words), fontsize=8)
 
@@ -154,7 +154,7 @@ class _Column:
         for name, layer in self._layers.items():
             layer.set_segments([] if has_ended else list(plan.lines.get(name, ())))
         met = f"{recording.traversability[min(now, steps - 1)]:.2f}" if steps else "–"
-        self._time.set_text(f"t = {now * recording.dt_s:5.1f} s   λ met = {met}")
+        self._time.set_text(f"t = {now * recording.dt_s:5.1f} s   observed λ = {met}")
         self._outcome.set_text(recording.outcome if has_ended else "")
         self._outcome.set_color("#00684a" if recording.about["outcome"] == "success" else "#a00000")
         held = immobilised_at(recording.about, track) if has_ended else None
@@ -164,7 +164,7 @@ class _Column:
 
 def _names(recordings: Sequence[Recording]) -> list[str]:
     if len(recordings) == 1:
-        return [trial_name(recordings[0].about, ())]
+        return [condition_name(recordings[0].about, ())]
     return contender_names([recording.about for recording in recordings])
 
 
@@ -187,7 +187,7 @@ def _draw_ground(panels: Sequence[Axes], recording: Recording) -> None:
             LineCollection(drawn, colors=[tuple(value / 255 for value in SOFT)], linewidths=0.5)
         )
     if recording.field is not None:
-        shown, title = field_colours(recording.field, recording.holding), "λ as it was"
+        shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
     else:
         shown = field_colours(recording.predicted, np.zeros_like(recording.free))
         shown[~recording.free] = round(255 * _CLOSED)

@@ -8,7 +8,7 @@ ended, and time series; and a blueprint that arranges them.
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchnav.eval.report.contenders import contender_names, trial_colours
+from benchnav.eval.report.contenders import condition_colours, contender_names
 from benchnav.eval.report.playback.blueprint import arrange
 from benchnav.eval.report.playback.robot import (
     Driver,
@@ -64,7 +64,7 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     if len(recordings) == 1:
         return [Driver(recording=recordings[0], name="", colour=_ALONE)]
     names = contender_names([recording.about for recording in recordings])
-    colours = trial_colours(len(recordings))
+    colours = condition_colours(len(recordings))
     return [
         Driver(recording=recording, name=name, colour=colour)
         for recording, name, colour in zip(recordings, names, colours, strict=True)
@@ -75,4 +75,4 @@ def _title(drivers: Sequence[Driver]) -> str:
     if len(drivers) == 1:
         return drivers[0].recording.title
     about = drivers[0].recording.about
-    return f"{about['scenario']} {about['instance']}: {', '.join(driver.name for driver in drivers)}"
+    return f"{about['scenario']} {about['map']}: {', '.join(driver.name for driver in drivers)}"

@@ -42,7 +42,7 @@ class Driver:
         """Path of what is the robot's own under a root."""
         import rerun as rr
 
-        own = ["trials", rr.escape_entity_path_part(self.name)] if self.name else []
+        own = ["conditions", rr.escape_entity_path_part(self.name)] if self.name else []
         return "/".join([root, *own, *([leaf] if leaf else [])])
 
 
@@ -70,7 +70,7 @@ def log_robot(stream: Any, driver: Driver) -> None:
 
 
 def log_series(stream: Any, driver: Driver) -> None:
-    """Logs λ met and predicted, the threshold of free ground, the distance to the goal, and commands."""
+    """Logs observed λ and predicted, the threshold of free ground, the distance to the goal, and commands."""
     import rerun as rr
 
     recording = driver.recording
@@ -97,7 +97,7 @@ def log_series(stream: Any, driver: Driver) -> None:
 
 
 def log_driven(stream: Any, driver: Driver) -> None:
-    """Logs the path driven so far, coloured by the λ met, or in the robot's colour where it is not alone."""
+    """Logs the path driven so far, coloured by the observed λ, or in the robot's colour where it is not alone."""
     import rerun as rr
 
     recording = driver.recording

@@ -56,7 +56,7 @@ def log_maps(stream: Any, recording: Recording) -> None:
     log_image(stream, "map/colour", np.moveaxis(recording.rgb, 0, -1))
     log_image(stream, "map/true_mean", _shades(recording.true_mean))
     if recording.field is not None:
-        log_image(stream, "map/field", field_colours(recording.field, recording.holding))
+        log_image(stream, "map/field", field_colours(recording.field, recording.immobilising))
     if recording.soft.any():
         for name, lines in (("outline", outline), ("hatching", hatching)):
             drawn = lines(recording.soft, grid.resolution_m)

@@ -14,7 +14,7 @@ FRAMES_A_SECOND = 20
 # Seconds of an episode in a second of video.
 SPEED = 4.0
 HOLD_S = 2.0  # of the last frame, which says how it ended
-MOST_TRIALS = 6
+MOST_CONDITIONS = 6
 
 
 def frame_times(end_s: float) -> np.ndarray:
@@ -39,8 +39,10 @@ def write_video(recordings: Sequence[Recording], path: Path) -> Iterator[tuple[i
     """
     import av
 
-    if len(recordings) > MOST_TRIALS:
-        raise ConfigError(f"Expected at most {MOST_TRIALS} trials side by side, got {len(recordings)}.")
+    if len(recordings) > MOST_CONDITIONS:
+        raise ConfigError(
+            f"Expected at most {MOST_CONDITIONS} conditions side by side, got {len(recordings)}."
+        )
     frames, times = Frames(recordings), frame_times(max(recording.end_s for recording in recordings))
     faststart = {"movflags": "+faststart"}
     with replacing(path) as partial, av.open(str(partial), "w", format="mp4", options=faststart) as container:

@@ -2,24 +2,30 @@
 
 from collections.abc import Sequence
 
+from benchnav.eval.condition import NOT_USED
 from benchnav.eval.report.contenders import NAMING
 from benchnav.eval.report.playback.robot import Driver
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.eval.trial import NOT_USED
 
 
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
     about = drivers[0].recording.about
-    lines = [f"# {about['data']}, {about['scenario']} {about['instance']}", ""]
+    lines = [f"# {about['data']}, {about['scenario']} {about['map']}", ""]
     lines += [f"Seed {about['seed']}, realisation {about['realisation']}", ""]
     if len(drivers) == 1:
         recording = drivers[0].recording
         lines += [f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s"]
-        lines += ["", f"λ met on average: {_mean_met(recording)}", "", f"Free: {free_rule(recording)}", ""]
+        lines += [
+            "",
+            f"observed λ on average: {_mean_met(recording)}",
+            "",
+            f"Free: {free_rule(recording)}",
+            "",
+        ]
         used = [(name, about[name]) for name in NAMING if about.get(name, NOT_USED) != NOT_USED]
         return "\n".join([*lines, "| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in used)])
-    lines += ["| trial | outcome | time [s] | λ met | free |", "|---|---|---|---|---|"]
+    lines += ["| condition | outcome | time [s] | observed λ | free |", "|---|---|---|---|---|"]
     for driver in drivers:
         recording = driver.recording
         cells = (driver.name, f"**{recording.outcome}**", f"{recording.end_s:.1f}", _mean_met(recording))

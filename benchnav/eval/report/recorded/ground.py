@@ -1,4 +1,4 @@
-"""How ground that is soft, or that holds a robot, is drawn, once for figures and playback.
+"""How ground that is soft, or that immobilises a robot, is drawn, once for figures and playback.
 
 Letters in shapes: H×W cells, N positions, M lines.
 """
@@ -10,18 +10,18 @@ import numpy as np
 from benchnav.planning.world.outcome import Outcome
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
-HOLDING = (160, 0, 0)
+IMMOBILISING = (160, 0, 0)
 SOFT = (255, 255, 255)
 
 _HATCH_CELLS = 4
 
 
-def field_colours(field: np.ndarray, holding: np.ndarray) -> np.ndarray:
-    """Colours λ as it is, and cells that hold a robot in a colour of their own.
+def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:
+    """Colours λ as it is, and cells that immobilise a robot in a colour of their own.
 
     Args:
         field: λ in [0, 1], shape [H, W].
-        holding: bool, shape [H, W].
+        immobilising: bool, shape [H, W].
 
     Returns:
         Red, green and blue, uint8, shape [H, W, 3].
@@ -32,7 +32,7 @@ def field_colours(field: np.ndarray, holding: np.ndarray) -> np.ndarray:
 
     shades = matplotlib.colormaps[TRAVERSABILITY_COLOURS](field)[..., :3]
     colours = np.round(255 * shades).astype(np.uint8)
-    colours[holding] = HOLDING
+    colours[immobilising] = IMMOBILISING
     return colours
 
 
@@ -72,7 +72,7 @@ def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
 
 
 def immobilised_at(about: Mapping[str, str], track: np.ndarray) -> np.ndarray | None:
-    """Where an episode ended on ground that holds a robot, (x, y); None where it ended otherwise.
+    """Where an episode ended on ground that immobilises a robot, (x, y); None where it ended otherwise.
 
     Args:
         about: with `outcome`.

@@ -20,7 +20,7 @@ from benchnav.files import replacing
 from benchnav.grid import Grid
 
 _ARRAYS = (
-    *("rgb", "elevation_m", "true_mean", "predicted", "free", "soft", "holding"),
+    *("rgb", "elevation_m", "true_mean", "predicted", "free", "soft", "immobilising"),
     *("goal_m", "states", "actions", "traversability"),
 )
 _PLANS = "plans:"
@@ -33,7 +33,7 @@ class Recording:
     """An episode of any robot, from its start to its end.
 
     Args:
-        about: `trial`, its labels, `seed`, `realisation`, `instance` and `outcome`, as text.
+        about: `condition`, its labels, `seed`, `realisation`, `map` and `outcome`, as text.
         grid: of the maps.
         rgb: uint8, shape [3, H, W].
         elevation_m: shape [H, W].
@@ -44,14 +44,14 @@ class Recording:
         free_above: what that map has to exceed.
         field: λ as it was through the episode, shape [H, W]; None where it was resampled.
         soft: ground with soft spots that do not show, bool, shape [H, W].
-        holding: cells of the field that hold a robot for good, bool, shape [H, W].
+        immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
         goal_m: (x, y).
         dt_s: time step.
         time_budget_s: T.
         action_names: what each action is, with its unit, A of them.
         states: robot states beginning with (x, y, θ), shape [N + 1, S].
         actions: shape [N, A].
-        traversability: λ met, shape [N].
+        traversability: observed λ, shape [N].
         plans: what was planned, in order of steps; those after the episode's end are left out.
     """
 
@@ -66,7 +66,7 @@ class Recording:
     free_above: float
     field: np.ndarray | None
     soft: np.ndarray
-    holding: np.ndarray
+    immobilising: np.ndarray
     goal_m: np.ndarray
     dt_s: float
     time_budget_s: float
@@ -79,7 +79,7 @@ class Recording:
     @property
     def title(self) -> str:
         """What it is, for people."""
-        named = ("planner", "risk", "model", "scenario", "instance", "outcome")
+        named = ("planner", "risk", "model", "scenario", "map", "outcome")
         return ", ".join(self.about[name] for name in named)
 
     @property
@@ -176,7 +176,7 @@ def take_snapshot(recording: Recording, time_s: float | None = None) -> Snapshot
         free=recording.free,
         field=recording.field,
         soft=recording.soft,
-        holding=recording.holding,
+        immobilising=recording.immobilising,
         extent_m=np.array(recording.grid.extent_m),
         goal_m=recording.goal_m,
         dt_s=recording.dt_s,

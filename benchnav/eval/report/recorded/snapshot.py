@@ -19,18 +19,18 @@ class Snapshot:
     """One panel of the trajectory figure.
 
     Args:
-        about: `trial`, its labels, `seed`, `realisation`, `instance` and `outcome`, as text.
+        about: `condition`, its labels, `seed`, `realisation`, `map` and `outcome`, as text.
         rgb: uint8, shape [3, H, W].
         predicted: λ̂, the map the planner was given, shape [H, W].
         free: S_free, bool, shape [H, W].
         field: λ as it was through the episode, shape [H, W]; None where it was resampled.
         soft: ground with soft spots that do not show, bool, shape [H, W].
-        holding: cells of the field that hold a robot for good, bool, shape [H, W].
+        immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
         extent_m: size of the map along x and y, shape [2].
         goal_m: (x, y).
         dt_s: time step.
         track: driven positions to the end, shape [N + 1, 2].
-        traversability: λ met, shape [N].
+        traversability: observed λ, shape [N].
         plan: what was planned at that moment, or last before it.
     """
 
@@ -40,7 +40,7 @@ class Snapshot:
     free: np.ndarray
     field: np.ndarray | None
     soft: np.ndarray
-    holding: np.ndarray
+    immobilising: np.ndarray
     extent_m: np.ndarray
     goal_m: np.ndarray
     dt_s: float

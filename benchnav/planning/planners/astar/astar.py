@@ -3,7 +3,7 @@
 λ̂ does not change during an episode, so the exact cost to go h* is found once for every cell, by one
 compiled search, Dijkstra's, backward from the goal, on the host. A* with h* as its heuristic expands the
 cells of a cheapest path alone: replanning from wherever the robot stands is following pointers. Ground that
-is not free costs its price a metre, on the half of an edge that lies in it, so that every cell has a path.
+is not free costs its penalty a metre, on the half of an edge that lies in it, so that every cell has a path.
 Sources: Hart, Nilsson and Raphael (1968); paper IV-A1. Letters in shapes: B episodes, H×W cells, N points,
 E edges.
 """
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav import gridgraph
 from benchnav.errors import ConfigError
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance, path_cost_of
 from benchnav.planning.problem import Problem
 
@@ -26,7 +26,7 @@ class CostToGo:
     """Cheapest paths from every cell to the goal.
 
     Args:
-        cost: of the path to the goal region, by the objective's `path_cost`, prices included, shape [B, H, W].
+        cost: of the path to the goal region, by the objective's `path_cost`, penalties included, shape [B, H, W].
         following: flat index of the next cell, itself where the path ends, int64, shape [B, H·W].
     """
 
@@ -70,8 +70,8 @@ def edge_costs(problem: Problem) -> Tensor:
             f"Expected `path_cost` of {type(problem.objective).__name__} as finite numbers > 0, got {least:g} "
             f"to {most:g}. Let no metre of a path be free."
         )
-    price = PRICE * (not_free[:, source] + not_free[:, target])
-    return 0.5 * length_m * (at_source + at_target) + 0.5 * length_m * price
+    penalty = PENALTY * (not_free[:, source] + not_free[:, target])
+    return 0.5 * length_m * (at_source + at_target) + 0.5 * length_m * penalty
 
 
 def search(problem: Problem) -> CostToGo:

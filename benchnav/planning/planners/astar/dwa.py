@@ -5,7 +5,7 @@ the velocity pairs that the robot can reach within one step, and the search for 
 A robot without limits reaches all that its bounds allow. How arcs are judged is not theirs: each pair is held
 for the whole horizon, rolled out through F under λ̂, and judged by J toward a way-point and by the heading that
 it ends with. There are no admissible velocities by braking distance, no terms for clearance and speed; a pair
-that leaves free ground before it arrives pays the price of each step off it, which is why DWA creeps in narrow
+that leaves free ground before it arrives pays the penalty of each step off it, which is why DWA creeps in narrow
 places and needs a recovery where it stands.
 Letters in shapes: B episodes, M velocity pairs, T horizon steps, S state dimensions.
 """
@@ -109,12 +109,12 @@ class DWA:
         self.config = config or DWAConfig()
         pairs = self.config.speeds * self.config.turn_rates
         # Of the episodes are: states, cost, under_way, pairs, padded_ground, target.
-        self._hold = Fused(hold, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5))
+        self._rollout = Fused(rollout, pairs, _WORTH_COMPILING, batched=(0, 1, 2, 3, 4, 5))
 
     @property
     def compiled(self) -> bool | None:
         """Whether it runs compiled; None before the first step."""
-        return self._hold.compiled
+        return self._rollout.compiled
 
     def init(self, problem: Problem, generator: torch.Generator) -> DWAState:
         """Starts from standing robots; draws nothing. See `LocalPlanner`."""
@@ -126,7 +126,7 @@ class DWA:
         """Picks the window's best pair; see `LocalPlanner`."""
         problem = plan_state.problem
         window = velocity_window(problem, plan_state.velocity, self.config)
-        cost = judge(problem, step.state, window, target_m, self.config, self._hold)
+        cost = score(problem, step.state, window, target_m, self.config, self._rollout)
         best = cost.argmin(dim=1)[:, None, None]
         action = window.gather(1, best.expand(-1, 1, 2))[:, 0]
         plan = Plan.empty(len(problem), step.state.device)
@@ -136,7 +136,7 @@ class DWA:
             plan = Plan.empty(len(problem), step.state.device, path=path, samples=drawn[:, :, ::_DRAW_EVERY])
         return action, plan_state, plan
 
-    def took(self, plan_state: DWAState, action: Tensor) -> DWAState:
+    def commit_action(self, plan_state: DWAState, action: Tensor) -> DWAState:
         """Notes the velocities that the robots now have; see `LocalPlanner`."""
         least, most = reachable(plan_state.problem, plan_state.velocity)
         return DWAState(plan_state.problem, torch.clamp(action, least, most))
@@ -189,7 +189,7 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
     return pairs.flatten(1, 2)
 
 
-def judge(
+def score(
     problem: Problem,
     state: Tensor,
     window: Tensor,
@@ -205,12 +205,12 @@ def judge(
         window: pairs (v, ω), shape [B, M, 2].
         target_m: way-points (x, y), shape [B, 2].
         config: settings.
-        advance: `hold` or the same compiled.
+        advance: `rollout` or the same compiled.
 
     Returns:
         Cost of each pair, shape [B, M].
     """
-    advance, target = advance or hold, target_m[:, None].contiguous()
+    advance, target = advance or rollout, target_m[:, None].contiguous()
     states = component_wise(state[:, None].expand(-1, window.shape[1], -1))
     pairs = component_wise(window)
     cost = torch.zeros_like(window[..., 0])
@@ -219,7 +219,8 @@ def judge(
     for first in range(0, steps, _CHUNK_STEPS):
         states, cost, under_way = advance(
             states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
-            problem.objective, problem.task.rules.slowest, config.arrival_m, min(_CHUNK_STEPS, steps - first),
+            problem.objective, problem.task.rules.min_traversability, config.arrival_m,
+            min(_CHUNK_STEPS, steps - first),
         )  # fmt: skip
     terminal = problem.terminal_cost(states, target)
     weight = config.heading_weight * standing_cost(problem, state, target_m, steps)
@@ -227,7 +228,7 @@ def judge(
 
 
 def standing_cost(problem: Problem, state: Tensor, target_m: Tensor, steps: int) -> Tensor:
-    """What J costs robots that stand for the horizon, without prices; the unit of the heading's weight.
+    """What J costs robots that stand for the horizon, without penalties; the unit of the heading's weight.
 
     Args:
         problem: B problems.
@@ -244,15 +245,15 @@ def standing_cost(problem: Problem, state: Tensor, target_m: Tensor, steps: int)
     return (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
 
 
-def hold(
+def rollout(
     states: Tensor, cost: Tensor, under_way: Tensor, pairs: Tensor, padded_ground: Tensor, target: Tensor,
-    grid: Grid, robot: Robot, objective: Objective, slowest: float, arrival_m: float, steps: int,
+    grid: Grid, robot: Robot, objective: Objective, min_traversability: float, arrival_m: float, steps: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
     """Holds each pair for some steps, adding up costs of those under way; takes a problem in its parts."""
     for _ in range(steps):
         ground = grid.lookup(padded_ground, states[..., 0], states[..., 1])
         cost = cost + stage_cost(objective, states, pairs, ground, target) * under_way
-        states = robot(states, pairs, motion_traversability(ground, slowest))
+        states = robot(states, pairs, motion_traversability(ground, min_traversability))
         offset = states[..., :2] - target
         under_way = under_way & ((offset * offset).sum(-1) > arrival_m**2)
     return component_wise(states), cost, under_way

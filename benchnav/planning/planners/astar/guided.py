@@ -40,7 +40,7 @@ class LocalPlanner(Protocol[Local]):
         """Chooses actions toward a target (x, y), shape [B, 2]; else as `Planner.plan`."""
         ...
 
-    def took(self, plan_state: Local, action: Tensor) -> Local:
+    def commit_action(self, plan_state: Local, action: Tensor) -> Local:
         """Notes the actions that are taken, which may be others than it chose, shape [B, A]."""
         ...
 
@@ -109,7 +109,7 @@ class Guided(Generic[Local]):
         found, metre = [], path_cost_of(task.objective)
         if metre is path_length:
             found.append(f"A* takes the shortest path: {type(task.objective).__name__} has no `path_cost`")
-        slow, fast = metre(torch.tensor([task.rules.slowest, 1.0]), torch.zeros(2)).tolist()
+        slow, fast = metre(torch.tensor([task.rules.min_traversability, 1.0]), torch.zeros(2)).tolist()
         if slow == fast and task.rules.free_space.by == "mean":
             found.append(
                 "ground is free by the mean, and λ̂ is no part of what A* minimises: its path is the same under "
@@ -144,7 +144,7 @@ class Guided(Generic[Local]):
             # Long enough for a path that crosses the map twice; longer ones are cut.
             whole = 2 * (problem.grid.height + problem.grid.width)
             plan = replace(plan, reference=astar.path_points(problem, field, state, whole))
-        local = self.local.took(local, action)
+        local = self.local.commit_action(local, action)
         return action, replace(plan_state, local=local, recovery=recovery), plan
 
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from benchnav.grid import Grid
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import PathCost, path_cost_of
 from benchnav.planning.problem import Problem
 
@@ -24,20 +24,20 @@ _SHORT_CUT = 1.1
 class GroundCosts:
     """What a metre of straight line costs in each cell; maps framed by `Grid.pad` for lookups.
 
-    A metre costs path_cost(λ̂, gradient · direction) + price_per_m.
+    A metre costs path_cost(λ̂, gradient · direction) + penalty_per_m.
 
     Args:
         grid: size and resolution of the maps.
         path_cost: cost of a metre, from λ̂ and grade.
         traversability: λ̂, shape [B, (H + 2)·(W + 2)].
-        price_per_m: of ground that is not free, shape [B, (H + 2)·(W + 2)].
+        penalty_per_m: of ground that is not free, shape [B, (H + 2)·(W + 2)].
         gradient: rise of a metre along x and along y, each of shape [B, (H + 2)·(W + 2)].
     """
 
     grid: Grid
     path_cost: PathCost
     traversability: Tensor
-    price_per_m: Tensor
+    penalty_per_m: Tensor
     gradient: tuple[Tensor, Tensor]
 
 
@@ -49,7 +49,7 @@ def ground_costs(problem: Problem) -> GroundCosts:
         grid,
         path_cost_of(problem.objective),
         grid.pad(problem.traversability, outside=1.0),
-        grid.pad(PRICE * (~problem.free).to(problem.risk_map), outside=PRICE),
+        grid.pad(PENALTY * (~problem.free).to(problem.risk_map), outside=PENALTY),
         (grid.pad(along_x, outside=0.0), grid.pad(along_y, outside=0.0)),
     )
 
@@ -79,7 +79,7 @@ def line_costs(ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: i
     # Of a line without length any grade will do: it costs nothing.
     grade = sum(rises) / length.clamp(min=1e-9)
     per_m = ground.path_cost(at_pieces(ground.traversability), grade)
-    return ((per_m + at_pieces(ground.price_per_m)) * share * length).sum(dim=-1)
+    return ((per_m + at_pieces(ground.penalty_per_m)) * share * length).sum(dim=-1)
 
 
 def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -> tuple[Tensor, Tensor]:

@@ -66,12 +66,12 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
         The answer. A wrong type, shape, dtype or device makes every episode faulty, an action that is not
         finite its own alone.
     """
-    given = replace(step, state=step.state.clone(), felt=step.felt.clone())
+    given = replace(step, state=step.state.clone(), traversability=step.traversability.clone())
     said = planner.plan(given, plan_state)
     standing = standing_actions(problem)
     fault = find_fault(said, problem)
     if fault:
-        everyone = torch.ones_like(step.felt, dtype=torch.bool)
+        everyone = torch.ones_like(step.traversability, dtype=torch.bool)
         nothing = Plan.empty(len(problem), step.state.device)
         return Answer(action=standing, plan_state=plan_state, plan=nothing, faulty=everyone, reason=fault)
     action, following, plan = said

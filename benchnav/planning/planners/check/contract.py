@@ -45,7 +45,7 @@ def check_planner(
 ) -> None:
     """Tries whether a planner keeps the contract, by letting it plan a few steps on four maps.
 
-    The maps: free ground, a closed wall, a start on ground predicted to hold the robot, a wall with a gap.
+    The maps: free ground, a closed wall, a start on ground predicted to immobilise the robot, a wall with a gap.
     The contract: finite actions within the robot's bounds, of shape [B, A], in the states' dtype and on
     their device; a `Plan` with a `PlanStatus` for each episode, and layers of the shapes that it names;
     the problem, the step and the plan state left as they were, and with them the global generators of
@@ -129,10 +129,12 @@ def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
     if plan_state is NOTHING:
         return
     first_state, steps, actions = plan_state, [], []
-    step = Step(state=problem.start, felt=torch.full_like(problem.start[:, 0], torch.nan), time_s=0.0)
+    step = Step(
+        state=problem.start, traversability=torch.full_like(problem.start[:, 0], torch.nan), time_s=0.0
+    )
     for number in range(_STEPS + 1):
         is_last = number == _STEPS
-        ended = _some_ended(problem) if is_last else torch.zeros_like(step.felt, dtype=torch.bool)
+        ended = _some_ended(problem) if is_last else torch.zeros_like(step.traversability, dtype=torch.bool)
         step = _step(problem, step, ended, number)
         said, found = _ask(planner, step, plan_state, problem)
         yield from found
@@ -146,7 +148,7 @@ def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
         plan_state = following
         met = problem.traversability_at(step.state)
         moved = problem.robot(step.state, action.clamp(*problem.action_bounds), met)
-        step = replace(step, state=moved, felt=met)
+        step = replace(step, state=moved, traversability=met)
     yield from _compare_seed(planner, problem, steps[0], actions[0])
     yield from _compare_alone(planner, problem, steps[:_STEPS], actions, tolerance)
     yield from _compare_selected(planner, problem, steps[:_STEPS], actions, tolerance)
@@ -219,7 +221,10 @@ def _compare_alone(
     low, high = problem.action_bounds
     for step, action in zip(steps, actions, strict=False):
         said, found = _ask(
-            planner, replace(step, state=step.state[-1:], felt=step.felt[-1:]), plan_state, alone
+            planner,
+            replace(step, state=step.state[-1:], traversability=step.traversability[-1:]),
+            plan_state,
+            alone,
         )
         yield from found
         if said is NOTHING:
@@ -245,7 +250,7 @@ def _compare_selected(
     yield from found
     if kept is NOTHING:
         return
-    step = replace(steps[1], state=steps[1].state[members], felt=steps[1].felt[members])
+    step = replace(steps[1], state=steps[1].state[members], traversability=steps[1].traversability[members])
     said, found = _ask(planner, step, kept, problem.select(members))
     yield from found
     low, high = problem.action_bounds

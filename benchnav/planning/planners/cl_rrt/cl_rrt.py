@@ -23,7 +23,7 @@ the source calls the execution loop, algorithm 2: when to plan, and from what.
   little before its end, and not tried anew from ground that is not free: a robot that slid into a wall could
   leave it on the other side.
 - Where `most_failures` plans in a row found no partial path either, the next ones may cross: their edges go
-  on over ground that is not free, at its price a metre, and the cheapest path is driven as a partial one.
+  on over ground that is not free, at its penalty a metre, and the cheapest path is driven as a partial one.
   Before that the tree stays on free ground, so that a free way is taken wherever one is found; and once
   the robot is across, it looks for one again. The planner never gives up.
 - Expansions go in rounds: all samples of a round, of all episodes, are simulated at once. Samples are a pure

@@ -7,7 +7,7 @@ its time, or where it collides.
 - An edge collides where it leaves the map or *enters* ground that is not free. One that begins on such
   ground, because the truth differs from the prediction, may leave it, and goes on.
 - A loop that may cross does not collide with ground that is not free. How far an edge drives on such
-  ground is counted, since a metre of it has a price.
+  ground is counted, since a metre of it has a penalty.
 - Of an edge that collides the nearer half of its free part stays, as the source keeps feasible nodes along
   the way: in tight places no edge of full length is free.
 
@@ -172,7 +172,9 @@ def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: T
         if step % _CHECK_STEPS == 0 and bool(((progress >= end_m) | collided).all()):
             break
         action, tracking = follower.act(reference, state, tracking, progress)
-        state = problem.robot(state, action, motion_traversability(ground, problem.task.rules.slowest))
+        state = problem.robot(
+            state, action, motion_traversability(ground, problem.task.rules.min_traversability)
+        )
     return [torch.stack(values) for values in zip(*log, strict=True)]
 
 

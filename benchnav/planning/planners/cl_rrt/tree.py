@@ -7,10 +7,10 @@ route. A tree is a value: a table of nodes, of which every round makes a longer 
 - Nodes are chosen by Kuwata's mix of two heuristics: the nearest in Dubins length (explore), or the one
   through which the point is reached soonest (optimise). Before a way to the goal is known 70 % of the
   choices explore, afterwards 30 %, and nodes that cannot improve on the best way are left out.
-- The goal's share of the edges goes to nodes that have not tried it yet, the most promising first: a trial
+- The goal's share of the edges goes to nodes that have not tried it yet, the most promising first: a condition
   has no chance in it, so that a second one from the same node would be a copy. The source tries the goal from
   every new node.
-- A way costs its simulated time, and `PRICE` for each metre of it on ground that is not free.
+- A way costs its simulated time, and `PENALTY` for each metre of it on ground that is not free.
 
 Source: Kuwata et al. (2009), section IV and algorithm 1. Letters in shapes: B episodes, R edges of a round,
 V nodes, E edges of a finished tree, D edges of a path, N points of a reference, of which Q are drawn, P drawn
@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import (
@@ -79,7 +79,7 @@ class Tree:
     @property
     def cost(self) -> Tensor:
         """What the way to each node costs, shape [B, V]."""
-        return self.time_s + PRICE * self.blocked_m
+        return self.time_s + PENALTY * self.blocked_m
 
     @property
     def best_cost(self) -> Tensor:

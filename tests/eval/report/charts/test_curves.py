@@ -13,7 +13,7 @@ LEVELS = (0.5, 0.8, 0.9)
 
 
 def values(labels: dict[str, str], **changes: Any) -> dict[str, Any]:
-    """What `run.json` says of a trial with these labels."""
+    """What `run.json` says of a condition with these labels."""
     part, _, level = labels["risk"].partition(":")
     risk = {"part": part, "options": {"level": float(level)} if level else {}}
     world = {"name": labels["world"], **changes}
@@ -28,12 +28,16 @@ def values(labels: dict[str, str], **changes: Any) -> dict[str, Any]:
     return {"value": value}
 
 
-def drawn(*trials: tuple[dict[str, str], int], **changes: Any) -> Figure:
+def drawn(*conditions: tuple[dict[str, str], int], **changes: Any) -> Figure:
     rows = made.rows(
-        *([made.row(labels, i, 20.0 if i < count else None) for i in range(10)] for labels, count in trials)
+        *(
+            [made.row(labels, i, 20.0 if i < count else None) for i in range(10)]
+            for labels, count in conditions
+        )
     )
     known = {
-        "+".join(made.row(labels)["trial"].split("+")): values(labels, **changes) for labels, _ in trials
+        "+".join(made.row(labels)["condition"].split("+")): values(labels, **changes)
+        for labels, _ in conditions
     }
     (sweep,) = find_sweeps(known)
     return curve_figure(sweep, made.summarised(rows))
@@ -49,7 +53,7 @@ def curves(panel: Axes) -> list[list[float]]:
 
 def test_success_and_time_stand_at_their_levels_with_their_bands() -> None:
     figure = drawn(
-        *((made.trial(risk=f"cvar:{level}"), n) for level, n in zip(LEVELS, (2, 6, 4), strict=True))
+        *((made.condition(risk=f"cvar:{level}"), n) for level, n in zip(LEVELS, (2, 6, 4), strict=True))
     )
     above, below = shown(figure)
     assert curves(above) == [pytest.approx([20, 60, 40])]
@@ -62,12 +66,12 @@ def test_success_and_time_stand_at_their_levels_with_their_bands() -> None:
 
 
 def test_other_settings_of_the_same_planner_are_lines_across_and_blind_ones_grey() -> None:
-    levels = [(made.trial(risk=f"cvar:{level}"), 5) for level in LEVELS]
+    levels = [(made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS]
     figure = drawn(
         *levels,
-        (made.trial(risk="mean"), 3),
-        (made.trial("cl_rrt", "mean"), 9),  # no line of its planner is there
-        (made.trial("straight", "–", model="–"), 1),
+        (made.condition(risk="mean"), 3),
+        (made.condition("cl_rrt", "mean"), 9),  # no line of its planner is there
+        (made.condition("straight", "–", model="–"), 1),
     )
     above, _ = shown(figure)
     across = {float(np.asarray(line.get_ydata())[0]) for line in above.lines if line.get_marker() == "None"}
@@ -79,9 +83,9 @@ def test_other_settings_of_the_same_planner_are_lines_across_and_blind_ones_grey
 def test_each_setting_is_drawn_in_the_style_that_the_legend_gives_it() -> None:
     settings = ["mean", "var", "entropic", "chance", "worst", "own", "other", "last"]
     figure = drawn(
-        *((made.trial(risk=f"cvar:{level}"), 9) for level in LEVELS),
-        *((made.trial(risk=setting), n) for n, setting in enumerate(settings)),
-        (made.trial("straight", "–", model="–"), 8),
+        *((made.condition(risk=f"cvar:{level}"), 9) for level in LEVELS),
+        *((made.condition(risk=setting), n) for n, setting in enumerate(settings)),
+        (made.condition("straight", "–", model="–"), 8),
     )
     names = {10.0 * n: name for n, name in enumerate([*settings, "straight"])}
     # Matplotlib tells a pattern of dashes by a private name alone: `get_linestyle` gives "--" for each.
@@ -100,8 +104,8 @@ def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:
     places: tuple[dict[str, str], ...] = ({"scenario": "hg"}, {"world": "stakes"}, {"model": "mdn"})
     for other in places:
         figure = drawn(
-            *((made.trial(risk=f"cvar:{level}"), 5) for level in LEVELS),
-            *((made.trial(risk=f"cvar:{level}", **other), 7) for level in LEVELS),
+            *((made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS),
+            *((made.condition(risk=f"cvar:{level}", **other), 7) for level in LEVELS),
         )
         panels = shown(figure)
         assert len(panels) == 4
@@ -115,9 +119,9 @@ def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:
 def test_what_looks_at_nothing_stands_beside_every_model_over_all_severities() -> None:
     blind = {"planner": "straight", "risk": "–", "model": "–"}
     scenarios = ("std", "hg-050", "hg")
-    models = [made.trial(scenario=name, model=model) for name in scenarios for model in ("a", "b")]
+    models = [made.condition(scenario=name, model=model) for name in scenarios for model in ("a", "b")]
     figure = drawn(
-        *((made.trial(scenario=name, **blind), 2) for name in scenarios), *((one, 7) for one in models)
+        *((made.condition(scenario=name, **blind), 2) for name in scenarios), *((one, 7) for one in models)
     )
     success = shown(figure)[:2]
     assert [panel.get_title() for panel in success] == ["a", "b"]
@@ -127,17 +131,17 @@ def test_what_looks_at_nothing_stands_beside_every_model_over_all_severities() -
         assert sorted(line.get_ydata()[0] for line in lines) == [20, 70]
 
 
-def test_many_lines_are_told_apart_by_panels() -> None:
+def test_many_lines_are_distinguished_by_panels() -> None:
     planners = [f"planner_{i}" for i in range(9)]
-    figure = drawn(*((made.trial(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
+    figure = drawn(*((made.condition(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
     assert len(shown(figure)) == 18
     assert all(len(curves(panel)) == 1 for panel in shown(figure))
 
 
 def test_figures_have_the_width_of_a_column_or_a_page() -> None:
-    one = drawn(*((made.trial(risk=f"cvar:{level}"), 5) for level in LEVELS))
+    one = drawn(*((made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS))
     assert one.get_figwidth() * 25.4 == pytest.approx(88)
-    two = drawn(*((made.trial(risk=f"cvar:{level}", world=w), 5) for level in LEVELS for w in ("a", "b")))
+    two = drawn(*((made.condition(risk=f"cvar:{level}", world=w), 5) for level in LEVELS for w in ("a", "b")))
     assert two.get_figwidth() * 25.4 == pytest.approx(180)
 
 

@@ -14,7 +14,7 @@ from benchnav.eval.report.charts.driven import (
     telling_map,
     write_driven,
 )
-from benchnav.eval.report.recorded.ground import HOLDING
+from benchnav.eval.report.recorded.ground import IMMOBILISING
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
 
@@ -29,20 +29,20 @@ def ground(**changes: Any) -> DrivenGround:
         "world": "stakes",
         "seed": 0,
         "realisation": 0,
-        "instance": 1,
+        "map": 1,
     }
     given = {
         "about": about, "resolution_m": 0.5, "rgb": np.full((3, 40, 60), 100, np.uint8), "field": field,
-        "holding": field < 0.1, "goal_m": np.array([24.0, 15.0], np.float32),
+        "immobilising": field < 0.1, "goal_m": np.array([24.0, 15.0], np.float32),
     }  # fmt: skip
     return DrivenGround(**(given | changes))
 
 
 def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
-    """Rows of three risk settings: of each instance, which of them succeeded."""
+    """Rows of three risk settings: of each map, which of them succeeded."""
     return made.rows(
-        made.row(made.trial(risk=risk, world="stakes"), instance, 30.0 + place if success else None)
-        for instance, successes in ended.items()
+        made.row(made.condition(risk=risk, world="stakes"), map_index, 30.0 + place if success else None)
+        for map_index, successes in ended.items()
         for place, (risk, success) in enumerate(zip(RISKS, successes, strict=False))
     )
 
@@ -53,22 +53,22 @@ def track(place: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("ended", "instance"),
+    ("ended", "map_index"),
     [
         ({0: [True] * 3, 1: [True, False, True], 2: [False] * 3}, 1),
         ({0: [True] * 3, 1: [False] * 3}, 0),
-        ({0: [True, False], 4: [False, False, True]}, 4),  # more trials
+        ({0: [True, False], 4: [False, False, True]}, 4),  # more conditions
     ],
 )
-def test_the_map_is_one_on_which_outcomes_differ(ended: dict[int, list[bool]], instance: int) -> None:
+def test_the_map_is_one_on_which_outcomes_differ(ended: dict[int, list[bool]], map_index: int) -> None:
     about = telling_map(episodes(ended))
     assert about == {"data": "paper-v1", "scenario": "std", "world": "stakes", "seed": 0, "realisation": 0,
-                     "instance": instance}  # fmt: skip
+                     "map": map_index}  # fmt: skip
     assert type(about["seed"]) is int
 
 
-def test_luck_and_worlds_tell_maps_apart() -> None:
-    labels = [made.trial(risk=risk, world=world) for world in ("a", "b") for risk in RISKS]
+def test_noise_and_worlds_tell_maps_apart() -> None:
+    labels = [made.condition(risk=risk, world=world) for world in ("a", "b") for risk in RISKS]
     rows = made.rows(
         made.row(one, seed=seed, realisation=draw, time_s=None if (seed, draw, one["risk"], one["world"]) ==
                  (7, 1, "mean", "b") else 9.0)
@@ -101,30 +101,30 @@ def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     assert len({line.get_color() for line in labelled}) == 3
 
 
-def test_what_holds_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> None:
+def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> None:
     rows = episodes({1: [True]})
     panel, _ = drawn(driven_figure(ground(), rows, [track(0)]))
     shown = np.asarray(panel.images[0].get_array())
-    red = np.isclose(shown, np.array(HOLDING) / 255).all(axis=-1)
-    np.testing.assert_array_equal(red, ground().holding)
-    greys = shown[~ground().holding]
+    red = np.isclose(shown, np.array(IMMOBILISING) / 255).all(axis=-1)
+    np.testing.assert_array_equal(red, ground().immobilising)
+    greys = shown[~ground().immobilising]
     assert (np.diff(greys[:, 0]) >= 0).all()
-    faded = ground(field=None, holding=np.zeros((40, 60), bool))
+    faded = ground(field=None, immobilising=np.zeros((40, 60), bool))
     panel, _ = drawn(driven_figure(faded, rows, [track(0)]))
     np.testing.assert_allclose(np.asarray(panel.images[0].get_array()), 0.6 + 0.4 * 100 / 255)
 
 
 def with_steps(folder: Path, rows: pd.DataFrame) -> None:
     """Stores a path of each row, like no other's."""
-    for place, (trial, own) in enumerate(rows.groupby("trial", sort=False)):
+    for place, (condition, own) in enumerate(rows.groupby("condition", sort=False)):
         for (seed, realisation), unit in own.groupby(["seed", "realisation"]):
             steps = pd.concat(
-                pd.DataFrame({"seed": seed, "realisation": realisation, "instance": i, "step": np.arange(30)}
+                pd.DataFrame({"seed": seed, "realisation": realisation, "map": i, "step": np.arange(30)}
                              | dict(zip(("x_m", "y_m"), (track(place) + i + 5 * seed + 9 * realisation).T,
                                         strict=True)))
-                for i in unit["instance"]
+                for i in unit["map"]
             )  # fmt: skip
-            path = folder / "steps" / f"trial={trial}" / f"{seed}-{realisation}-00000.parquet"
+            path = folder / "steps" / f"condition={condition}" / f"{seed}-{realisation}-00000.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
             steps.to_parquet(path, index=False)
 
@@ -149,18 +149,18 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(
     assert "std 1, seed 0, realisation 0: of all maps" in caption["driven"]
     assert (folder / "figures" / "driven.png").stat().st_size > 5000
     ((_, own, tracks),) = shown
-    assert own["instance"].tolist() == [1, 1, 1]
+    assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
 
 
 @pytest.mark.parametrize(("seed", "realisation"), [(0, 0), (0, 1), (7, 0), (7, 1)])
-def test_the_paths_are_those_of_the_maps_own_luck(
+def test_the_paths_are_those_of_the_maps_own_noise(
     seed: int, realisation: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = made.rows(
-        made.row(made.trial(risk=risk, world="stakes"), instance, seed=one, realisation=draw)
-        for risk in RISKS for one in (0, 7) for draw in (0, 1) for instance in (0, 1)
+        made.row(made.condition(risk=risk, world="stakes"), map_index, seed=one, realisation=draw)
+        for risk in RISKS for one in (0, 7) for draw in (0, 1) for map_index in (0, 1)
     )  # fmt: skip
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
@@ -174,22 +174,22 @@ def test_the_paths_are_those_of_the_maps_own_luck(
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
     ((_, own, tracks),) = shown
     assert own["risk"].tolist() == list(RISKS)
-    assert set(zip(own["seed"], own["realisation"], own["instance"], strict=True)) == {(seed, realisation, 1)}
+    assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1 + 5 * seed + 9 * realisation)
 
 
-def test_more_trials_than_can_be_told_apart_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_path: Path) -> None:
     rows = made.rows(
-        made.row(made.trial(risk=f"cvar:0.{i:02}", world="stakes"), instance)
-        for instance in range(2)
+        made.row(made.condition(risk=f"cvar:0.{i:02}", world="stakes"), map_index)
+        for map_index in range(2)
         for i in range(MOST_PATHS + 2)
     )
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
     caption = write_driven(folder, folder)["driven"]
-    assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} trials." in caption
+    assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} conditions." in caption
 
 
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -198,4 +198,4 @@ def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
         again = DrivenGround.load(tmp_path / "a.npz")
         assert (again.about, again.resolution_m) == (one.about, 0.5)
         assert (again.field is None) == (one.field is None)
-        np.testing.assert_array_equal(again.holding, one.holding)
+        np.testing.assert_array_equal(again.immobilising, one.immobilising)

@@ -12,7 +12,7 @@ GENERATOR = np.random.default_rng(0)
 def failures(outcomes: list[str], **changes: Any) -> pd.DataFrame:
     count = len(outcomes)
     columns = {
-        "scenario": "hg", "instance": range(count), "outcome": outcomes, "end_time_s": 20.0 + np.arange(count),
+        "scenario": "hg", "map": range(count), "outcome": outcomes, "end_time_s": 20.0 + np.arange(count),
         "x_m": 1.0 + np.arange(count), "y_m": 2.0, "last_traversability": 0.05,
     }  # fmt: skip
     return pd.DataFrame(columns | changes)
@@ -20,7 +20,7 @@ def failures(outcomes: list[str], **changes: Any) -> pd.DataFrame:
 
 def ground(count: int, **changes: Any) -> FailedGround:
     made = {
-        "predicted": GENERATOR.random((count, 8, 12)), "holding": np.zeros((count, 8, 12), bool),
+        "predicted": GENERATOR.random((count, 8, 12)), "immobilising": np.zeros((count, 8, 12), bool),
         "resolution_m": 0.5, "goal_m": np.full((count, 2), 3.0),
     }  # fmt: skip
     return FailedGround(**(made | changes))
@@ -45,7 +45,7 @@ def test_told_is_that_of_the_cell_a_place_lies_in() -> None:
 def test_each_outcome_is_shown_before_any_twice() -> None:
     rows = failures(["immobilised"] * 5 + ["stuck", "timeout", "timeout"])
     assert list(choose(rows)["outcome"]) == ["immobilised", "timeout", "stuck", "immobilised"]
-    assert list(choose(failures(["stuck"] * 6))["instance"]) == [0, 1, 2, 3]
+    assert list(choose(failures(["stuck"] * 6))["map"]) == [0, 1, 2, 3]
     assert choose(failures(["stuck"], x_m=np.nan)).empty
 
 
@@ -56,7 +56,7 @@ def test_panels_say_where_when_and_why() -> None:
     panels = [panel for panel in figure.axes if panel.get_visible() and panel.get_title()]
     told = line.ground.predicted[0, 4, 2]
     assert [panel.get_title() for panel in panels] == [
-        f"hg 0: immobilised, 20 s\ntold λ̂ = {told:.2f}, met λ = 0.04",
+        f"hg 0: immobilised, 20 s\nλ̂ = {told:.2f}, observed λ = 0.04",
         "hg 1: out of bounds, 21 s\noutside the map",
     ]
     assert panels[0].get_ylabel() == "MPPI, mean\n(2 of 9 failures)"
@@ -70,14 +70,14 @@ def test_panels_say_where_when_and_why() -> None:
     assert figure.get_figwidth() * 25.4 == pytest.approx(180)
 
 
-def test_ground_that_holds_a_robot_is_drawn_and_named_where_there_is_such() -> None:
+def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such() -> None:
     rows = failures(["immobilised"])
-    holding = np.zeros((1, 8, 12), bool)
-    holding[0, 3, 4] = True
-    figure = failure_sheet([shown(rows, ground=ground(1, holding=holding))])
+    immobilising = np.zeros((1, 8, 12), bool)
+    immobilising[0, 3, 4] = True
+    figure = failure_sheet([shown(rows, ground=ground(1, immobilising=immobilising))])
     alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
-    assert (alpha > 0).tolist() == holding[0].tolist()
+    assert (alpha > 0).tolist() == immobilising[0].tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["start", "goal", "end", "driven", "ground that holds a robot"]
+    assert names == ["start", "goal", "end", "driven", "ground that immobilises a robot"]
     plain = failure_sheet([shown(rows)])
-    assert "ground that holds a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]
+    assert "ground that immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]

@@ -23,7 +23,7 @@ def test_every_failure_has_a_colour_of_its_own() -> None:
 
 
 def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
-    first, second = made.trial("a"), made.trial("b")
+    first, second = made.condition("a"), made.condition("b")
     ends = ["timeout", "immobilised", "immobilised", "timeout", "stuck"]
     rows = made.rows(
         (made.row(first, i, None, outcome=name) for i, name in enumerate(ends)),
@@ -44,7 +44,7 @@ def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
 
 
 def test_each_scenario_has_its_panel() -> None:
-    rows = made.rows(made.row(made.trial(scenario=name)) for name in ("std", "hg"))
+    rows = made.rows(made.row(made.condition(scenario=name)) for name in ("std", "hg"))
     figure = outcome_figure(made.summarised(rows))
     assert [panel.get_title() for panel in figure.axes] == ["std", "hg"]
     assert figure.get_figwidth() * 25.4 == pytest.approx(180)

@@ -33,8 +33,8 @@ def points(panel: Axes) -> dict[str, float]:
 def test_each_rate_stands_at_its_name_with_its_interval() -> None:
     summary = made.summarised(
         made.rows(
-            shares(made.trial(**BLIND), 2), shares(made.trial("astar_dwa", "mean"), 9), shares(made.trial(), 7),
-            shares(made.trial("astar_dwa"), 8),
+            shares(made.condition(**BLIND), 2), shares(made.condition("astar_dwa", "mean"), 9),
+            shares(made.condition(), 7), shares(made.condition("astar_dwa"), 8),
         )
     )  # fmt: skip
     (panel,) = panels(success_figure(summary))
@@ -48,8 +48,11 @@ def test_each_rate_stands_at_its_name_with_its_interval() -> None:
 def test_the_blind_baseline_is_a_line_through_its_own_panel() -> None:
     summary = made.summarised(
         made.rows(
-            *(shares(made.trial(**BLIND, scenario=name), count) for name, count in (("std", 4), ("hg", 1))),
-            *(shares(made.trial(scenario=name), 10) for name in ("std", "hg")),
+            *(
+                shares(made.condition(**BLIND, scenario=name), count)
+                for name, count in (("std", 4), ("hg", 1))
+            ),
+            *(shares(made.condition(scenario=name), 10) for name in ("std", "hg")),
         )
     )
     drawn = {panel.get_title(): panel for panel in panels(success_figure(summary))}
@@ -64,7 +67,7 @@ def test_any_number_of_planners_risks_and_scenarios_fit(
 ) -> None:  # type: ignore[no-untyped-def]
     summary = made.summarised(
         made.rows(
-            made.row(made.trial(f"planner_{p}", f"cvar:{r}", scenario=f"scenario-{s}"))
+            made.row(made.condition(f"planner_{p}", f"cvar:{r}", scenario=f"scenario-{s}"))
             for p in range(planners) for r in range(risks) for s in range(scenarios)
         )
     )  # fmt: skip
@@ -82,8 +85,10 @@ def test_any_number_of_planners_risks_and_scenarios_fit(
     assert height < 25
 
 
-def test_models_and_worlds_are_told_apart() -> None:
-    several = [made.trial(model=model, world=world) for model in ("a", "b") for world in ("paper", "stakes")]
+def test_models_and_worlds_are_distinguished() -> None:
+    several = [
+        made.condition(model=model, world=world) for model in ("a", "b") for world in ("paper", "stakes")
+    ]
     figure = success_figure(
         made.summarised(made.rows(*(shares(labels, n) for n, labels in enumerate(several))))
     )
@@ -95,9 +100,9 @@ def test_models_and_worlds_are_told_apart() -> None:
 
 
 def test_one_that_is_told_λ_itself_is_named_by_its_model_and_is_not_drawn_as_blind() -> None:
-    told = made.trial("astar_dwa", "–", model="clairvoyant")
-    for others in ((), (made.trial("astar_dwa", model="oracle"),)):
-        labels = [made.trial(**BLIND), told, *others]
+    told = made.condition("astar_dwa", "–", model="clairvoyant")
+    for others in ((), (made.condition("astar_dwa", model="oracle"),)):
+        labels = [made.condition(**BLIND), told, *others]
         (panel,) = panels(success_figure(made.summarised(made.rows(*(shares(one, 5) for one in labels)))))
         named = [label.get_text() for label in panel.get_yticklabels()]
         assert named == ["straight", "A* + DWA, clairvoyant", "A* + DWA, oracle, cvar"][: len(labels)]
@@ -113,14 +118,16 @@ def points_by_height(panel: Axes) -> list[float]:
 
 
 def test_points_are_filled_where_they_are_marked() -> None:
-    summary = made.summarised(made.rows(shares(made.trial(risk="a"), 9), shares(made.trial(risk="b"), 2)))
-    (panel,) = panels(success_figure(summary, {summary["trial"][0]}))
+    summary = made.summarised(
+        made.rows(shares(made.condition(risk="a"), 9), shares(made.condition(risk="b"), 2))
+    )
+    (panel,) = panels(success_figure(summary, {summary["condition"][0]}))
     marked = [line for line in panel.lines if line.get_marker() == "o"]
     assert [to_rgb(line.get_markerfacecolor()) == (1, 1, 1) for line in marked] == [False, True]
 
 
 def test_figures_have_the_width_of_a_column_or_a_page() -> None:
-    one = made.summarised(made.rows(shares(made.trial(), 5)))
+    one = made.summarised(made.rows(shares(made.condition(), 5)))
     assert success_figure(one).get_figwidth() * 25.4 == pytest.approx(88)
-    two = made.summarised(made.rows(*(shares(made.trial(scenario=name), 5) for name in ("std", "hg"))))
+    two = made.summarised(made.rows(*(shares(made.condition(scenario=name), 5) for name in ("std", "hg"))))
     assert success_figure(two).get_figwidth() * 25.4 == pytest.approx(180)

@@ -14,16 +14,16 @@ from benchnav.eval.report.recorded.snapshot import Snapshot
 from tests.eval.report import made
 
 
-def snapshot(trial: str = "t", instance: int = 0, seed: int = 0, **labels: str) -> Snapshot:
-    about = made.trial(**labels) | {"trial": trial, "instance": str(instance), "seed": str(seed)}
+def snapshot(condition: str = "t", map_index: int = 0, seed: int = 0, **labels: str) -> Snapshot:
+    about = made.condition(**labels) | {"condition": condition, "map": str(map_index), "seed": str(seed)}
     return take_snapshot(made.recording(about=about | {"realisation": "0", "outcome": "out_of_bounds"}))
 
 
-def chosen(snapshots: list[Snapshot], trials: list[str]) -> list[tuple[str, str]]:
-    return [(s.about["trial"], s.about["instance"]) for s in choose(snapshots, trials)]
+def chosen(snapshots: list[Snapshot], conditions: list[str]) -> list[tuple[str, str]]:
+    return [(s.about["condition"], s.about["map"]) for s in choose(snapshots, conditions)]
 
 
-def test_one_a_trial_on_one_map_in_the_tables_order() -> None:
+def test_one_a_condition_on_one_map_in_the_tables_order() -> None:
     every = [snapshot("b", 10), snapshot("b", 9), snapshot("a", 9), snapshot("a", 10), snapshot("c", 3)]
     assert chosen(every, ["c", "b", "a"]) == [("c", "3"), ("b", "9"), ("a", "9")]
     assert chosen(every, ["a", "b"]) == [("a", "9"), ("b", "9")]
@@ -33,8 +33,8 @@ def test_one_a_trial_on_one_map_in_the_tables_order() -> None:
 
 
 def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do_not() -> None:
-    def ended(trial: str, instance: int, outcome: str) -> Snapshot:
-        made = snapshot(trial, instance)
+    def ended(condition: str, map_index: int, outcome: str) -> Snapshot:
+        made = snapshot(condition, map_index)
         return replace(made, about={**made.about, "outcome": outcome})
 
     outcomes = {("a", 1): "success", ("b", 1): "success", ("a", 2): "success", ("b", 2): "immobilised"}
@@ -46,14 +46,14 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
         ended("c", 0, "success"),
     ]
     assert chosen(every, ["a", "b", "c"]) == [("a", "2"), ("b", "2"), ("c", "0")]
-    alike = [ended(trial, 1, "success") for trial in "ab"] + [ended(trial, 2, "stuck") for trial in "ab"]
+    alike = [ended(name, 1, "success") for name in "ab"] + [ended(name, 2, "stuck") for name in "ab"]
     assert chosen(alike, ["a", "b"]) == [("a", "2"), ("b", "2")]
     assert chosen(alike[:2], ["a", "b"]) == [("a", "1"), ("b", "1")]
 
 
 def test_no_more_than_can_be_seen() -> None:
-    trials = [f"t{k}" for k in range(12)]
-    assert len(chosen([snapshot(trial) for trial in trials], trials)) == MOST_PANELS
+    conditions = [f"t{k}" for k in range(12)]
+    assert len(chosen([snapshot(condition) for condition in conditions], conditions)) == MOST_PANELS
 
 
 def shown(figure: Figure) -> list:  # type: ignore[type-arg]
@@ -106,7 +106,7 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
     above, below, last = shown(trajectory_figure([taken]))
     assert taken.field is not None
     (drawn,) = (image.get_array() for image in last.get_images())
-    np.testing.assert_array_equal(drawn, field_colours(taken.field, taken.holding))
+    np.testing.assert_array_equal(drawn, field_colours(taken.field, taken.immobilising))
     assert last.get_images()[0].origin == "lower"
     paths = [line for line in last.lines if len(line.get_xdata()) > 1]
     assert paths
@@ -161,7 +161,7 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
 
 def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
     taken = held(field=None)
-    bare = replace(taken, soft=np.zeros_like(taken.soft), holding=np.zeros_like(taken.holding))
+    bare = replace(taken, soft=np.zeros_like(taken.soft), immobilising=np.zeros_like(taken.immobilising))
     with_ground, without = (trajectory_figure([one]) for one in (taken, bare))
     assert names_in_legend(with_ground) == names_in_legend(without)
     for one, other in zip(shown(with_ground), shown(without), strict=True):
@@ -190,9 +190,9 @@ def names_in_legend(figure: Figure) -> list[str]:
 @pytest.mark.parametrize(
     ("changes", "names"),
     [
-        ({}, ["not free", SOFT_WORDS, "holds a robot", "immobilised"]),
-        ({"soft": np.zeros((40, 60), bool)}, ["not free", "holds a robot", "immobilised"]),
-        ({"holding": np.zeros((40, 60), bool)}, ["not free", SOFT_WORDS, "immobilised"]),
+        ({}, ["not free", SOFT_WORDS, "immobilises a robot", "immobilised"]),
+        ({"soft": np.zeros((40, 60), bool)}, ["not free", "immobilises a robot", "immobilised"]),
+        ({"immobilising": np.zeros((40, 60), bool)}, ["not free", SOFT_WORDS, "immobilised"]),
     ],
 )
 def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: list[str]) -> None:
@@ -204,7 +204,7 @@ def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: li
 
 def test_the_legend_names_layers_that_are_there() -> None:
     names = names_in_legend(trajectory_figure([snapshot()]))
-    marks = ["start", "goal", "robot", "driven; above in the colour of the λ met"]
+    marks = ["start", "goal", "robot", "driven; above in the colour of the observed λ"]
     assert names == [*marks, "not free", "samples", "reference path", "planned"]
     taken = snapshot()
     everywhere = replace(taken, free=np.ones_like(taken.free))

@@ -23,14 +23,14 @@ def test_each_map_shows_its_own_layer_under_what_is_driven_and_planned() -> None
 
 def test_each_planner_is_seen_on_what_it_was_given() -> None:
     recordings = [
-        made.recording(10, labels=made.trial(risk=risk), free_by="mean", free_above=above)
+        made.recording(10, labels=made.condition(risk=risk), free_by="mean", free_above=above)
         for risk, above in (("cvar:0.9", 0.1), ("mean", 0.2))
     ]
     views = map_views(drivers_of(recordings))
     assert views["λ̂ given to mean, free: mean λ above 0.2"] == [
-        "/map/risk/trials/mean", "/map/overlay/trials/mean/**", "/map/places/**"
+        "/map/risk/conditions/mean", "/map/overlay/conditions/mean/**", "/map/places/**"
     ]  # fmt: skip
-    assert views["λ̂ given to cvar:0.9, free: mean λ above 0.1"][0] == "/map/risk/trials/cvar\\:0.9"
+    assert views["λ̂ given to cvar:0.9, free: mean λ above 0.1"][0] == "/map/risk/conditions/cvar\\:0.9"
     assert views["Colour"] == ["/map/colour", "/map/soft/**", *OVERLAY]
 
 

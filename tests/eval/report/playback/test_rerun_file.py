@@ -9,7 +9,7 @@ import pytest
 
 from benchnav.eval.report.playback.rerun_file import write_rerun
 from benchnav.eval.report.recorded.drawn_plan import MOST_POINTS, DrawnPlan, thinned
-from benchnav.eval.report.recorded.ground import HOLDING, field_colours, hatching, outline
+from benchnav.eval.report.recorded.ground import IMMOBILISING, field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
@@ -22,7 +22,7 @@ def written(folder: Path, *recordings: Recording) -> Path:
 
 
 def pair() -> list[Recording]:
-    """Two trials on one map: one arrives, one is held after 8 s."""
+    """Two conditions on one map: one arrives, one is held after 8 s."""
     other = made.held_recording(80, about={**made.held_recording().about, "risk": "mean"})
     first = made.held_recording(120, about={**made.held_recording().about, "outcome": "success"})
     return [first, replace(other, predicted=1 - first.predicted, free=first.predicted < 0.7, free_by="mean")]
@@ -96,8 +96,8 @@ def test_maps_are_those_of_the_recording(tmp_path: Path) -> None:
     path = written(tmp_path, recording)
     assert recording.field is not None
     shown = image(path, "/map/field")
-    np.testing.assert_array_equal(shown, field_colours(recording.field, recording.holding))
-    np.testing.assert_array_equal((shown == HOLDING).all(axis=-1), recording.holding)
+    np.testing.assert_array_equal(shown, field_colours(recording.field, recording.immobilising))
+    np.testing.assert_array_equal((shown == IMMOBILISING).all(axis=-1), recording.immobilising)
     viridis = matplotlib.colormaps["viridis"]
     expected = np.round(255 * viridis(recording.true_mean)[..., :3])
     np.testing.assert_array_equal(image(path, "/map/true_mean"), expected)
@@ -204,27 +204,27 @@ def test_an_episode_that_ended_at_once_can_be_played(tmp_path: Path) -> None:
     assert len(positions) == 1
 
 
-def test_several_trials_have_paths_colours_and_maps_of_their_own(tmp_path: Path) -> None:
+def test_several_conditions_have_paths_colours_and_maps_of_their_own(tmp_path: Path) -> None:
     recordings = pair()
     path = written(tmp_path, *recordings)
     verify(path)
     colours = []
     for recording, name in zip(recordings, ("cvar", "mean"), strict=True):
-        times, positions = read_path(path, f"/world/trials/{name}/robot")
+        times, positions = read_path(path, f"/world/conditions/{name}/robot")
         np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
         assert times[-1] == pytest.approx(recording.end_s)
         own = {
             entity: int(np.ravel(static(path, entity, "colors"))[0])
-            for entity in (f"/world/trials/{name}/robot", f"/map/overlay/trials/{name}/robot",
-                           f"/series/traversability/trials/{name}/met")
+            for entity in (f"/world/conditions/{name}/robot", f"/map/overlay/conditions/{name}/robot",
+                           f"/series/traversability/conditions/{name}/met")
         }  # fmt: skip
         assert len(set(own.values())) == 1
         colours += [*set(own.values())]
-        assert static(path, f"/series/traversability/trials/{name}/met", "names").tolist() == [name]
-        assert column(path, f"/world/trials/{name}/outcome", "labels")[1] == [
+        assert static(path, f"/series/traversability/conditions/{name}/met", "names").tolist() == [name]
+        assert column(path, f"/world/conditions/{name}/outcome", "labels")[1] == [
             [f"{name}: {recording.outcome}"]
         ]
-        shown = image(path, f"/map/risk/trials/{name}")
+        shown = image(path, f"/map/risk/conditions/{name}")
         assert ((shown == 64).all(axis=-1) == ~recording.free).all()
     assert colours[0] != colours[1]
     assert not [

@@ -39,7 +39,7 @@ def robot_at(frame: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
 
 
 def test_a_video_has_its_frames_size_and_duration_and_the_robot_where_the_path_says(tmp_path: Path) -> None:
-    first, second = grey(40), grey(24, labels=made.trial(risk="mean"))
+    first, second = grey(40), grey(24, labels=made.condition(risk="mean"))
     second = replace(second, states=second.states * np.array([1, 0.5, 1, 1, 1], np.float32))
     path = tmp_path / "there" / "a.mp4"
     steps = list(write_video([first, second], path))
@@ -85,7 +85,7 @@ def test_what_moves_is_told_in_words() -> None:
     frames = Frames([recording])
     column = frames._columns[0]
     frames.draw(2.0)
-    assert column._time.get_text() == f"t =   2.0 s   λ met = {recording.traversability[20]:.2f}"
+    assert column._time.get_text() == f"t =   2.0 s   observed λ = {recording.traversability[20]:.2f}"
     assert column._outcome.get_text() == ""
     assert len(column._driven.get_segments()) == 20
     np.testing.assert_array_equal(column._driven.get_array(), recording.traversability[:20])
@@ -114,6 +114,6 @@ def test_an_episode_that_ended_at_once_is_shown(tmp_path: Path) -> None:
 
 
 def test_more_than_can_be_seen_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="at most 6 trials"):
+    with pytest.raises(ConfigError, match="at most 6 conditions"):
         list(write_video([made.recording(3)] * 7, tmp_path / "a.mp4"))
     assert not list(tmp_path.iterdir())

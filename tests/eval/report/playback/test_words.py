@@ -15,8 +15,8 @@ def test_an_episode_is_told_with_its_outcome_and_the_threshold() -> None:
         assert words in text
 
 
-def test_trials_are_told_side_by_side() -> None:
-    first = made.recording(200, labels=made.trial(risk="cvar:0.9"))
+def test_conditions_are_told_side_by_side() -> None:
+    first = made.recording(200, labels=made.condition(risk="cvar:0.9"))
     about = {**made.recording().about, "risk": "mean", "outcome": "out_of_bounds"}
     text = describe(drivers_of([first, made.recording(150, about=about)]))
     assert "| cvar:0.9 | **success** | 20.0 |" in text
@@ -24,4 +24,4 @@ def test_trials_are_told_side_by_side() -> None:
 
 
 def test_an_episode_that_ended_at_once_met_nothing() -> None:
-    assert "λ met on average: –" in describe(drivers_of([made.recording(0)]))
+    assert "observed λ on average: –" in describe(drivers_of([made.recording(0)]))

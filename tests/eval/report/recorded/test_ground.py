@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from benchnav.eval.report.recorded.ground import HOLDING, field_colours, hatching, immobilised_at, outline
+from benchnav.eval.report.recorded.ground import (
+    IMMOBILISING,
+    field_colours,
+    hatching,
+    immobilised_at,
+    outline,
+)
 
 REGIONS = arrays(bool, st.tuples(st.integers(1, 7), st.integers(1, 9)))
 
@@ -36,21 +42,21 @@ def lab(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seen", SEEN)
-def test_what_holds_a_robot_has_a_colour_that_no_traversability_has(seen: str) -> None:
+def test_what_immobilises_a_robot_has_a_colour_that_no_traversability_has(seen: str) -> None:
     shades = field_colours(np.linspace(0, 1, 256)[None], np.zeros((1, 256), bool))[0] / 255
-    away = lab(shades, SEEN[seen]) - lab(np.array(HOLDING) / 255, SEEN[seen])
+    away = lab(shades, SEEN[seen]) - lab(np.array(IMMOBILISING) / 255, SEEN[seen])
     # A difference of 2.3 can just be seen.
     assert np.linalg.norm(away, axis=1).min() > 30
 
 
 def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds() -> None:
     field = np.random.default_rng(0).random((5, 7))
-    holding = field < 0.3
-    colours = field_colours(field, holding)
+    immobilising = field < 0.3
+    colours = field_colours(field, immobilising)
     assert (colours.dtype, colours.shape) == (np.uint8, (5, 7, 3))
     usual = np.round(255 * matplotlib.colormaps["viridis"](field)[..., :3])
-    np.testing.assert_array_equal(colours[~holding], usual[~holding])
-    assert (colours[holding] == HOLDING).all()
+    np.testing.assert_array_equal(colours[~immobilising], usual[~immobilising])
+    assert (colours[immobilising] == IMMOBILISING).all()
 
 
 def cells_beside(region: np.ndarray, edge: np.ndarray, resolution_m: float) -> list[bool]:

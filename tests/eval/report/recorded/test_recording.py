@@ -34,7 +34,7 @@ def test_a_snapshot_is_of_the_last_plan_by_its_time(
 def test_a_snapshot_is_of_the_recordings_own_ground() -> None:
     recording = made.held_recording()
     snapshot = take_snapshot(recording)
-    for name in ("field", "soft", "holding"):
+    for name in ("field", "soft", "immobilising"):
         np.testing.assert_array_equal(getattr(snapshot, name), getattr(recording, name))
     assert take_snapshot(made.recording()).field is None
 

@@ -8,7 +8,7 @@ import torch
 from benchnav import gridgraph
 from benchnav.errors import ConfigError
 from benchnav.grid import Grid
-from benchnav.planning.free_space import PRICE, Rules
+from benchnav.planning.free_space import PENALTY, Rules
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.problem import Problem, pose_problem
@@ -25,7 +25,7 @@ def random_problem(seed: int, robot: Unicycle, by_time: bool = False) -> Problem
 
 
 def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Graph:
-    """Halves of an edge at their own cell's cost; prices on the flat length."""
+    """Halves of an edge at their own cell's cost; penalties on the flat length."""
     free, height = problem.free[member].numpy(), problem.elevation_m[member].double().numpy()
     pace = 1 / problem.risk_map[member].double().clamp(min=0.3).numpy() / problem.robot.top_speed_mps
     graph = networkx.Graph()
@@ -38,8 +38,8 @@ def networkx_graph(problem: Problem, member: int, by_time: bool) -> networkx.Gra
                     cost = np.hypot(2 * half, height[i, j] - height[k, m])
                     if by_time:
                         cost = half * (pace[i, j] + pace[k, m])
-                    price = half * PRICE * (int(not free[i, j]) + int(not free[k, m]))
-                    graph.add_edge((i, j), (k, m), weight=cost + price)
+                    penalty = half * PENALTY * (int(not free[i, j]) + int(not free[k, m]))
+                    graph.add_edge((i, j), (k, m), weight=cost + penalty)
     return graph
 
 
@@ -147,7 +147,7 @@ def test_a_wall_without_a_gap_is_crossed_where_it_is_thinnest() -> None:
     blocked = [~problem.free[b].flatten()[cells[b]] for b in range(2)]
     assert blocked[0].sum() == 1
     # Half an edge before its centre and half an edge behind, straight or across a corner.
-    assert 0.5 * PRICE <= field.cost[0, 2, 2] <= 0.75 * PRICE
+    assert 0.5 * PENALTY <= field.cost[0, 2, 2] <= 0.75 * PENALTY
     assert blocked[1].sum() == 0
     assert field.cost[1, 2, 2] < 100
 

@@ -117,7 +117,7 @@ def test_a_robot_that_spins_stops_it(rate: float) -> None:
     planner = AStarDWA()
     state = planner.init(problem, generator())
     spinning = torch.tensor([[0.0, rate]])
-    state = replace(state, local=planner.local.took(state.local, spinning))
+    state = replace(state, local=planner.local.commit_action(state.local, spinning))
     robot_state, rates = problem.start, []
     for _ in range(150):
         step = replace(first(problem), state=robot_state)

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from benchnav.errors import ConfigError
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import dwa as dwa_module
-from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, held_paths, judge, velocity_window
+from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, held_paths, score, velocity_window
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from tests import factories
@@ -56,10 +56,10 @@ def test_it_knows_the_velocity_that_a_robot_took() -> None:
     dwa = DWA()
     state = dwa.init(problem, generator())
     assert state.velocity.tolist() == [[0.0, 0.0]]
-    assert torch.equal(dwa.took(state, taken).velocity, taken)
+    assert torch.equal(dwa.commit_action(state, taken).velocity, taken)
     # A robot with limits gets no farther than these.
     limited = replace(problem, task=replace(problem.task, robot=DifferentialDrive()))
-    state = dwa.took(dwa.init(limited, generator()), taken)
+    state = dwa.commit_action(dwa.init(limited, generator()), taken)
     torch.testing.assert_close(state.velocity, torch.tensor([[0.05, -0.1]]))
 
 
@@ -71,7 +71,7 @@ def test_costs_equal_a_loop_over_pairs_and_steps() -> None:
     target = torch.tensor([[3.6, 2.6], [7.0, 6.0]])
     window = torch.tensor([[[0.9, 0.2], [0.1, -0.7]], [[0.0, 0.0], [1.0, 1.0]]])
     config = DWAConfig(horizon_s=2.3, heading_weight=0.1, arrival_m=0.3)
-    cost = judge(problem, problem.start, window, target, config)
+    cost = score(problem, problem.start, window, target, config)
     positions = held_paths(problem, problem.start, window, 23)
     assert positions.shape == (2, 2, 24, 2)
     arrivals = 0
@@ -83,9 +83,9 @@ def test_costs_equal_a_loop_over_pairs_and_steps() -> None:
             expected, arrived = 0.0, False
             for t in range(24):
                 row, column = int(y // 0.5), int(x // 0.5)
-                price = 0 if problem.free[b, row, column] else 1e4
+                penalty = 0 if problem.free[b, row, column] else 1e4
                 if not arrived:
-                    expected += math.hypot(x - gx, y - gy) + price
+                    expected += math.hypot(x - gx, y - gy) + penalty
                 if t == 23:
                     break
                 lam = max(maps[b, row, column].item(), 0.3)
@@ -189,7 +189,9 @@ def test_no_tensor_is_made_on_another_device(monkeypatch: pytest.MonkeyPatch) ->
         action, state, plan = dwa.plan_toward(
             first(problem, draw=True), dwa.init(problem, generator()), problem.goal_m
         )
-        assert on_cuda(action, dwa.took(state, action).velocity, plan.path, plan.samples, plan.status)
+        assert on_cuda(
+            action, dwa.commit_action(state, action).velocity, plan.path, plan.samples, plan.status
+        )
 
 
 @pytest.mark.parametrize(
@@ -201,7 +203,7 @@ def test_the_horizon_is_in_seconds_and_has_a_step_at_least(horizon_s: float, dt_
     _, _, plan = dwa.plan_toward(first(problem, draw=True), dwa.init(problem, generator()), problem.goal_m)
     assert plan.path.shape == (1, steps + 1, 2)
     ahead = torch.tensor([[[1.0, 0.0]]])
-    far = judge(
+    far = score(
         problem, problem.start, ahead, problem.goal_m, DWAConfig(horizon_s=horizon_s, heading_weight=0)
     )
     away = (problem.start[0, :2] - problem.goal_m[0]).norm().item()
@@ -230,19 +232,19 @@ def test_the_heading_weighs_alike_in_whatever_unit_an_objective_counts(objective
     for scale in (1.0, 1024.0):
         problem = factories.problem(ground, start=(4.0, 4.0), objective=Scaled(objective, scale))
         window = velocity_window(problem, torch.zeros(3, 2), CONFIG)
-        costs.append(judge(problem, problem.start, window, target, CONFIG) / scale)
+        costs.append(score(problem, problem.start, window, target, CONFIG) / scale)
     torch.testing.assert_close(costs[0], costs[1])
 
 
-def test_a_price_is_no_part_of_what_the_heading_weighs() -> None:
+def test_a_penalty_is_no_part_of_what_the_heading_weighs() -> None:
     free = factories.problem(torch.full((1, 16, 16), 0.35), start=(4.0, 4.0), goal=(7.0, 7.0))
     not_free = replace(free, free=torch.zeros_like(free.free))
     stand = torch.zeros(1, 1, 2)
     costs = [
-        judge(problem, problem.start, stand, torch.tensor([[6.0, 5.0]]), CONFIG).item()
+        score(problem, problem.start, stand, torch.tensor([[6.0, 5.0]]), CONFIG).item()
         for problem in (free, not_free)
     ]
-    assert costs[1] - costs[0] == pytest.approx(51 * PRICE)
+    assert costs[1] - costs[0] == pytest.approx(51 * PENALTY)
 
 
 @pytest.mark.parametrize("value", [0, -1, math.inf, math.nan])

@@ -37,7 +37,7 @@ class Constant:
         action = step.state.new_tensor(self.action).expand(len(step.state), 2)
         return action, plan_state, Plan.empty(len(action), action.device)
 
-    def took(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
+    def commit_action(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
         return (*plan_state, action)
 
 

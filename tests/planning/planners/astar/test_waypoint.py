@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from benchnav.grid import Grid
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs, line_costs
@@ -49,7 +49,7 @@ def sampled(given: Problem, member: int, start: torch.Tensor, end: torch.Tensor,
     cost = np.sqrt(1 + slope**2)
     if by_time:
         cost = 1 / given.risk_map[member].double().numpy()[rows, columns].clip(0.3) / 1.5
-    cost = cost + PRICE * ~given.free[member].numpy()[rows, columns]
+    cost = cost + PENALTY * ~given.free[member].numpy()[rows, columns]
     return float(cost.mean() * np.hypot(*offset))
 
 
@@ -62,7 +62,7 @@ def test_line_costs_equal_dense_sampling(by_time: bool) -> None:
     for b in range(3):
         for j in range(12):
             expected = sampled(given, b, start[b, j], end[b, j], by_time)
-            # A sample is worth PRICE / 40 000 of a line's length at each edge of a blocked cell.
+            # A sample is worth PENALTY / 40 000 of a line's length at each edge of a blocked cell.
             assert costs[b, j].item() == pytest.approx(expected, rel=1e-4, abs=3.0)
 
 

@@ -32,7 +32,7 @@ def problem(**changes: Any) -> Problem:
 
 
 def step_of(given: Problem) -> Step:
-    return Step(state=given.start, felt=given.start[:, 0] * torch.nan, time_s=0.0)
+    return Step(state=given.start, traversability=given.start[:, 0] * torch.nan, time_s=0.0)
 
 
 def ask(*answer: Any, **changes: Any) -> Answer:
@@ -64,7 +64,7 @@ def test_what_a_planner_does_to_its_arguments_reaches_nobody() -> None:
 
         def plan(self, step: Step, plan_state: Problem) -> tuple[Tensor, Problem, Plan]:
             step.state.fill_(9.0)
-            step.felt.fill_(9.0)
+            step.traversability.fill_(9.0)
             return ahead(), plan_state, Plan.empty(BATCH)
 
     def tensors(value: Problem) -> list[Tensor]:
@@ -79,7 +79,7 @@ def test_what_a_planner_does_to_its_arguments_reaches_nobody() -> None:
     plan_state = begin(Vandal(), given, torch.Generator())
     act(Vandal(), step, plan_state, given)
     assert all(torch.equal(kept, tensor) for kept, tensor in zip(before, tensors(given), strict=True))
-    assert step.felt.isnan().all()
+    assert step.traversability.isnan().all()
 
 
 def test_an_action_that_is_written_into_later_stays_what_it_was() -> None:

@@ -170,7 +170,10 @@ class Draws(Good):
 BAD: dict[str, tuple[Any, str]] = {
     "no planner": (object(), "Expected an answer from `init`, got AttributeError"),
     "writes into the states": (acting(lambda step, _: step.state.zero_()), "got another step.state."),
-    "writes into what was felt": (acting(lambda step, _: step.felt.zero_()), "got another step.felt."),
+    "writes into what was observed": (
+        acting(lambda step, _: step.traversability.zero_()),
+        "got another step.traversability.",
+    ),
     "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got another problem.risk_map."),
     "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments as they were"),
     "writes into the prediction": (preparing(lambda p, _: p.mixture.means.zero_()), "problem.mixture.means"),
@@ -249,8 +252,8 @@ def test_a_good_planner_passes_on_maps_worth_trying() -> None:
     shut = ~problems[0].free.any(dim=2)
     assert shut.any(dim=1).tolist() == [False, True, False, False]
     assert {one.draw for one in steps} == {True, False}
-    assert any(one.felt.isnan().all() for one in steps)
-    assert any(one.felt.isfinite().all() for one in steps)
+    assert any(one.traversability.isnan().all() for one in steps)
+    assert any(one.traversability.isfinite().all() for one in steps)
     assert max(one.time_s for one in steps) > 0
     assert any((one.state[:, :2] < 0).any() for one in steps)
 

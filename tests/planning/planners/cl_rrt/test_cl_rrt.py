@@ -33,7 +33,7 @@ GAP = slice(20, 28)  # from y = 10 m to 14 m, wide enough to be found by every s
 
 
 def at(state: Tensor, draw: bool = True) -> Step:
-    return Step(state=state, felt=torch.full_like(state[:, 0], math.nan), time_s=0.0, draw=draw)
+    return Step(state=state, traversability=torch.full_like(state[:, 0], math.nan), time_s=0.0, draw=draw)
 
 
 def begin(problem: Problem, config: CLRRTConfig = SMALL, seed: int = 0) -> tuple[CLRRT, CLRRTState]:

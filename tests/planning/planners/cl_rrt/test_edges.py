@@ -125,7 +125,7 @@ def test_edge_that_may_cross_goes_on_and_counts_the_metres() -> None:
     assert edges.end.state[0, 0, 0] == pytest.approx(11.0, abs=0.1)
     assert edges.blocked_m.item() == pytest.approx(1.0, abs=0.1)
     assert edges.end.free.item()
-    # Ground that is not free moves a robot at least as `slowest` does.
+    # Ground that is not free moves a robot at least as `min_traversability` does.
     assert edges.time_s.item() == pytest.approx(3 / 0.8 + 1 / 0.3, abs=0.3)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.planning.free_space import PRICE
+from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop, draw_references, drive
 from benchnav.planning.planners.cl_rrt.pursuit import Tracking
@@ -105,7 +105,7 @@ def test_nodes_that_cannot_improve_on_the_best_way_are_left_out() -> None:
     assert (choose(loop, tree, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 3).node == 0).all()
     soon = replace(tree, time_s=torch.tensor([[0.0, 14.0, 20.0]]))
     assert (choose(loop, soon, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).node == 1).any()
-    dear = replace(soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]]))  # and the price counts
+    dear = replace(soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]]))  # and the penalty counts
     assert (choose(loop, dear, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).node == 0).all()
 
 
@@ -140,7 +140,7 @@ def test_no_more_edges_aim_at_the_goal_than_are_asked_for_or_there_are_nodes(
     assert (choice.target_m == loop.problem.goal_m).all(dim=-1).sum() == aimed
 
 
-def test_a_way_costs_its_time_and_the_price_of_metres_that_are_not_free() -> None:
+def test_a_way_costs_its_time_and_the_penalty_of_metres_that_are_not_free() -> None:
     loop = make_loop(walled_map(), crossing=True)
     tree = extended(loop, planted(loop), [0], [(7.0, 8.0)])
     tree = extended(loop, tree, [1], [(11.0, 8.0)])
@@ -149,7 +149,7 @@ def test_a_way_costs_its_time_and_the_price_of_metres_that_are_not_free() -> Non
         tree.time_s[0], torch.tensor([0, 5, 5 + 3.75 + 3.33, 12.08 + 1.25]), rtol=0, atol=0.6
     )
     torch.testing.assert_close(tree.blocked_m[0], torch.tensor([0.0, 0.0, 1.0, 1.0]), rtol=0, atol=0.1)
-    torch.testing.assert_close(tree.cost, tree.time_s + PRICE * tree.blocked_m)
+    torch.testing.assert_close(tree.cost, tree.time_s + PENALTY * tree.blocked_m)
     torch.testing.assert_close(tree.best_cost, tree.cost[:, 3])
 
 

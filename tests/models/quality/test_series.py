@@ -1,6 +1,6 @@
 import pytest
 
-from benchnav.models.quality.ladders import find_ladders
+from benchnav.models.quality.series import find_series
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ from benchnav.models.quality.ladders import find_ladders
           "test/hs": [(0.0, "test/std"), (0.5, "test/hs-050")]}),
     ],
 )  # fmt: skip
-def test_ladders_are_read_from_the_names_of_splits(
+def test_series_are_read_from_the_names_of_splits(
     splits: list[str], expected: dict[str, list[tuple[float, str]]]
 ) -> None:
-    assert find_ladders(splits) == expected
+    assert find_series(splits) == expected

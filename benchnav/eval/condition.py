@@ -1,7 +1,7 @@
-"""Trials: the cell of an experiment as a value, and how a suite becomes a list of them.
+"""Conditions: the cell of an experiment as a value, and how a suite becomes a list of them.
 
-A trial says which data split, model, risk setting, planner, robot, objective, rules and world. Its id is
-the digest of that value; its labels are for people. Seeds, realisations and instances are how often a trial
+A condition says which data split, model, risk setting, planner, robot, objective, rules and world. Its id is
+the digest of that value; its labels are for people. Seeds, realisations and maps are how often a condition
 is run, and belong to the suite.
 """
 
@@ -28,11 +28,11 @@ from benchnav.planning.world.world import World
 from benchnav.registry import Part
 
 PART_KINDS = ("model", "risk", "planner", "robot", "objective")
-# Columns of `Trial.labels`, in the order of tables.
+# Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
 NOT_USED = "–"
 
-# What the mappings of `trials` may hold, with the other way to write it.
+# What the mappings of `conditions` may hold, with the other way to write it.
 _KEYS = {
     **{"data": "datas", "scenarios": "scenario", "models": "model", "risks": "risk", "planners": "planner"},
     **{"robots": "robot", "objectives": "objective", "world": "worlds", "task": "tasks"},
@@ -41,7 +41,7 @@ _SINGULAR = {other: key for key, other in _KEYS.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class Condition:
     """One cell of an experiment.
 
     Args:
@@ -55,7 +55,7 @@ class Trial:
         rules: free space, least λ̂, goal radius.
         world: what λ does.
         world_label: what tables call rules and world.
-        blind: the planner looks at nothing predicted; model and risk stand in for any.
+        blind: the planner is blind; model and risk stand in for any.
     """
 
     data: str
@@ -77,7 +77,7 @@ class Trial:
 
     @property
     def value(self) -> dict[str, Any]:
-        """All that bears on the trial's rows, as plain data; no labels."""
+        """All that bears on the condition's rows, as plain data; no labels."""
         parts = {kind: getattr(self, kind) for kind in PART_KINDS}
         return {
             "data": self.data,
@@ -124,15 +124,15 @@ class Trial:
         return registry.make("risk", self.risk)
 
 
-def trial_from(about: Mapping[str, Any]) -> Trial:
-    """Rebuilds a trial from its `value` and `labels`, as `run.json` holds them."""
+def condition_from(about: Mapping[str, Any]) -> Condition:
+    """Rebuilds a condition from its `value` and `labels`, as `run.json` holds them."""
     value, labels = about["value"], about["labels"]
     parts = {
         kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
         for kind in PART_KINDS
     }
     rules = Rules(**{**value["rules"], "free_space": FreeSpace(**value["rules"]["free_space"])})
-    return Trial(
+    return Condition(
         data=value["data"],
         scenario=value["split"].removeprefix("test/"),
         **parts,
@@ -143,8 +143,8 @@ def trial_from(about: Mapping[str, Any]) -> Trial:
     )
 
 
-def trials_of(suite: Suite, scenarios_of: Any) -> list[Trial]:
-    """Lists the trials of a suite, in the order of tables.
+def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
+    """Lists the conditions of a suite, in the order of tables.
 
     Args:
         suite: what is evaluated.
@@ -154,34 +154,34 @@ def trials_of(suite: Suite, scenarios_of: Any) -> list[Trial]:
         ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
     """
     _check_options_used(suite)
-    every: list[Trial] = []
-    for product in suite.trials or ({},):
+    every: list[Condition] = []
+    for product in suite.conditions or ({},):
         here: set[str] = set()
-        for trial in _product(suite, product, scenarios_of):
-            if trial.id in here and trial.risk.label != NOT_USED:
-                raise ConfigError(f"Expected settings that differ, got twice what {_words(trial)} is.")
-            here.add(trial.id)
-            every.append(trial)
+        for condition in _product(suite, product, scenarios_of):
+            if condition.id in here and condition.risk.label != NOT_USED:
+                raise ConfigError(f"Expected settings that differ, got twice what {_words(condition)} is.")
+            here.add(condition.id)
+            every.append(condition)
     check_labels(every)
-    return list({trial.id: trial for trial in every}.values())
+    return list({condition.id: condition for condition in every}.values())
 
 
-def check_labels(trials: Iterable[Trial]) -> None:
+def check_labels(conditions: Iterable[Condition]) -> None:
     """Refuses two settings under one label, which no reader of a table could tell apart, and two labels of one.
 
     Args:
-        trials: those that had their labels first come first; one condition may be there twice.
+        conditions: those that had their labels first come first; one condition may be there twice.
 
     Raises:
         ConfigError: there are such.
     """
     known: dict[tuple[str, str], Any] = {}
     labels: dict[tuple[str, str], str] = {}
-    for trial in trials:
-        for name, label in trial.labels.items():
+    for condition in conditions:
+        for name, label in condition.labels.items():
             if label == NOT_USED:
                 continue
-            value = _labelled(trial, name)
+            value = _labelled(condition, name)
             if known.setdefault((name, label), value) != value:
                 raise ConfigError(
                     f"Expected a label for each {name}, got two settings that are both called {label!r}. "
@@ -195,14 +195,14 @@ def check_labels(trials: Iterable[Trial]) -> None:
                 )
 
 
-def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Iterator[Trial]:
+def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Iterator[Condition]:
     given = {}
     for key, values in product.items():
         key = _SINGULAR.get(key, key)
         if key not in _KEYS:
             known = [*_KEYS, *_SINGULAR]
             raise ConfigError(
-                f"Expected keys of `trials` among {', '.join(_KEYS)}, got {key!r}.{registry.hint(key, known)}"
+                f"Expected keys of `conditions` among {', '.join(_KEYS)}, got {key!r}.{registry.hint(key, known)}"
             )
         given[key] = values if isinstance(values, list | tuple) else [values]
 
@@ -235,11 +235,11 @@ def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Ite
             worlds,
             *(ready[kind] for kind in ("robot", "objective", "model", "risk", "planner")),
         ):
-            trial = Trial(
+            condition = Condition(
                 data=data, scenario=scenario, model=model, risk=risk, planner=planner, robot=robot,
                 objective=objective, rules=rules, world=world, world_label=label,
             )  # fmt: skip
-            yield _as_run_once(trial)
+            yield _as_run_once(condition)
 
 
 def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
@@ -257,7 +257,7 @@ def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
 
 
 def _check_risk(part: Part) -> None:
-    """Lets a shipped risk measure refuse its options, on the distribution of one cell; be it that no trial uses it."""
+    """Lets a shipped risk measure refuse its options, on one cell, also where no condition uses it."""
     measure = registry.make("risk", part)
     if registry.find("risk", part.part).shipped:
         cell = torch.full((1, 1, 1, 1), 0.5)
@@ -286,7 +286,7 @@ def read_model(given: Any) -> Part:
 def _check_options_used(suite: Suite) -> None:
     """Refuses options of planners that no product names, such as a mistyped one."""
     listed: list[Any] = []
-    for product in suite.trials or ({},):
+    for product in suite.conditions or ({},):
         given = next((product[key] for key in ("planners", "planner") if key in product), suite.planners)
         listed += given if isinstance(given, list | tuple) else [given]
     known = list(dict.fromkeys(registry.read_part("planner", part).part for part in listed))
@@ -311,29 +311,31 @@ def _world(suite: Suite, world: Any, task: Any) -> tuple[World, Rules, str]:
     return read_world(world, task, short)
 
 
-def _as_run_once(trial: Trial) -> Trial:
-    """One trial for every setting that would change nothing.
+def _as_run_once(condition: Condition) -> Condition:
+    """One condition for every setting that would change nothing.
 
     What a blind planner is given is not looked at; and of λ that is known every measure of risk is λ itself.
     """
     any_risk = Part(part="mean", label=NOT_USED)
-    if getattr(registry.find("planner", trial.planner.part).target, "blind", False):
-        return replace(trial, model=Part(part="oracle", label=NOT_USED), risk=any_risk, blind=True)
-    if trial.model.part != "clairvoyant":
-        return trial
-    if trial.world.noise == "resampled":
+    if getattr(registry.find("planner", condition.planner.part).target, "blind", False):
+        return replace(condition, model=Part(part="oracle", label=NOT_USED), risk=any_risk, blind=True)
+    if condition.model.part != "clairvoyant":
+        return condition
+    if condition.world.noise == "resampled":
         raise ConfigError(
-            f"Expected a world whose λ can be known for the model 'clairvoyant', got {trial.world_label!r}, where "
+            f"Expected a world whose λ can be known for the model 'clairvoyant', got {condition.world_label!r}, where "
             "it is resampled at each step. Take the world stakes, or `world.noise` frozen or stored."
         )
-    return replace(trial, risk=any_risk)
+    return replace(condition, risk=any_risk)
 
 
-def _labelled(trial: Trial, name: str) -> Any:
+def _labelled(condition: Condition, name: str) -> Any:
     if name == "world":
-        return trial.world, trial.rules
-    return trial.value[name] if name in PART_KINDS else None
+        return condition.world, condition.rules
+    return condition.value[name] if name in PART_KINDS else None
 
 
-def _words(trial: Trial) -> str:
-    return ", ".join(f"{trial.labels[name]}" for name in ("scenario", "model", "planner", "risk", "world"))
+def _words(condition: Condition) -> str:
+    return ", ".join(
+        f"{condition.labels[name]}" for name in ("scenario", "model", "planner", "risk", "world")
+    )

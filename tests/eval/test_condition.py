@@ -1,4 +1,4 @@
-"""Trials as values, and how a suite becomes a list of them."""
+"""Conditions as values, and how a suite becomes a list of them."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -6,22 +6,22 @@ from itertools import pairwise
 import pytest
 
 from benchnav.errors import ConfigError
+from benchnav.eval.condition import Condition, condition_from, conditions_of
 from benchnav.eval.suite import Suite
-from benchnav.eval.trial import Trial, trial_from, trials_of
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.world.world import PRESETS, Immobile, World
 
 FAN = "tests.eval.parts:Faulty"
 
 
-def trials(**changes: object) -> list[Trial]:
+def conditions(**changes: object) -> list[Condition]:
     given = {"model": "oracle", "planners": (FAN,), "risks": ("mean",)} | changes
-    return trials_of(Suite(**given), lambda data: ["std", "hg"])  # type: ignore[arg-type]
+    return conditions_of(Suite(**given), lambda data: ["std", "hg"])  # type: ignore[arg-type]
 
 
-def one(**changes: object) -> Trial:
-    (trial,) = trials(**({"scenarios": ("std",)} | changes))
-    return trial
+def one(**changes: object) -> Condition:
+    (condition,) = conditions(**({"scenarios": ("std",)} | changes))
+    return condition
 
 
 def test_travel_time_ends_where_the_tasks_goal_begins() -> None:
@@ -31,9 +31,9 @@ def test_travel_time_ends_where_the_tasks_goal_begins() -> None:
 
 
 def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
-    trial = one()
-    assert one().id == trial.id
-    assert one(planners=({"part": FAN, "label": "other"},)).id == trial.id
+    condition = one()
+    assert one().id == condition.id
+    assert one(planners=({"part": FAN, "label": "other"},)).id == condition.id
     assert one(risks=("cvar:0.9",)).id == one(risks=("cvar",)).id
     changes = (
         {"scenarios": ("hg",)},
@@ -55,44 +55,44 @@ def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
         {"world": {"preset": "stakes", "immobile": None}},
         {"world": {"preset": "stakes", "time_budget_ratio": 2.0}},
         {"world": {"preset": "stakes", "time_budget_s": 2.0}},
-        {"task": {"slowest": 0.05}},
+        {"task": {"min_traversability": 0.05}},
         {"task": {"goal_radius_m": 0.5}},
         {"task": {"free_space": {"by": "mean"}}},
         {"task": {"free_space": {"above": 0.1}}},
     )
-    ids = [trial.id, *(one(**change).id for change in changes)]
+    ids = [condition.id, *(one(**change).id for change in changes)]
     assert len(set(ids)) == len(ids)
 
 
-def test_a_trial_is_read_back_from_what_a_run_holds() -> None:
-    for trial in trials(
+def test_a_condition_is_read_back_from_what_a_run_holds() -> None:
+    for condition in conditions(
         planners=({"part": FAN, "label": "late", "options": {"after_s": 2.0}}, "straight"),
         task={"free_space": {"by": "mean", "above": 0.1}},
-        trials=({"world": [{"noise": "stored"}, "stakes", {"preset": "stakes", "immobile": None}]},),
+        conditions=({"world": [{"noise": "stored"}, "stakes", {"preset": "stakes", "immobile": None}]},),
         robots=({"part": "unicycle", "options": {"speed_mps": [0.0, 2.0]}},),
     ):
-        again = trial_from({"value": trial.value, "labels": trial.labels})
-        assert again.id == trial.id
-        assert again == trial
+        again = condition_from({"value": condition.value, "labels": condition.labels})
+        assert again.id == condition.id
+        assert again == condition
 
 
 def test_every_setting_reaches_its_place() -> None:
-    trial = one(
-        task={"free_space": {"by": "mean", "above": 0.1}, "slowest": 0.05, "goal_radius_m": 2},
+    condition = one(
+        task={"free_space": {"by": "mean", "above": 0.1}, "min_traversability": 0.05, "goal_radius_m": 2},
         world={"preset": "paper", "noise": "stored"},
         time_budget_s=30.0,
         robots=({"part": "unicycle", "options": {"dt_s": 0.2}},),
         planner_options={FAN: {"after_s": 3.0}},
     )
-    assert (trial.rules.free_space.by, trial.rules.free_space.above) == ("mean", 0.1)
-    assert (trial.rules.slowest, trial.rules.goal_radius_m) == (0.05, 2.0)
-    assert (trial.world.noise, trial.world.time_budget_s) == ("stored", 30.0)
-    assert trial.make_task().robot.dt_s == 0.2
-    assert trial.make_task().rules == trial.rules
-    assert trial.make_planner().after_s == 3.0
+    assert (condition.rules.free_space.by, condition.rules.free_space.above) == ("mean", 0.1)
+    assert (condition.rules.min_traversability, condition.rules.goal_radius_m) == (0.05, 2.0)
+    assert (condition.world.noise, condition.world.time_budget_s) == ("stored", 30.0)
+    assert condition.make_task().robot.dt_s == 0.2
+    assert condition.make_task().rules == condition.rules
+    assert condition.make_planner().after_s == 3.0
     assert (
-        trial.world_label
-        == "paper noise=stored time_budget_s=30 by=mean above=0.1 slowest=0.05 goal_radius_m=2"
+        condition.world_label
+        == "paper noise=stored time_budget_s=30 by=mean above=0.1 min_traversability=0.05 goal_radius_m=2"
     )
     travel = one(objectives=("travel_time",), robots=({"part": "unicycle", "options": {"dt_s": 0.2}},))
     assert travel.make_task().objective.robot.dt_s == 0.2  # type: ignore[attr-defined]
@@ -104,7 +104,7 @@ def test_several_worlds_stand_at_the_top_of_a_suite() -> None:
         planners=("straight",),
         world=("paper", {"preset": "stakes", "correlation_m": [1.0, 2.0]}),
     )
-    worlds = [trial.world for trial in trials_of(suite, lambda data: ["std"])]
+    worlds = [condition.world for condition in conditions_of(suite, lambda data: ["std"])]
     assert [(world.noise, world.correlation_m) for world in worlds] == [
         ("resampled", 1.5), ("frozen", 1.0), ("frozen", 2.0),
     ]  # fmt: skip
@@ -115,11 +115,11 @@ def test_what_a_world_says_itself_goes_before_the_short_forms() -> None:
 
 
 def test_a_product_has_every_combination_once_in_the_order_of_tables() -> None:
-    made = trials(
+    made = conditions(
         planners=(FAN, "mppi"), risks=("mean", "cvar"), models=("oracle", "tests.eval.parts:Gaussian")
     )
     names = ("scenario", "model", "risk", "planner")
-    keys = [tuple(trial.labels[name] for name in names) for trial in made]
+    keys = [tuple(condition.labels[name] for name in names) for condition in made]
     assert len(set(keys)) == len(keys) == 16
     assert keys[:3] == [
         ("std", "oracle", "mean", "Faulty"), ("std", "oracle", "mean", "mppi"), ("std", "oracle", "cvar", "Faulty"),
@@ -127,9 +127,9 @@ def test_a_product_has_every_combination_once_in_the_order_of_tables() -> None:
 
 
 def test_products_side_by_side_take_what_they_leave_out_from_the_suite() -> None:
-    made = trials(
+    made = conditions(
         risks=("mean",),
-        trials=(
+        conditions=(
             {"planners": ["mppi"], "risks": ["cvar", "var"], "scenario": "std"},
             {"planner": FAN, "world": ["paper", {"noise": "stored"}], "scenarios": "hg"},
         ),
@@ -141,17 +141,17 @@ def test_products_side_by_side_take_what_they_leave_out_from_the_suite() -> None
     ]  # fmt: skip
 
 
-def test_a_blind_planner_is_one_trial_for_all_models_and_risks() -> None:
-    made = trials(
+def test_a_blind_planner_is_one_condition_for_all_models_and_risks() -> None:
+    made = conditions(
         planners=("straight", FAN), risks=("mean", "cvar"), models=("oracle", "tests.eval.parts:Gaussian")
     )
-    blind = [trial for trial in made if trial.blind]
+    blind = [condition for condition in made if condition.blind]
     assert [(t.scenario, t.labels["risk"], t.labels["model"]) for t in blind] == [
         ("std", "–", "–"),
         ("hg", "–", "–"),
     ]
     assert len(made) == 2 + 2 * 2 * 2
-    alone = trials(planners=("straight",), risks=("cvar",), model="tests.eval.parts:Gaussian")
+    alone = conditions(planners=("straight",), risks=("cvar",), model="tests.eval.parts:Gaussian")
     assert [t.id for t in alone] == [t.id for t in blind]
 
 
@@ -159,7 +159,7 @@ def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
     few, many = (
         {"part": "mppi", "label": name, "options": {"samples": n}} for name, n in (("few", 8), ("many", 9))
     )
-    made = trials(planners=(few, many), scenarios=("std",))
+    made = conditions(planners=(few, many), scenarios=("std",))
     assert [(t.labels["planner"], t.make_planner().config.samples) for t in made] == [("few", 8), ("many", 9)]
     for first, second in pairwise(made):
         assert first.id != second.id
@@ -182,22 +182,22 @@ def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
         ({"noise": "loud"}, "loud"),
         ({"world": "papr"}, "Did you mean 'paper'"),
         ({"world": {"nois": "stored"}}, "Did you mean 'noise'"),
-        ({"task": {"slowst": 0.1}}, "Did you mean 'slowest'"),
-        ({"task": {"free_space": {"by": "luck"}}}, "luck"),
-        ({"task": {"slowest": "much"}}, "slowest"),
-        ({"trials": ({"planer": "mppi"},)}, "Did you mean 'planner"),
+        ({"task": {"min_traversabilty": 0.1}}, "Did you mean 'min_traversability'"),
+        ({"task": {"free_space": {"by": "noise"}}}, "noise"),
+        ({"task": {"min_traversability": "much"}}, "min_traversability"),
+        ({"conditions": ({"planer": "mppi"},)}, "Did you mean 'planner"),
     ],
 )
 def test_what_cannot_be_had_is_refused(changes: dict[str, object], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
-        trials(**changes)
+        conditions(**changes)
 
 
 def test_a_suite_refuses_what_means_nothing() -> None:
     for bad in (
         {"planners": ()},
         {"realisations": 0},
-        {"instances": -1},
+        {"maps": -1},
         {"seeds": (1, 1)},
         {"record": "sometimes"},
         {"steps": "first"},
@@ -206,21 +206,21 @@ def test_a_suite_refuses_what_means_nothing() -> None:
             replace(Suite(), **bad)
 
 
-def test_a_world_with_stakes_is_told_apart_by_what_is_changed() -> None:
-    trial = one(world="stakes")
-    assert trial.world == PRESETS["stakes"].world
-    assert trial.rules == PRESETS["stakes"].rules
-    assert trial.world_label == "stakes"
+def test_a_world_with_stakes_is_distinguished_by_what_is_changed() -> None:
+    condition = one(world="stakes")
+    assert condition.world == PRESETS["stakes"].world
+    assert condition.rules == PRESETS["stakes"].rules
+    assert condition.world_label == "stakes"
     changed = one(
         world={"preset": "stakes", "correlation_m": 2, "immobile": {"below": 0.2}, "time_budget_s": 50},
-        task={"slowest": 0.1, "free_space": {"by": "risk"}},
+        task={"min_traversability": 0.1, "free_space": {"by": "risk"}},
     )
     assert changed.world == World(
         noise="frozen", correlation_m=2.0, immobile=Immobile(below=0.2, for_s=2.0), time_budget_s=50.0
     )
-    assert changed.rules == Rules(free_space=FreeSpace(by="risk", above=0.1), slowest=0.1)
+    assert changed.rules == Rules(free_space=FreeSpace(by="risk", above=0.1), min_traversability=0.1)
     assert changed.world_label == (
-        "stakes correlation_m=2 immobile=0.2/2s time_budget_s=50 by=risk slowest=0.1"
+        "stakes correlation_m=2 immobile=0.2/2s time_budget_s=50 by=risk min_traversability=0.1"
     )
     assert one(world={"preset": "stakes", "immobile": None}).world_label == "stakes immobile=none"
     held = one(world={"immobile": {"for_s": 4}})
@@ -245,11 +245,11 @@ def test_a_world_with_stakes_is_told_apart_by_what_is_changed() -> None:
 )
 def test_worlds_that_contradict_themselves_are_refused(changes: dict[str, object], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
-        trials(**changes)
+        conditions(**changes)
 
 
-def test_the_clairvoyant_is_one_trial_a_planner_for_all_risks() -> None:
-    made = trials(
+def test_the_clairvoyant_is_one_condition_a_planner_for_all_risks() -> None:
+    made = conditions(
         planners=("straight", FAN, "mppi"), risks=("mean", "cvar"), models=("oracle", "clairvoyant"),
         world="stakes", scenarios=("std",),
     )  # fmt: skip
@@ -258,5 +258,5 @@ def test_the_clairvoyant_is_one_trial_a_planner_for_all_risks() -> None:
         [("–", "straight", "–"), ("clairvoyant", "Faulty", "–"), ("clairvoyant", "mppi", "–")]
         + [("oracle", planner, risk) for planner in ("Faulty", "mppi") for risk in ("mean", "cvar")]
     )
-    for trial in made:
-        assert trial_from({"value": trial.value, "labels": trial.labels}) == trial
+    for condition in made:
+        assert condition_from({"value": condition.value, "labels": condition.labels}) == condition

@@ -18,24 +18,24 @@ from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 
 
 @dataclass(frozen=True, kw_only=True)
-class TwinQuality:
+class LookAlikeQuality:
     """Quality of class probabilities where classes look alike.
 
     Args:
-        twin_accuracy: share of cells whose most likely class is right, look-alikes merged into one.
-        twin_miou: intersection over union, look-alikes merged, averaged over the classes that occur in truth.
-        twin_share_error: over the cells of classes with look-alikes, mean distance of the share of the
+        look_alike_accuracy: share of cells whose most likely class is right, look-alikes merged into one.
+        look_alike_miou: intersection over union, look-alikes merged, averaged over the classes that occur in truth.
+        look_alike_share_error: over the cells of classes with look-alikes, mean distance of the share of the
             true class within them to that which a perfect classifier says: 1/2 of two.
-        twin_share_ece: expected calibration error of the larger share, 15 bins.
+        look_alike_share_ece: expected calibration error of the larger share, 15 bins.
     """
 
-    twin_accuracy: float
-    twin_miou: float
-    twin_share_error: float
-    twin_share_ece: float
+    look_alike_accuracy: float
+    look_alike_miou: float
+    look_alike_share_error: float
+    look_alike_share_ece: float
 
 
-class TwinTally:
+class LookAlikeTally:
     """Counts of class probabilities over maps, look-alikes merged.
 
     Args:
@@ -82,13 +82,13 @@ class TwinTally:
         self.cells += len(shares)
         self.curve.update(shares.T[None, :, None], place[None, None])
 
-    def quality(self) -> TwinQuality:
+    def quality(self) -> LookAlikeQuality:
         """What was counted; the shares are not a number where no look-alike occurred."""
         scores = self.scores.compute()
         missing = float("nan")
-        return TwinQuality(
-            twin_accuracy=float(scores["accuracy"]),
-            twin_miou=float(scores["miou"]),
-            twin_share_error=self.distance / self.cells if self.cells else missing,
-            twin_share_ece=calibration_error(self.curve.compute().cpu()) if self.cells else missing,
+        return LookAlikeQuality(
+            look_alike_accuracy=float(scores["accuracy"]),
+            look_alike_miou=float(scores["miou"]),
+            look_alike_share_error=self.distance / self.cells if self.cells else missing,
+            look_alike_share_ece=calibration_error(self.curve.compute().cpu()) if self.cells else missing,
         )
