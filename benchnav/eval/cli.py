@@ -236,10 +236,11 @@ def _print(report: "Report", folder: Path) -> None:
 
 
 def _print_recorded(folder: Path) -> None:
-    files = list((folder / "playback").glob("*.rrd"))
-    if files:
+    files = [path for path in (folder / "playback").glob("*") if path.suffix in (".npz", ".rrd")]
+    episodes = sum(path.suffix == ".npz" for path in files)
+    if episodes:
         size = sum(path.stat().st_size for path in files) / 1e6
-        print(f"recorded: {len(files)} files in {folder / 'playback'}, {size:.1f} MB")
+        print(f"recorded: {episodes} episode{'s' * (episodes > 1)} in {folder / 'playback'}, {size:.1f} MB")
 
 
 def _print_replay(folder: Path) -> None:

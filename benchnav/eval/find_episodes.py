@@ -9,6 +9,7 @@ from benchnav.eval.condition import NOT_USED, Condition
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.keep import Keep
 from benchnav.eval.unit import Extent, Unit, units
+from benchnav.options import hint
 
 _COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
 
@@ -33,12 +34,19 @@ def find_episodes(
         ConfigError: the run has no such episode, or they are not on one map.
     """
     run = open_run(folder)
+    known = {
+        name: {condition.labels[name] for condition, _ in run.conditions.values()} - {NOT_USED}
+        for name in labels
+    }
     found: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         asked = dict(zip(labels, values, strict=True))
         unit = _find(run.conditions, asked, seed, realisation, map_index)
-        if unit is None:
-            raise ConfigError(_refusal(run.conditions, asked, seed, realisation, map_index))
+        # A blind planner has no risk setting and fits any, but not one that no planner of the run has.
+        strange = [name for name, label in asked.items() if known[name] and label not in known[name]]
+        if unit is None or strange:
+            near = "".join(hint(asked[name], known[name]) for name in strange[:1])
+            raise ConfigError(_refusal(run.conditions, asked, seed, realisation, map_index) + near)
         seed = unit.seed
         found.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))
     episodes = list(found.values())

@@ -156,6 +156,10 @@ def _read(given: Mapping[str, Any], place: int, conditions: Mapping[str, Conditi
             f"Expected `margin` of {where} where its kind is non-inferiority or equivalence, above 0"
             f"{f' in {unit}' if unit else ''}, got {margin:g} for {kind}. {remedy}."
         )
+    if METRICS[metric].unit == "points" and margin >= 100:
+        raise ConfigError(
+            f"Expected `margin` of {where} below 100 points, got {margin:g}, which says nothing."
+        )
     if kind == "equivalence" and direction:
         raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {direction!r}.")
     if kind == "non-inferiority":

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from benchnav.errors import ConfigError
 
 Record = Literal["none", "failures", "first", "all"]
+# What a unit was run for that was asked for failures and for the first episode.
+_BOTH = "failures and first"
 Steps = Literal["none", "recorded", "all"]
 
 
@@ -26,7 +28,7 @@ class Keep:
     def __post_init__(self) -> None:
         """Refuses what is no choice."""
         for name, choices in (("record", get_args(Record)), ("steps", get_args(Steps))):
-            if getattr(self, name) not in choices:
+            if getattr(self, name) not in (*choices, _BOTH):
                 raise ConfigError(
                     f"Expected `{name}` as {', '.join(choices[:-1])} or {choices[-1]}, got {getattr(self, name)!r}."
                 )
@@ -70,16 +72,16 @@ class Keep:
 def _chosen(rule: str, succeeded: Sequence[bool]) -> list[int]:
     """Which episodes of a unit a rule means; the unit is the first of its condition where it says `first`."""
     every = range(len(succeeded))
-    if rule == "failures":
-        return [member for member in every if not succeeded[member]]
+    if rule in ("failures", _BOTH):
+        return [member for member in every if not succeeded[member] or (rule == _BOTH and member == 0)]
     return list(every[: {"none": 0, "first": 1, "all": None}[rule]])
 
 
 def _joined(rule: Record, other: Record) -> Record:
     if _includes(rule, other):
         return rule
-    return other if _includes(other, rule) else "all"
+    return other if _includes(other, rule) else cast(Record, _BOTH)
 
 
 def _includes(rule: str, other: str) -> bool:
-    return rule == "all" or other in ("none", rule)
+    return rule == "all" or other in ("none", rule) or (rule == _BOTH and other in ("failures", "first"))

@@ -94,6 +94,11 @@ def test_a_blind_planner_stands_once_under_any_risk_setting(folder: Path) -> Non
     ]  # fmt: skip
 
 
+def test_a_label_that_no_condition_has_is_refused_also_for_a_blind_planner(folder: Path) -> None:
+    with pytest.raises(ConfigError, match=r"risk 'cvarr'.* Did you mean 'cvar'"):
+        found(folder, planner=["straight"], risk=["cvarr"])
+
+
 def test_other_maps_do_not_stand_together(folder: Path) -> None:
     with pytest.raises(ConfigError, match="conditions on one map"):
         found(folder, scenario=["std", "hs"])

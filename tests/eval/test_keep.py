@@ -60,6 +60,16 @@ def test_a_unit_that_kept_more_has_all_that_less_asks_for() -> None:
             assert joined == one or (joined.covers(one) and one.covers(joined))
 
 
+def test_failures_asked_for_after_the_first_add_the_failures_alone() -> None:
+    for one, other in (("failures", "first"), ("first", "failures")):
+        joined = Keep(record=one).joined(Keep(record=other))  # type: ignore[arg-type]
+        assert joined.recorded(ENDED) == [0, 1, 3]
+        assert list(joined.watched(4)) == [0, 1, 2, 3]
+        assert Keep(**joined.to_dict()) == joined  # type: ignore[arg-type]
+        assert Keep(record="all").covers(joined)
+        assert not joined.covers(Keep(record="all"))
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("record", "sometimes"), ("steps", "failures"), ("record", None)]
 )

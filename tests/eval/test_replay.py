@@ -115,7 +115,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     assert call("run", "--data", str(dataset_path), "--out", str(out), *SMALL, "--record", "failures") == 0
     printed = capsys.readouterr().out.splitlines()
     count = len(list((out / "playback").glob("*.rrd")))
-    assert any(line.startswith(f"recorded: {count} files in {out / 'playback'}, ") for line in printed)
+    assert any(line.startswith(f"recorded: {count} episodes in {out / 'playback'}, ") for line in printed)
     (line,) = [line for line in printed if line.startswith("replay:  ")]
     words = shlex.split(line.removeprefix("replay:  "))
     assert "straight" not in words

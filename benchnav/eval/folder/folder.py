@@ -10,6 +10,8 @@ of the run's tables, so that an edit of either is found.
 import hashlib
 import json
 import secrets
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,7 +40,7 @@ _METADATA = b"benchnav"
 # What reading a damaged file raises: of a condition's rules and world what refuses a suite, of a table its library's.
 _DAMAGE = (
     *(ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError, OSError),
-    *(ConfigError, pa.ArrowException),
+    *(ConfigError, pa.ArrowException, EOFError, zipfile.BadZipFile, zlib.error),
 )
 
 

@@ -52,6 +52,11 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
         finished: units of the run.
     """
     paths = [path for unit in finished if (path := folder / unit.steps_path).exists()]
+    with damaged(folder / STEPS, _REMEDY):
+        _align(paths)
+
+
+def _align(paths: Sequence[Path]) -> None:
     fields = {field.name: field for path in paths for field in pq.read_schema(path)}
     names = [name for name in fields if name != LAST_COLUMN] + [LAST_COLUMN]
     for path in paths:

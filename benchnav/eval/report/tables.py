@@ -133,7 +133,7 @@ def bold_note(summary: pd.DataFrame) -> str:
     by = "group" if is_grouped(summary) else "map"
     words.append(
         f"(max-T sign-flip test by {by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
-        "significantly worse none is bold"
+        "significantly worse none is marked"
     )
     left_out = [
         summary.loc[rows.index[~competing(rows)]]

@@ -184,7 +184,9 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
         if maps > 1:
             _, entry["best_low"], entry["best_high"] = map(float, success_interval(gain, draws))
             std = float(standard_deviation(gain, draws))
-            entry["best_shown"] = smallest_difference(std, maps, 2 * norm.sf(critical))
+            # Fewer maps cannot reach p < 0.05, be all of them won.
+            few = 2.0 ** (1 - maps) >= ALPHA
+            entry["best_shown"] = np.inf if few else smallest_difference(std, maps, 2 * norm.sf(critical))
         made[condition] = entry
     return made
 

@@ -22,8 +22,10 @@ def smallest_difference(std: float, maps: int, alpha: float, power: float = POWE
         power: chance to show it.
 
     Returns:
-        In the unit of `std`.
+        In the unit of `std`; infinite where no sign-flip test of so many maps can reach `alpha`, whatever they show.
     """
+    if 2.0 ** (1 - maps) >= alpha:
+        return math.inf
     return _quantiles(alpha, power) * std / math.sqrt(maps)
 
 

@@ -1,4 +1,4 @@
-"""SeriesOfShifts of shifts, which splits make by their names.
+"""Series of shifts, which splits make by their names.
 
 A split is one of a series where its name ends in the severity: in hundredths after a dash (`test/hg-050`),
 or as a number after an @ (`test/hg@0.5`). What stands before is the scenario; the split `std` of the same folder
@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 SeriesOfShifts = dict[str, list[tuple[float, str]]]
 
-_RUNG = re.compile(r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))")
+_NAMED = re.compile(r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))")
 
 
 def find_series(splits: Iterable[str]) -> SeriesOfShifts:
@@ -27,7 +27,7 @@ def find_series(splits: Iterable[str]) -> SeriesOfShifts:
     splits = list(splits)
     all_series: SeriesOfShifts = {}
     for split in splits:
-        if named := _RUNG.fullmatch(split):
+        if named := _NAMED.fullmatch(split):
             hundredths = named["hundredths"]
             severity = int(hundredths) / 100 if hundredths else float(named["severity"])
             all_series.setdefault(named["scenario"], []).append((severity, split))

@@ -13,7 +13,7 @@ import torch
 
 from benchnav.errors import ConfigError
 from benchnav.eval.condition import conditions_of
-from benchnav.eval.folder.folder import EPISODES, read_table
+from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.folder.steps import align_steps, read_steps
 from benchnav.eval.keep import Keep
 from benchnav.eval.report.failures import failures_table
@@ -143,6 +143,14 @@ def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> No
     }
     align_steps(folder, units(conditions, Keep()))
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_a_file_that_was_cut_short_is_named_when_the_run_is_finished(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "run"))
+    path = next(copy.glob("steps/*/*"))
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(ConfigError, match="steps is damaged"):
+        align_steps(copy, units(open_run(copy).conditions, Keep()))
 
 
 def test_an_episode_that_ended_at_once_has_its_one_state() -> None:

@@ -109,7 +109,7 @@ def test_bold_is_what_is_not_worse_than_the_best_where_another_is() -> None:
     assert table.bold == {(1, rate), (2, rate)}
     assert table.bold_note == (
         "not significantly worse than the highest success rate of its block (max-T sign-flip test by map over the "
-        "block, step by step, p ≥ 0.05); in blocks where nothing is significantly worse none is bold; privileged "
+        "block, step by step, p ≥ 0.05); in blocks where nothing is significantly worse none is marked; privileged "
         "models (oracle) do not compete."
     )
     alike = table_of(rows[rows["risk"].isin(["var", "cvar"]) & (rows["model"] != "oracle")])

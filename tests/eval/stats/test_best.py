@@ -179,16 +179,14 @@ def test_the_detectable_difference_is_at_the_level_of_the_first_step() -> None:
         (["a", "b"], ["a", "b"]),
     ],
 )
-def test_what_is_privileged_models_competes_only_where_nothing_else_does(
-    models: list[str], left: list[str]
-) -> None:
+def test_a_privileged_model_competes_only_where_nothing_else_does(models: list[str], left: list[str]) -> None:
     rows = pd.DataFrame(
         {"model": models, "privileged": [model if model in PRIVILEGED else "" for model in models]}
     )
     assert list(rows["model"][competing(rows)]) == left
 
 
-def test_a_privileged_is_known_by_its_part_and_not_by_its_name() -> None:
+def test_a_privileged_model_is_known_by_its_part_and_not_by_its_name() -> None:
     def about(part: str, label: str) -> dict[str, object]:
         return {"value": {"model": {"part": part, "options": {}}}, "labels": {"model": label}}
 
@@ -200,7 +198,7 @@ def test_a_privileged_is_known_by_its_part_and_not_by_its_name() -> None:
     assert privileged_models(conditions) == {"a": "oracle"}
 
 
-def test_privileged_are_not_compared() -> None:
+def test_privileged_models_are_not_compared() -> None:
     found = compared(
         episodes(made.condition(risk="mine"), range(5)),
         episodes(made.condition(risk="privileged", model="oracle"), range(30)),
@@ -221,3 +219,12 @@ def test_conditions_without_a_map_in_common_and_with_one_map_are_not_distinguish
     single = compared([made.row(made.condition(risk="a"), 0)], [made.row(made.condition(risk="b"), 0, None)])
     assert single["best_alike"].all()
     assert single.loc["b", "best_difference"] == 1
+
+
+@pytest.mark.parametrize("maps", [2, 5, 6, 20])
+def test_fewer_than_six_maps_detect_nothing(maps: int) -> None:
+    found = compared(
+        [made.row(made.condition(risk="a"), i, 30.0) for i in range(maps)],
+        [made.row(made.condition(risk="b"), i, 30.0 if i else None) for i in range(maps)],
+    )
+    assert np.isinf(found.loc["b", "best_shown"]) == (maps < 6)

@@ -93,6 +93,7 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
         ({"margin": 1}, "Leave it out"),
         ({"kind": "equivalence"}, "above 0 in points, got 0 for equivalence. Give one"),
         ({"kind": "equivalence", "margin": -1}, "number ≥ 0, got -1"),
+        ({"kind": "equivalence", "margin": 100}, "below 100 points, got 100"),
         ({"kind": "equivalence", "margin": 1, "direction": "lower"}, "no `direction`"),
         ({"one": MEAN}, "two conditions that are the same in"),
         (

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 
@@ -32,3 +34,10 @@ def test_more_maps_are_needed_for_more_power_and_less_chance() -> None:
 
 def test_spread_is_never_nothing() -> None:
     assert standard_deviation(np.zeros(30, dtype=int), 3) > 0
+
+
+def test_where_no_result_would_be_significant_nothing_is_detected() -> None:
+    """Of M maps the least p of a sign-flip test is 2 of 2^M."""
+    assert smallest_difference(0.1, 5, 0.05) == math.inf
+    assert smallest_difference(0.1, 6, 0.05) < 1
+    assert smallest_difference(0.1, 6, 0.05 / 3) == math.inf

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.errors import ConfigError
-from benchnav.eval.folder.folder import EPISODES, read_table
+from benchnav.eval.folder.folder import EPISODES, damaged, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.report.contenders import NAMING, condition_colours, contender_names
 from benchnav.eval.report.recorded.ground import IMMOBILISING
@@ -59,8 +59,13 @@ class DrivenGround:
 
     @classmethod
     def load(cls, path: Path) -> "DrivenGround":
-        """Reads what `save` wrote."""
-        with np.load(path, allow_pickle=False) as stored:
+        """Reads what `save` wrote.
+
+        Raises:
+            ConfigError: the file is damaged.
+        """
+        remedy = "Remove it; the run's command makes it again."
+        with damaged(path, remedy), np.load(path, allow_pickle=False) as stored:
             scalars = json.loads(str(stored["scalars"]))
             arrays = {name: stored[name] for name in _ARRAYS}
             return cls(**scalars, field=stored.get("field"), **arrays)

@@ -5,15 +5,13 @@ Letters in shapes: N steps, H×W cells, S state and A action dimensions.
 """
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchnav.errors import ConfigError
+from benchnav.eval.folder.folder import damaged
 from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, join_plans, split_plans, thinned
 from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S, Snapshot
 from benchnav.files import replacing
@@ -24,8 +22,6 @@ _ARRAYS = (
     *("goal_m", "states", "actions", "traversability"),
 )
 _PLANS = "plans:"
-# What reading a damaged archive raises.
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,7 +135,7 @@ class Recording:
         Raises:
             ConfigError: the file is damaged.
         """
-        try:
+        with damaged(path, "Remove it and its .rrd; `replay` makes them again."):
             with np.load(path, allow_pickle=False) as stored:
                 scalars = json.loads(str(stored["scalars"]))
                 plans = {n.removeprefix(_PLANS): stored[n] for n in stored if n.startswith(_PLANS)}
@@ -158,8 +154,6 @@ class Recording:
                 plans=split_plans(plans),
                 **arrays,
             )
-        except _DAMAGE as error:
-            raise ConfigError(f"{path} is damaged: {error}. Remove it; `replay` makes it again.") from error
 
 
 def take_snapshot(recording: Recording, time_s: float | None = None) -> Snapshot:

@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 
+from benchnav.errors import ConfigError
 from benchnav.eval.report.charts.driven import (
     GROUND,
     MOST_PATHS,
@@ -199,3 +200,7 @@ def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
         assert (again.about, again.resolution_m) == (one.about, 0.5)
         assert (again.field is None) == (one.field is None)
         np.testing.assert_array_equal(again.immobilising, one.immobilising)
+    path = tmp_path / "a.npz"
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(ConfigError, match=r"a\.npz is damaged"):
+        DrivenGround.load(path)
