@@ -50,7 +50,7 @@ def compare_runs(
     """Compares the conditions of runs pair by pair.
 
     Args:
-        folders: finished runs, of format version 2 or later.
+        folders: finished runs.
         by: in what conditions differ; see `pairing.by_what`.
         against: what all others are compared with; all pairs when empty.
         asked: labels of the conditions that are looked at, several with a comma between; all when not named.

@@ -81,7 +81,7 @@ class Report:
         episodes: the rows behind the summary.
         failures: a row a failed episode.
         sheets: failures on their ground.
-        about: all of `run.json`, with what that of format version 2 has.
+        about: all of `run.json`.
     """
 
     header: tuple[str, ...]

@@ -155,7 +155,7 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
     """Summarises each condition, in the order in which conditions first appear.
 
     Args:
-        episodes: rows of episodes, format version 2 or later.
+        episodes: rows of episodes.
         worlds: by condition what λ did, as `run.json` holds it.
 
     Returns:
