@@ -24,8 +24,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import load_model, predict
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA

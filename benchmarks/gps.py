@@ -26,20 +26,20 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import latent_mean
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.quality.scores import coverage, crps, pit, tail_rate
 from benchnav.models.slope_gp.cells import Cells, read_cells
 from benchnav.models.slope_gp.sums import SlopeSums, sum_cells, sum_split
 from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.models.training.gps import fit_gps
-from benchnav.terrain import Terrain
 
 REPEATS = 5
 EXACT_CELLS, EXACT_STEPS, EXACT_TIMED = 2000, 50, 3

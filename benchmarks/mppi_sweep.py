@@ -16,19 +16,19 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
-from benchnav import registry, rng
-from benchnav.eval.condition import conditions_of
+from benchnav.core import registry, rng
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.episode import build, simulate
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Unit
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.planner import Planner, Step
 from benchnav.planning.problem import Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
-from benchnav.terrain import Observation
 
 OBJECTIVES, SCENARIOS, BUDGET_S = ("goal_distance", "travel_time"), ("std", "hg", "hs"), 100.0
 START_M = torch.tensor([[8.0, 8.0], [4.7, 16.0], [16.0, 27.3]])

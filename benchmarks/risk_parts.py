@@ -12,7 +12,7 @@ from engine import milliseconds
 from rich.console import Console
 from rich.table import Table
 
-from benchnav import cvar
+from benchnav.core import cvar
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.models.predictor import load_model, predict
 

@@ -13,7 +13,7 @@ from engine import milliseconds, problem_of
 from rich.console import Console
 from torch import Tensor
 
-from benchnav.grid import Grid
+from benchnav.core.grid import Grid
 from benchnav.planning.planners.mppi import MPPI, roll_out
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle

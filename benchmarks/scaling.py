@@ -15,15 +15,15 @@ from engine import milliseconds
 from rich.console import Console
 from rich.progress import track
 
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
 from benchnav.planning.planners.planner import Planner, Step
 from benchnav.planning.problem import Problem, Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.terrain import Observation
 
 SAMPLES = (2000, 5000, 10_000, 20_000, 50_000)
 HORIZONS_S = (1, 2, 5, 10, 20)

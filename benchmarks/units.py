@@ -20,11 +20,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from benchnav.eval.condition import conditions_of
-from benchnav.eval.keep import Keep
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent, units
 from benchnav.eval.run import runner
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Extent, units
 
 SCENARIOS, PLANNERS, SEEDS, MAPS = ("std", "hg", "hs"), ("straight", "astar_dwa"), 6, 200
 

@@ -9,6 +9,6 @@ __version__ = "0.7.0"
 
 gymnasium.register(
     id="benchnav/OffRoad-v0",
-    entry_point="benchnav.planning.env:OffRoadEnv",
-    vector_entry_point="benchnav.planning.env:OffRoadVectorEnv",
+    entry_point="benchnav.env.environment:OffRoadEnv",
+    vector_entry_point="benchnav.env.environment:OffRoadVectorEnv",
 )

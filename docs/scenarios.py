@@ -20,16 +20,16 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import generate
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import find_checkpoint
 from benchnav.models.quality.measure import pit
-from benchnav.terrain import Observation
 
 DOCS, MODEL = Path(__file__).parent, "paper-v1"
 RESAMPLES, PAIRED_MAPS, CHUNK_MAPS, EXAMPLE = 1000, 200, 20, 13

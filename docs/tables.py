@@ -26,7 +26,7 @@ from scipy.stats import fisher_exact, t, ttest_ind_from_stats
 from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.compare import read_conditions
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.folder import EPISODES, open_run
 from benchnav.eval.report.hypotheses import hypothesis_table
 from benchnav.eval.report.rendering import to_markdown

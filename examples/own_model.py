@@ -21,16 +21,16 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.registry import register
+from benchnav.core.terrain import Observation
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
-from benchnav.models.contract import check_model
 from benchnav.models.predictor import load_model
 from benchnav.models.quality.measure import evaluate
-from benchnav.registry import register
-from benchnav.terrain import Observation
+from benchnav.testing.model import check_model
 
 SEED, STEPS, BATCH, HIDDEN = 0, 400, 4096, 32
 

@@ -4,7 +4,7 @@
 
 It is found by its file; its constructor's parameters are its options, as in
 `{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. Its tests need one line,
-`check_planner("examples/own_planner.py:Fan")` of `benchnav.planning.planners.check.contract`.
+`check_planner("examples/own_planner.py:Fan")` of `benchnav.testing.planner`.
 """
 
 import torch

@@ -6,7 +6,7 @@ benchnav-eval run --planners '[straight,astar_dwa]' --risks '[mean,examples/own_
 
 import torch
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 
 
 def worst(mixture: TraversabilityMixture, share: float = 0.05) -> torch.Tensor:

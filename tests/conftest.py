@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchnav import drawing
+from benchnav.core import drawing
 from tests import factories
 
 torch.set_num_threads(1)

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import torch
 
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.create import create
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Robot, Unicycle
 from benchnav.planning.world.places import Places
-from benchnav.terrain import Observation, Terrain
 
 GRID = Grid(16, 16, 0.5)
 

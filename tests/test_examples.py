@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchnav.planning.planners.check.contract import check_planner
+from benchnav.testing.planner import check_planner
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

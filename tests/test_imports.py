@@ -1,4 +1,4 @@
-"""Imports go one way: root → datagen → planning and models → eval, and so do the drawers within them."""
+"""Imports go one way: core → datagen → planning and models → env → eval, and so do the drawers within them."""
 
 import ast
 from pathlib import Path
@@ -18,11 +18,12 @@ MODELS = tuple(
 )
 # Of reports, how an episode is recorded and the map that a figure shows is kept.
 RECORDED = ("eval.report.recorded", "eval.report.playback.files", "eval.report.charts.driven")
-VALUES_OF_EVAL = ("eval.suite", "eval.condition", "eval.unit", "eval.keep", "eval.hypotheses")
+VALUES_OF_EVAL = ("eval.experiment",)
 
 # What the modules of a drawer may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "": (),
+    "core": ("core",),
     "datagen": ("datagen",),
     "datagen/schema.py": (),
     "datagen/recipe": ("datagen.recipe", "datagen.schema"),
@@ -38,12 +39,13 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "planning": PLANNING,
     "planning/world": (*PLANNING, "planning.world"),
     "planning/planners": (*PLANNING, "planning.planners"),
-    "planning/env.py": (*PLANNING, "planning.world", "planning.env_batch"),
-    "planning/env_batch.py": (*PLANNING, "planning.world", "datagen.files.reader"),
+    "env": ("env", "models", "planning", "datagen"),
+    "testing": ("testing", "models", "planning", "datagen"),
     "eval": ("eval", "models", "planning", "datagen"),
+    "eval/experiment": ("eval.experiment", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/run": ("eval.run", "eval.folder", *RECORDED, *VALUES_OF_EVAL, "models", "planning", "datagen"),
-    "eval/stats": ("eval.stats", "eval.condition", "eval.hypotheses", "planning"),
+    "eval/stats": ("eval.stats", "eval.experiment", "planning"),
     "eval/report": (
         *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
         "planning",
@@ -68,13 +70,12 @@ def drawer(place: Path) -> str:
 def may_import(place: Path, name: str) -> bool:
     """Tells whether a module may import another, both of ours."""
     inner = name.removeprefix("benchnav").removeprefix(".")
-    first = inner.split(".")[0]
-    is_root = not (PACKAGE / first).is_dir()
+    is_core = inner.split(".")[0] == "core"
     if inner.split(".")[-1] == "cli" or ".cli." in f".{inner}.":
         return False
     return (
         not inner
-        or is_root
+        or (is_core and place != Path("__init__.py"))
         or any(f"{inner}.".startswith(f"{known}.") for known in MAY_IMPORT[drawer(place)])
     )
 
@@ -107,22 +108,22 @@ def test_imports_go_one_way(place: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "name", "allowed"),
     [
-        ("registry.py", "benchnav.errors", True),
-        ("registry.py", "benchnav.planning.robots", False),
+        ("core/registry.py", "benchnav.core.errors", True),
+        ("core/registry.py", "benchnav.planning.robots", False),
         ("datagen/files/reader.py", "benchnav.models.config", False),
         ("models/training/data.py", "benchnav.datagen.files.reader", True),
         ("models/fused.py", "benchnav.planning.risk", False),
         ("planning/problem.py", "benchnav.planning.objective", True),
         ("planning/problem.py", "benchnav.planning.planners.planner", False),
         ("planning/problem.py", "benchnav.datagen.files.reader", False),
-        ("planning/env_batch.py", "benchnav.datagen.files.reader", True),
-        ("planning/env_batch.py", "benchnav.datagen.synth.generate", False),
-        ("planning/env.py", "benchnav.planning.planners.mppi", False),
+        ("env/batch.py", "benchnav.datagen.files.reader", True),
+        ("env/batch.py", "benchnav.models.predictor", True),
+        ("env/batch.py", "benchnav.eval.run.rollout", False),
         ("planning/world/simulation.py", "benchnav.planning.problem", True),
         ("planning/world/simulation.py", "benchnav.planning.planners.planner", False),
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.planners.planner", True),
         ("planning/planners/cl_rrt/tree.py", "benchnav.planning.world.outcome", False),
-        ("planning/planners/mppi.py", "benchnav.eval.condition", False),
+        ("planning/planners/mppi.py", "benchnav.eval.experiment.condition", False),
         ("eval/run/rollout.py", "benchnav.planning.world.simulation", True),
         ("eval/run/rollout.py", "benchnav.eval.report.tables", False),
         ("eval/stats/summary.py", "benchnav.eval.run.rows", False),
@@ -159,7 +160,7 @@ def test_every_folder_is_a_drawer_or_lies_in_one() -> None:
 
 def test_values_of_planning_are_all_that_lies_beside_its_drawers() -> None:
     beside = {path.stem for path in (PACKAGE / "planning").glob("*.py")} - {"__init__"}
-    assert beside == {*VALUES, "env", "env_batch"}
+    assert beside == set(VALUES)
 
 
 def test_no_drawers_without_a_label() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from benchnav import shipped
+from benchnav.core import shipped
 
 ROOT = Path(__file__).parents[1]
 MOST_BYTES = 60e6

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav import gridgraph, registry, rng
+from benchnav.core import gridgraph, registry, rng
 from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import load_recipe
@@ -23,8 +23,8 @@ from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, end
 from benchnav.planning.world.world import World
 from tests import factories
+from tests.core.test_mixture import random_mixture
 from tests.factories import tiny_recipe
-from tests.test_mixture import random_mixture
 
 
 def same_after(call: Callable[[], object], *given: torch.Tensor | np.ndarray) -> None:

@@ -11,10 +11,10 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.cli import main as datagen
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import ConfigError
 from benchnav.eval.cli import main as evaluate
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.cli import main as train

@@ -16,9 +16,9 @@ from jsonargparse import ArgumentParser
 from benchmarks.cai.run import SETTINGS, run_trials
 from benchmarks.cai.tables import CAUTIOUS, NEUTRAL, tabulate_pairs, tabulate_success
 from benchmarks.cai.task import Setup
-from benchnav.command import show_progress
-from benchnav.errors import ConfigError
-from benchnav.files import replacing
+from benchnav.core.command import show_progress
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import replacing
 
 
 def make_parser() -> ArgumentParser:

@@ -9,8 +9,8 @@ import torch
 from benchmarks.cai.drive import ManyTrialsMPPI, drive
 from benchmarks.cai.task import Setup, pose
 from benchmarks.cai.world import draw_traction, draw_vegetation
-from benchnav import rng
-from benchnav.errors import ConfigError
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
 
 SETTINGS = ("mean", "cvar:0.4", "cvar:0.6", "cvar:0.8")
 

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from benchmarks.cai.ground import DIRT, SLICES, VEGETATION
 from benchmarks.cai.world import GRID
-from benchnav import registry
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.planning import risk
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import Objective, distance
 from benchnav.planning.planners.mppi import MPPIConfig
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Unicycle
-from benchnav.terrain import Observation
 
 START_M = (0.5, 0.5)
 GOAL_M = (8.5, 8.5)

@@ -10,8 +10,8 @@ vegetation is the same vegetation and more. Letters in shapes: M maps.
 import numpy as np
 
 from benchmarks.cai.ground import DIRT, VEGETATION
-from benchnav import rng
-from benchnav.grid import Grid
+from benchnav.core import rng
+from benchnav.core.grid import Grid
 
 GRID = Grid(9, 9, 1.0)
 BORDER_CELLS = 1

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from benchnav.command import INTERRUPTED, Command, run
+from benchnav.core.command import INTERRUPTED, Command, run
 from benchnav.datagen.dem.command import import_dem
 from benchnav.datagen.export.command import export
 
@@ -42,28 +42,27 @@ def create(
         seed: Root seed in place of the recipe's: a sibling, of id ID-seedN, with other maps of the same classes.
         splits: Only these splits, for example [test/std,test/hg]; the same maps as in the whole.
         first: Only the first so many maps of each split; the same maps as in the whole. 0 makes all.
-        shard: Make only this share of the maps, such as 2/5; the others may be made on other machines.
+        shard: Make only this shard of the maps, such as 2/5; the others may be made on other machines.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         overwrite: Replace what is there.
     """
     from rich.console import Console
 
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import output_path, read_shard
     from benchnav.datagen.difficulty import explain, table
     from benchnav.datagen.files.create import create as create_dataset
     from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.reader import TerrainDataset, is_dataset
     from benchnav.datagen.recipe.recipe import load_recipe
-    from benchnav.errors import ConfigError
-    from benchnav.files import output_path
-    from benchnav.share import read_share
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
     if (backend == "dask") != bool(scheduler):
         raise ConfigError("Expected `backend` dask and `scheduler` together, got one without the other.")
-    share = read_share(shard)
+    own = read_shard(shard)
     chosen = load_recipe(recipe, overrides)
     if seed is not None and seed != chosen.seed:
         chosen = replace(chosen, seed=seed, id=f"{chosen.id}-seed{seed}")
@@ -80,12 +79,12 @@ def create(
         kept = {name: replace(spec, maps=min(first, spec.maps)) for name, spec in chosen.splits.items()}
         chosen = replace(chosen, splits=kept)
     cells = sum(spec.maps for spec in chosen.splits.values()) * chosen.height * chosen.width
-    is_folder = share is not None or cells > _MOST_CELLS_OF_A_FILE
+    is_folder = own is not None or cells > _MOST_CELLS_OF_A_FILE
     path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
-    steps = create_dataset(chosen, path, jobs, scheduler, share, overwrite)
+    steps = create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     show_progress(_tell_kept(steps), "maps")
     if not is_dataset(path):
-        print(f"{path}: shard {share} is made")
+        print(f"{path}: shard {own} is made")
         print(
             f"when the others are: benchnav-datagen merge {path} OTHER … --out OUT, or, where they are made in the"
         )
@@ -105,9 +104,9 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
+    from benchnav.core.errors import DatasetError
     from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset, dataset_folders
     from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
-    from benchnav.errors import DatasetError
 
     print("recipes:")
     for name in shipped_recipes():
@@ -159,9 +158,9 @@ def validate(file: str) -> int:
     Args:
         file: Path or id of a dataset.
     """
+    from benchnav.core.errors import DatasetError
     from benchnav.datagen.files.check import find_faults, summarise
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.errors import DatasetError
 
     path = find_dataset(file)
     try:
@@ -200,11 +199,11 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
         id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
         overwrite: Replace what is there.
     """
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
+    from benchnav.core.store import output_path
     from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.merge import merge as merge_datasets
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.files import output_path
 
     path = output_path(out)
     sources = [Path(file) if Path(file).is_dir() else find_dataset(file) for file in files]
@@ -228,10 +227,10 @@ def preview(
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
         contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import output_path, replacing
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.datagen.preview import save_contact_sheet, save_preview
-    from benchnav.errors import ConfigError
-    from benchnav.files import output_path, replacing
 
     dataset = TerrainDataset(find_dataset(file))
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))

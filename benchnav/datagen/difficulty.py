@@ -11,11 +11,11 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from benchnav.core.grid import Grid
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import UNLABELLED, Maps
-from benchnav.grid import Grid
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADS = (

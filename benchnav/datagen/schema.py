@@ -141,30 +141,6 @@ def has_unlabelled(entry: Mapping[str, Any]) -> bool:
     return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
-def seal(manifest: Mapping[str, Any]) -> str:
-    """Writes a manifest as JSON text that holds its own SHA-256, under `manifest_digest`."""
-    return json.dumps({**manifest, "manifest_digest": _text_digest(manifest)}, indent=1)
-
-
-def unseal(text: str | bytes) -> dict[str, Any]:
-    """Reads a manifest's text.
-
-    Raises:
-        ValueError: it is no JSON object, or not what was written.
-    """
-    manifest = json.loads(text)
-    if not isinstance(manifest, dict):
-        raise ValueError("it is not a JSON object")
-    if manifest.pop("manifest_digest", None) != _text_digest(manifest):
-        raise ValueError("its text does not match its digest")
-    return manifest
-
-
-def _text_digest(manifest: Mapping[str, Any]) -> str:
-    text = json.dumps(manifest, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def field_table(height: int, width: int, fields: Mapping[str, Field]) -> dict[str, Any]:
     """Describes fields for the manifest."""
     return {

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from benchnav import registry
-from benchnav.errors import BenchnavError, ConfigError
-from benchnav.options import dataclass_in, list_options, plain
-from benchnav.registry import Option
+from benchnav.core import registry
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.options import dataclass_in, list_options, plain
+from benchnav.core.registry import Option
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from benchnav.command import INTERRUPTED, Command, Device, run, tell
+from benchnav.core.command import INTERRUPTED, Command, Device, run, tell
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.replay import other_folder, program, replay
-from benchnav.eval.suite import Suite
 
 if TYPE_CHECKING:
     from benchnav.eval.report.write import Report
@@ -43,13 +43,13 @@ def run_command(
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
     """
-    from benchnav.command import show_progress
-    from benchnav.errors import ConfigError
+    from benchnav.core.command import show_progress
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import read_shard
     from benchnav.eval.run.runner import run_suite
-    from benchnav.share import read_share
 
     workers = _workers(jobs, backend, scheduler)
-    share = read_share(shard)
+    share = read_shard(shard)
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = _own_folder(out)
@@ -73,7 +73,7 @@ def merge(out: str, parts: list[str]) -> int:
         out: Run folder to be made.
         parts: Folders of all the run's shards, in any order.
     """
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
     from benchnav.eval.run.merge import merge_shards
 
     folder = _own_folder(out)
@@ -99,7 +99,7 @@ def rerun(
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
     from benchnav.eval.run.rerun import compare
     from benchnav.eval.run.rerun import rerun as rerun_all
 
@@ -172,7 +172,7 @@ def compare(
         allow_different: code compares conditions that other code made too, and names in every table what differs.
         out: Path without a suffix; .csv, .md and .tex are written there.
     """
-    from benchnav.errors import ConfigError
+    from benchnav.core.errors import ConfigError
     from benchnav.eval.compare import compare_runs, print_comparison, write_comparison
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
@@ -191,7 +191,7 @@ def compare(
 
 def _own_folder(path: str) -> Path:
     """A run folder by its path; one that has no name of its own, as `/`, is none."""
-    from benchnav.errors import ConfigError
+    from benchnav.core.errors import ConfigError
 
     if not Path(path).resolve().name:
         raise ConfigError(f"Expected the path of a run folder, got {path}.")
@@ -199,7 +199,7 @@ def _own_folder(path: str) -> Path:
 
 
 def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
-    from benchnav.errors import ConfigError
+    from benchnav.core.errors import ConfigError
     from benchnav.eval.run.runner import Workers
 
     if jobs < 1:
@@ -246,7 +246,7 @@ def _print_recorded(folder: Path) -> None:
 def _print_replay(folder: Path) -> None:
     import yaml
 
-    from benchnav.eval.condition import NOT_USED
+    from benchnav.eval.experiment.condition import NOT_USED
     from benchnav.eval.folder.folder import open_run
 
     every = [condition.labels for condition, _ in open_run(folder).conditions.values()]

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchnav import registry
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import LABELS, NOT_USED
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import write_text
+from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
 from benchnav.eval.folder.provenance import code_differences, code_of
 from benchnav.eval.folder.sameness import differences
@@ -31,7 +32,6 @@ from benchnav.eval.stats.pairing import (
     find_pairs,
 )
 from benchnav.eval.stats.summary import time_budgets
-from benchnav.files import write_text
 
 _CAPTION = (
     "Differences of success and of time between conditions that met the same maps with the same draws of λ."

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.core.errors import BenchnavError
+from benchnav.core.sources import digest_of
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.errors import BenchnavError
-from benchnav.eval.condition import Condition
+from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import Run, open_run
 from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.failure_choice import GroundOf
 from benchnav.eval.run.episode import build, one_thread
-from benchnav.eval.unit import Unit
-from benchnav.sources import digest_of
 
 
 def ground_of_run(folder: Path) -> GroundOf:

@@ -4,12 +4,12 @@ import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import NOT_USED, Condition
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import hint
+from benchnav.eval.experiment.condition import NOT_USED, Condition
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.folder.folder import open_run
-from benchnav.eval.keep import Keep
-from benchnav.eval.unit import Extent, Unit, units
-from benchnav.options import hint
 
 _COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
 

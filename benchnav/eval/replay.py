@@ -10,11 +10,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from benchnav.eval.experiment.unit import Unit
     from benchnav.eval.report.recorded.recording import Recording
-    from benchnav.eval.unit import Unit
 
 VIDEO = ".mp4"
 
@@ -74,7 +74,7 @@ def replay(
     run, place = Path(folder), other_folder(folder, out)
     found = find_episodes(run, asked, seed, realisation, map)
     if video:
-        from benchnav.command import show_progress
+        from benchnav.core.command import show_progress
         from benchnav.eval.report.playback.video import write_video
 
         show_progress(write_video(_recordings(run, found, place), Path(video)), "frames")

@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 import benchnav
-from benchnav.datagen.schema import seal, unseal
-from benchnav.errors import CheckpointError
+from benchnav.core.errors import CheckpointError
+from benchnav.core.store import seal, unseal
 
 FORMAT = "benchnav-checkpoint"
 FORMAT_VERSION = (2, 2)

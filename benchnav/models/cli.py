@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from benchnav.command import INTERRUPTED, Command, Device, run
+from benchnav.core.command import INTERRUPTED, Command, Device, run
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig, check_seed
 from benchnav.models.quality.command import evaluate
 
@@ -78,7 +78,7 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
-    from benchnav.files import output_path
+    from benchnav.core.store import output_path
     from benchnav.models.slope_gp.slip_logs import ENDINGS
     from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
@@ -179,8 +179,8 @@ def train_mdn(
 
 
 def _open_dataset(data: str) -> "TerrainDataset":
+    from benchnav.core.errors import DatasetError
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.errors import DatasetError
 
     dataset = TerrainDataset(find_dataset(data))
     if not {"train", "valid"} <= set(dataset.splits):
@@ -201,7 +201,7 @@ def _options(
     in_memory: bool,
 ) -> "tuple[Config, FitOptions]":
     """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
-    from benchnav.files import output_path
+    from benchnav.core.store import output_path
     from benchnav.models.checkpoint import training_folder
     from benchnav.models.training.fit import FitOptions
 
@@ -216,7 +216,7 @@ def _options(
 
 
 def _members(count: int, seed: int) -> list[str]:
-    from benchnav.errors import ConfigError
+    from benchnav.core.errors import ConfigError
     from benchnav.models.checkpoint import member_name
 
     if count < 1:

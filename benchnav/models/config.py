@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-from benchnav.errors import ConfigError
-from benchnav.options import list_options, refuse_unknown, typed
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import list_options, refuse_unknown, typed
 
 DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
 

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from benchnav.errors import BenchnavError, CheckpointError, ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.models.checkpoint import GP, Checkpoint, member_names
 from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_gp.table import SlopeTable
-from benchnav.terrain import Observation
 
 CHUNK_CELLS = 2**17
 

@@ -1,7 +1,7 @@
 """What a model is, and how it is found by name or by checkpoint.
 
 A model sees an `Observation` and gives a `TraversabilityMixture`; `oracle`, `ideal` and `clairvoyant`
-alone are given the Terrain. Models are parts of the registry (`benchnav.registry`, kind `model`): what
+alone are given the Terrain. Models are parts of the registry (`benchnav.core.registry`, kind `model`): what
 stands at a name is either called with its options and makes a model, or is a family, with
 `from_checkpoint`, for checkpoints that bear its name. The package's own models are in the same registry.
 Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes, K components.
@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from benchnav import registry
-from benchnav.device import exact_convolutions
-from benchnav.errors import CheckpointError, ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core import registry
+from benchnav.core.device import exact_convolutions
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.shipped import shipped_folder
+from benchnav.core.terrain import Observation, Terrain
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     CONFIG,
@@ -28,8 +30,6 @@ from benchnav.models.checkpoint import (
     read_config,
     refuse_unfinished,
 )
-from benchnav.shipped import shipped_folder
-from benchnav.terrain import Observation, Terrain
 
 if TYPE_CHECKING:
     from benchnav.datagen.files.reader import TerrainDataset
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 class Model(Protocol):
-    """The contract of a traversability model, which `benchnav.models.contract.check_model` tries."""
+    """The contract of a traversability model, which `benchnav.testing.model.check_model` tries."""
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """Predicts the distribution of traversability in every cell.

@@ -6,7 +6,7 @@ Letters in shapes: B maps, H×W cells, C classes, K components.
 import torch
 from torch import Tensor
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 
 
 def class_probabilities(mixture: TraversabilityMixture, class_count: int) -> Tensor:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
 
 # Of a step, and of a metre, on ground that is not free; the paper's penalty a step. Higher than what any
 # way over free ground costs.

@@ -16,7 +16,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.robots import Robot
 
 # Cost of a metre of path from λ̂ and grade, see `Objective`.

@@ -3,8 +3,8 @@
 A measure is a function of a `TraversabilityMixture` with parameters of shape [B, K, H, W] that gives λ̂ in
 [0, 1] of shape [B, H, W]; its further keyword parameters are its options. A setting is written
 `name` or `name:level`: `cvar:0.9`, `var:0.95`, `expected-time:0.05`, `mean`. Risk means the lower tail of λ;
-a higher level of CVaR or VaR is more cautious. The integrals are the mixture's own (`benchnav.mixture`), the names are
-given in `pyproject.toml`, and `benchnav.registry` reads what is written.
+a higher level of CVaR or VaR is more cautious. The integrals are the mixture's own, the names are given in
+`pyproject.toml`, and the registry reads what is written.
 Source: paper II and III-B; `expected_time` and `chance` go beyond it.
 """
 
@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 
 RiskMeasure = Callable[[TraversabilityMixture], Tensor]
 

@@ -17,7 +17,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 
 # How planners know what an action is.
 SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"

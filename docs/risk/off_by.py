@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.models.predictor import load_model
-from benchnav.terrain import Observation
 
 
 class OffBy:

@@ -8,14 +8,13 @@ import h5py
 import numpy as np
 import pytest
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen import cli
 from benchnav.datagen.files import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.shard import Shard
+from benchnav.datagen.files.shard import ShardFile
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
-from benchnav.errors import ConfigError
-from benchnav.share import Share
 from tests.factories import tiny_dataset
 
 Call = Callable[..., int]
@@ -143,7 +142,7 @@ def test_options_of_create_reach_it(datagen: Call, monkeypatch: pytest.MonkeyPat
         assert datagen(*plain, *options) == 2
     none = (1, "", None, False)
     assert seen == [
-        none, (3, "", None, False), (1, "tcp://a:1", None, False), (1, "", Share(index=2, of=3), False),
+        none, (3, "", None, False), (1, "tcp://a:1", None, False), (1, "", ShardFile(index=2, of=3), False),
         (1, "", None, True),
     ]  # fmt: skip
 
@@ -481,7 +480,7 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
     asked = ("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "d.h5")
     make = create.make
 
-    def interrupted(recipe: Recipe, shard: Shard) -> bytes:
+    def interrupted(recipe: Recipe, shard: ShardFile) -> bytes:
         if shard.split.startswith("test"):
             raise KeyboardInterrupt
         return make(recipe, shard)

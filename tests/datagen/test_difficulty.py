@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from benchnav.core.grid import Grid
 from benchnav.datagen import difficulty
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.grid import Grid
 from tests.datagen.small import SOFT, small_stakes, terrain_class
 from tests.factories import tiny_dataset
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import (
     TITLES,
@@ -25,7 +26,6 @@ from benchnav.datagen.preview import (
     soft_ground,
 )
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
-from benchnav.errors import ConfigError, DatasetError
 from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchnav.core.device import CPU
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.device import CPU
-from benchnav.errors import ConfigError
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig

@@ -11,28 +11,28 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav import mixture
-from benchnav.cvar import Cells
-from benchnav.device import DeviceError, find_device, gpu_failed
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import conditions_of
+from benchnav.core import mixture
+from benchnav.core.cvar import Cells
+from benchnav.core.device import DeviceError, find_device, gpu_failed
+from benchnav.core.errors import ConfigError
+from benchnav.core.terrain import Terrain
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder.folder import open_run, write_run
-from benchnav.eval.keep import Keep
 from benchnav.eval.run import episode, recorder, runner
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite, run_unit
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Unit, units
 from benchnav.models.predictor import Oracle, predict
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
 from tests import factories
+from tests.core.test_mixture import random_mixture
 from tests.elsewhere.device import elsewhere, waits
-from tests.test_mixture import random_mixture
 
 SMALL = {"samples": 20, "horizon_s": 0.4}
 DWA = {"part": "astar_dwa", "options": {"dwa": {"speeds": 3, "turn_rates": 3, "horizon_s": 0.4}}}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle

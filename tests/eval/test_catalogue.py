@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.eval import catalogue
 from benchnav.eval.catalogue import Entry, list_entries, make_table, plain_lines, print_catalogue
 

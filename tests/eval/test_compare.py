@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.eval import cli
 from benchnav.eval.compare import compare_runs
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.rendering import latex
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, find_pairs

@@ -8,12 +8,12 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from benchnav.errors import BenchnavError
+from benchnav.core.errors import BenchnavError
 from benchnav.eval.compare import compare_runs
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.report.write import read_report
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
 from tests.edits import edit_json, edit_table
 
 

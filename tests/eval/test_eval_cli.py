@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 import yaml
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard
 from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.run.runner import run_suite
-from benchnav.share import Share
 
 SMALL = (
     "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--maps", "1",
@@ -94,7 +94,7 @@ def test_a_world_is_given_by_name_as_several_or_with_its_fields(
     [
         ((), {}),
         (("--jobs", "3", "--overwrite"), {"jobs": 3, "overwrite": True}),
-        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Share(index=2, of=4)}),
+        (("--planner_limit_s", "2.5", "--shard", "2/4"), {"planner_limit_s": 2.5, "shard": Shard(index=2, of=4)}),
         (("--backend", "dask", "--scheduler", "tcp://a:1"), {"scheduler": "tcp://a:1"}),
         (("--device", "cpu"), {"device": "cpu"}),
         (("--device", "cuda"), {"device": "cuda"}),

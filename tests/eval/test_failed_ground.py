@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchnav.errors import BenchnavError
+from benchnav.core.errors import BenchnavError
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.failed_ground import ground_of_run
 from benchnav.eval.folder.folder import open_run, read_table, write_run
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run.episode import build
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Unit
 
 BELOW = 0.6
 

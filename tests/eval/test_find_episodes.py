@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import conditions_of
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.folder import FORMAT, FORMAT_VERSION, write_run
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Extent
 
 DRAWS = ((4, 0, 60), (4, 1, 60), (9, 0, 2))
 

@@ -12,16 +12,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import ConfigError
 from benchnav.eval import cli
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table, write_run
 from benchnav.eval.run import episode
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import Workers, run_suite
-from benchnav.eval.suite import Suite
-from benchnav.share import Share
 from tests.eval.forged import forge_rows
 
 
@@ -79,7 +79,7 @@ def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
     list(run_suite(quick(dataset_path), Path(), overwrite=True))
     assert open_run(Path()).about["run_id"] != before
     assert not Path("report.html").exists()
-    list(run_suite(quick(dataset_path), tmp_path / "part", shard=Share(index=1, of=1)))
+    list(run_suite(quick(dataset_path), tmp_path / "part", shard=Shard(index=1, of=1)))
     (tmp_path / "all").mkdir()
     monkeypatch.chdir(tmp_path / "all")
     list(merge_shards([tmp_path / "part"], Path()))
@@ -104,7 +104,7 @@ def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
 
 
 def test_merged_copies_of_one_shard_certify_nothing(dataset_path: Path, tmp_path: Path) -> None:
-    list(run_suite(quick(dataset_path), tmp_path / "part", shard=Share(index=1, of=1)))
+    list(run_suite(quick(dataset_path), tmp_path / "part", shard=Shard(index=1, of=1)))
     for name in ("one", "two"):
         list(merge_shards([tmp_path / "part"], tmp_path / name))
     with pytest.raises(ConfigError, match="copies"):

@@ -9,12 +9,12 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import find_checkpoint, load_model, predict
 from benchnav.models.quality.measure import evaluate
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from scipy.stats import t
 
-from benchnav.eval.condition import conditions_of
-from benchnav.eval.hypotheses import fix_hypotheses
-from benchnav.eval.suite import Suite
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.hypotheses import fix_hypotheses
+from benchnav.eval.experiment.suite import Suite
 from tests.eval.report.made import condition, row, rows
 from tests.eval.test_compare import run_folder
 

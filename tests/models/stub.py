@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
-from benchnav.terrain import Observation
 
 
 def true_table(classes: tuple[TerrainClass, ...], latent_std: float = 0.03) -> SlopeTable:

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import torch
 
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.slope_gp.cells import Cells
 from benchnav.models.slope_gp.sums import SlopeSums
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
-from benchnav.terrain import Terrain
 
 NAMES = ("a", "b", "c")
 

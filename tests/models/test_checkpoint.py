@@ -10,21 +10,21 @@ from typing import Any
 import pytest
 import torch
 
+from benchnav.core.errors import BenchnavError, CheckpointError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.store import seal, unseal
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.datagen.schema import seal, unseal
-from benchnav.errors import BenchnavError, CheckpointError
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models import checkpoint as module
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.contract import check_model
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import find_checkpoint, load_model, predict
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
-from benchnav.terrain import Terrain
+from benchnav.testing.model import check_model
 from tests.models.stub import true_table
 from tests.models.support import make_terrain
 

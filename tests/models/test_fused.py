@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.models import fused
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import EnsembleModel

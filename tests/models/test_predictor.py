@@ -10,10 +10,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from benchnav import registry
+from benchnav.core import registry
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import CheckpointError, ConfigError
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models import fused
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
 from benchnav.models.config import MDNConfig
@@ -27,7 +28,6 @@ from benchnav.models.predictor import (
     open_checkpoint,
     predict,
 )
-from benchnav.terrain import Observation, Terrain
 from tests.models.support import NAMES, linear_table, make_terrain
 
 
@@ -131,7 +131,7 @@ def test_a_prediction_that_does_not_fit_the_maps_is_refused() -> None:
 
 MINE = """
 import torch
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 
 
 class Constant:

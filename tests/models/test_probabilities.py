@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.probabilities import class_probabilities, sharpen
 
 

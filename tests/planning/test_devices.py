@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 
-from benchnav import registry
-from benchnav.planning.planners.check.boundary import act, begin
+from benchnav.core import registry
+from benchnav.core.terrain import Terrain
+from benchnav.planning.planners.boundary import act, begin
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, pose_problem
@@ -28,7 +29,6 @@ from benchnav.planning.world import world as world_module
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, end
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
 from tests import factories
 
 BATCH, SAMPLES = 3, 5

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PENALTY, FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.dwa import DWAConfig, held_paths, score

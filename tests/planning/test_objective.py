@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, TravelTime, distance, path_cost_of, toward_waypoints
 from benchnav.planning.robots import Bicycle, Unicycle
 

@@ -5,12 +5,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.planning.problem import Problem, heading_to, pose_problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
-from benchnav.terrain import Observation
 from tests import factories
 
 BATCH, HEIGHT, WIDTH = 3, 12, 20

@@ -4,11 +4,11 @@ from functools import partial
 import pytest
 import torch
 
-from benchnav import registry
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning import risk
-from tests.test_mixture import random_mixture
+from tests.core.test_mixture import random_mixture
 
 
 def test_measures_by_name_are_those_of_the_mixture() -> None:

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle, action_limits
 
 SHIPPED = [registry.make("robot", name) for name in registry.names("robot")]

@@ -42,7 +42,8 @@ def import_dem(
         solvable: Keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: Replace what is there.
     """
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
+    from benchnav.core.store import output_path
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.survey import Rasters
     from benchnav.datagen.dem.tiling import read_shares
@@ -50,7 +51,6 @@ def import_dem(
     from benchnav.datagen.files.hdf5 import is_one_file
     from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.datagen.recipe.recipe import load_recipe
-    from benchnav.files import output_path
 
     path = output_path(out)
     rasters = Rasters(

@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 
+from benchnav.core.errors import DatasetError
+from benchnav.core.store import real_place, restore, sole_writer, take_place
 from benchnav.datagen.dem.raster import load_rasterio
 from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import check_place, join
-from benchnav.datagen.files.folder import Contents, restore, take_place, write_manifest
+from benchnav.datagen.files.folder import Contents, write_manifest
 from benchnav.datagen.files.hdf5 import is_one_file, named_errors, pack
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.shard import SHARD_CELLS, Shard, write
+from benchnav.datagen.files.shard import SHARD_CELLS, ShardFile, write
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
-from benchnav.errors import DatasetError
-from benchnav.files import real_place, sole_writer
 
 _CELLS_AT_ONCE = 2**20
 _CACHE_BYTES = 2**29  # of rasters that GDAL keeps; what it would choose grows with the machine
@@ -154,7 +154,7 @@ class _Part:
 
     def flush(self) -> None:
         """Writes a shard of what is pending."""
-        shard = Shard(split=self.name, first=self.written, stop=len(self.numbers))
+        shard = ShardFile(split=self.name, first=self.written, stop=len(self.numbers))
         if not shard.maps:
             return
         maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.errors import ConfigError, DatasetError
+from benchnav.core.errors import ConfigError, DatasetError
 
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured

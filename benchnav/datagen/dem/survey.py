@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen.dem.raster import Lattice, Layer, Raster, opened
 from benchnav.datagen.dem.tiling import Run, Tiling, cut
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
-from benchnav.errors import ConfigError, DatasetError
 
 _SLACK = 1e-3  # of a cell that an extent may fall short by
 _KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from benchnav.errors import ConfigError, DatasetError
+from benchnav.core.errors import ConfigError, DatasetError
 
 
 class Run(NamedTuple):

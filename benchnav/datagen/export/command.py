@@ -32,12 +32,12 @@ def export(
     """
     from rich.filesize import decimal
 
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import output_path
     from benchnav.datagen.export.croissant import AUTHORS, Publication, is_ours
     from benchnav.datagen.export.export import export as export_dataset
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.errors import ConfigError
-    from benchnav.files import output_path
 
     dataset = TerrainDataset(find_dataset(file))
     chosen = list(dataset.splits) if splits is None else [name for name in splits if name in dataset.splits]

@@ -13,10 +13,10 @@ from typing import Any
 
 import yaml
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.export.parquet import FOLDER, MAP
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict, shipped_recipes
-from benchnav.errors import ConfigError
 
 METADATA = "croissant.json"
 CARD = "README.md"

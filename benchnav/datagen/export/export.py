@@ -8,12 +8,12 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from benchnav.core.errors import DatasetError
+from benchnav.core.store import sole_writer
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
 from benchnav.datagen.files.hdf5 import named_errors
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import DatasetError
-from benchnav.files import sole_writer
 
 
 def export(

@@ -15,10 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import Maps
-from benchnav.errors import DatasetError
 
 MAP = "map"
 FOLDER = "data"

@@ -8,9 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import CHUNK_CELLS, READ_ERRORS, TerrainDataset, open_file
-from benchnav.errors import DatasetError
 
 
 @dataclass(frozen=True, order=True)

@@ -19,18 +19,17 @@ from typing import Any
 import joblib
 
 import benchnav
-from benchnav.cluster import connected, parallel, told_when_lost
-from benchnav.datagen.files.folder import Contents, restore, take_place, whole, write_manifest
+from benchnav.core.cluster import connected, parallel, told_when_lost
+from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.store import Shard, real_place, restore, sole_writer, take_place
+from benchnav.core.workers import end_with
+from benchnav.datagen.files.folder import Contents, whole, write_manifest
 from benchnav.datagen.files.hdf5 import check_target, is_one_file, named_errors, writing
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, is_dataset, open_file, read_manifest
-from benchnav.datagen.files.shard import SHARD_CELLS, Shard, cut, is_there, make, write
+from benchnav.datagen.files.shard import SHARD_CELLS, ShardFile, cut, is_there, make, write
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.errors import ConfigError, DatasetError
-from benchnav.files import real_place, sole_writer
-from benchnav.share import Share
-from benchnav.workers import end_with
 
-_Made = tuple[Shard, bytes]
+_Made = tuple[ShardFile, bytes]
 
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
 _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
@@ -41,7 +40,7 @@ def create(
     path: Path,
     jobs: int = 1,
     scheduler: str = "",
-    share: Share | None = None,
+    shard: Shard | None = None,
     overwrite: bool = False,
     shard_cells: int = SHARD_CELLS,
 ) -> Iterator[tuple[int, int]]:
@@ -54,7 +53,7 @@ def create(
         path: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         jobs: processes to make maps in.
         scheduler: address of a Dask cluster's scheduler, whose workers take their place; empty for none.
-        share: which of the shards are made here; None for all.
+        shard: which of the shards are made here; None for all.
         overwrite: replace what is there.
         shard_cells: cells of a shard; of a single file it changes nothing.
 
@@ -63,17 +62,15 @@ def create(
         ConfigError: the recipe cannot be met.
     """
     shards = cut(recipe, shard_cells)
-    own = [
-        shard for place, shard in enumerate(shards) if share is None or place % share.of == share.index - 1
-    ]
+    own = [file for place, file in enumerate(shards) if shard is None or place % shard.of == shard.index - 1]
     path = real_place(path)
     names = {shard.name for shard in shards}
     is_file = is_one_file(path)
-    if is_file and share is not None:
-        raise ConfigError(f"Expected `out` to be a folder, since a share is made, got {path}.")
-    with named_errors(path), _held(path, share):
+    if is_file and shard is not None:
+        raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
+    with named_errors(path), _held(path, shard):
         restore(path)
-        folder = _workplace(path, recipe, names, share, overwrite)
+        folder = _workplace(path, recipe, names, shard, overwrite)
         missing = _missing(recipe, folder, shards, own, may_replace=overwrite or folder != path)
         if folder == path and (path / FOLDER_MANIFEST).exists():
             if not missing:
@@ -85,12 +82,12 @@ def create(
         done = total - sum(shard.maps for shard in missing)
         yield done, total
         with _runner(recipe, jobs, scheduler if missing else "") as run, _left_nothing(folder, path):
-            for shard, content in run(missing):
-                write(folder / shard.name, content)
-                done += shard.maps
+            for file, content in run(missing):
+                write(folder / file.name, content)
+                done += file.maps
                 yield done, total
         if not _are_all_there(folder, recipe, shards, overwrite):
-            return  # the other shares are made elsewhere
+            return  # the other shards are made elsewhere
         files = {
             name: [folder / shard.name for shard in shards if shard.split == name] for name in recipe.splits
         }
@@ -121,19 +118,19 @@ def join(path: Path, contents: Contents) -> None:
 
 
 @contextmanager
-def _held(path: Path, share: Share | None) -> Iterator[None]:
-    """Holds the dataset for one process, or a share of it: several shares may be made at once."""
-    with sole_writer(path, str(path), shared=share is not None):
-        if share is None:
+def _held(path: Path, shard: Shard | None) -> Iterator[None]:
+    """Holds the dataset for one process, or a shard of it: several may be made at once."""
+    with sole_writer(path, str(path), shared=shard is not None):
+        if shard is None:
             yield
             return
-        name = f"{path.name}.{share.index}-of-{share.of}"
+        name = f"{path.name}.{shard.index}-of-{shard.of}"
         with sole_writer(path.with_name(name), str(path)):
             yield
 
 
 def _workplace(
-    path: Path, recipe: Recipe, names: Collection[str], share: Share | None, overwrite: bool
+    path: Path, recipe: Recipe, names: Collection[str], shard: Shard | None, overwrite: bool
 ) -> Path:
     """Where shards are made: where they are to be, or beside a file or a finished folder that they replace.
 
@@ -149,16 +146,16 @@ def _workplace(
     check_folder(path, names)
     if not overwrite or not (path / FOLDER_MANIFEST).exists():
         return path
-    if share is not None:
+    if shard is not None:
         raise DatasetError(
-            f"Expected no finished dataset to replace by a share, got {path}. Remove it first."
+            f"Expected no finished dataset to replace by a shard, got {path}. Remove it first."
         )
     return beside
 
 
 def _missing(
-    recipe: Recipe, folder: Path, shards: Sequence[Shard], own: Sequence[Shard], may_replace: bool
-) -> list[Shard]:
+    recipe: Recipe, folder: Path, shards: Sequence[ShardFile], own: Sequence[ShardFile], may_replace: bool
+) -> list[ShardFile]:
     """Which shards are to be made; those of another recipe, cut or version are removed where they may be.
 
     Raises:
@@ -174,17 +171,17 @@ def _missing(
             f"Expected `out` to be new or to hold shards of this recipe and version, but {foreign[0]} is another. "
             "Choose another `out`, or pass --overwrite."
         )
-    # Those of other shares are for these to replace.
+    # Those of other shards are for these to replace.
     mine = {shard.name for shard in own}
     dropped = [file for file in foreign if file.name in mine or file.name not in known]
-    # What is half-written of this share is of a killed run.
+    # What is half-written of this shard is of a killed run.
     half = [file for file in folder.glob(".*.partial") if any(f".{name}." in file.name for name in mine)]
     for file in (*dropped, *half):
         file.unlink(missing_ok=True)
     return [shard for shard in own if folder / shard.name not in there]
 
 
-def _are_all_there(folder: Path, recipe: Recipe, shards: Sequence[Shard], overwrite: bool) -> bool:
+def _are_all_there(folder: Path, recipe: Recipe, shards: Sequence[ShardFile], overwrite: bool) -> bool:
     """Tells whether every shard is there, of this recipe and version.
 
     Raises:
@@ -195,7 +192,7 @@ def _are_all_there(folder: Path, recipe: Recipe, shards: Sequence[Shard], overwr
     if foreign and not overwrite:
         raise DatasetError(
             f"Expected all shards of one recipe and version, but {folder / foreign[0]} is of another. "
-            "Make its share anew with --overwrite, by the recipe, settings and version of the others."
+            "Make its shard anew with --overwrite, by the recipe, settings and version of the others."
         )
     return not missing
 
@@ -268,7 +265,7 @@ def _is_ours(file: Path) -> bool:
 @contextmanager
 def _runner(
     recipe: Recipe, jobs: int, scheduler: str
-) -> Iterator[Callable[[Sequence[Shard]], Iterable[_Made]]]:
+) -> Iterator[Callable[[Sequence[ShardFile]], Iterable[_Made]]]:
     """Gives a function that makes shards, here, in processes of this machine or on a cluster, each as it is done."""
     if scheduler:
         with connected(scheduler) as client, told_when_lost(scheduler):
@@ -289,7 +286,7 @@ def _runner(
         executor.shutdown(cancel_futures=True)
 
 
-def _make(recipe: Recipe, shard: Shard) -> _Made:
+def _make(recipe: Recipe, shard: ShardFile) -> _Made:
     return shard, make(recipe, shard)
 
 

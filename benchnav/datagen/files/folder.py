@@ -1,17 +1,15 @@
 """Datasets of many shards: a folder of files, and a manifest that says which maps lie in which."""
 
-import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchnav.core.store import seal, write_text
 from benchnav.datagen import schema
 from benchnav.datagen.files.hdf5 import manifest_of
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.files import write_text
 
 FORMAT_VERSION = "1.2"  # at least
 
@@ -68,30 +66,4 @@ def write_manifest(folder: Path, contents: Contents) -> None:
         splits[name] = {**entry, "digest": digest.hexdigest()}
     manifest = manifest_of(contents.id, contents.recipes, splits, contents.fields)
     manifest |= {"format_version": max(manifest["format_version"], FORMAT_VERSION), "shards": shards}
-    write_text(folder / FOLDER_MANIFEST, schema.seal(manifest))
-
-
-def take_place(partial: Path, out: Path) -> None:
-    """Moves a whole folder to where it is to be, in the place of one that is there.
-
-    Args:
-        partial: the folder, beside `out`.
-        out: where it is to be.
-    """
-    dropped = _dropped(out)
-    shutil.rmtree(dropped, ignore_errors=True)
-    if out.exists():
-        out.rename(dropped)
-    partial.rename(out)
-    shutil.rmtree(dropped, ignore_errors=True)
-
-
-def restore(out: Path) -> None:
-    """Gives a folder its name back which a run had taken away, that was killed before it put a new one there."""
-    if _dropped(out).exists() and not out.exists():
-        with suppress(FileNotFoundError):  # another share of it was quicker
-            _dropped(out).rename(out)
-
-
-def _dropped(out: Path) -> Path:
-    return out.with_name(f".{out.name}.dropped")
+    write_text(folder / FOLDER_MANIFEST, seal(manifest))

@@ -15,10 +15,10 @@ import h5py
 import numpy as np
 
 import benchnav
+from benchnav.core.errors import DatasetError
+from benchnav.core.store import replacing, seal
 from benchnav.datagen import schema
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.errors import DatasetError
-from benchnav.files import replacing
 
 # Structures of HDF5 1.10 carry checksums of their own, so that damage to them is found as well.
 _LIBRARY = ("v110", "v110")
@@ -85,7 +85,7 @@ class Writer:
         splits = {
             name: {**entry, "digest": self._digests[name].hexdigest()} for name, entry in self._splits.items()
         }
-        text = schema.seal(manifest_of(self._id, self._recipes, splits, self._fields)).encode()
+        text = seal(manifest_of(self._id, self._recipes, splits, self._fields)).encode()
         self._file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
         self._file.flush()
 

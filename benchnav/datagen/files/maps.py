@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, find_dataset, open_file
-from benchnav.errors import DatasetError
 
 # Files that a process keeps open; far fewer than systems allow.
 _MOST_OPEN = 100

@@ -1,4 +1,4 @@
-"""Combines datasets: splits side by side, those of one name end to end; and the shares of one dataset.
+"""Combines datasets: splits side by side, those of one name end to end; and the shards of one dataset.
 
 What is merged is packed already: files are copied into a folder, or their chunks into one file.
 """
@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.store import real_place, restore, sole_writer, take_place
 from benchnav.datagen import schema
 from benchnav.datagen.files.create import check_place, join
-from benchnav.datagen.files.folder import Contents, restore, take_place, whole, write_manifest
+from benchnav.datagen.files.folder import Contents, whole, write_manifest
 from benchnav.datagen.files.hdf5 import is_one_file, named_errors
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
-from benchnav.errors import ConfigError, DatasetError
-from benchnav.files import real_place, sole_writer
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
@@ -34,24 +34,24 @@ _SHARED = (
 def merge(
     paths: Sequence[Path], out: Path, dataset_id: str = "", overwrite: bool = False
 ) -> Iterator[tuple[int, int]]:
-    """Writes the maps of several datasets, or of the shares of one, to one; yields (maps done, maps in all).
+    """Writes the maps of several datasets, or of the shards of one, to one; yields (maps done, maps in all).
 
     Args:
-        paths: two or more datasets, of which the first fixes the order of splits; or folders of shares.
+        paths: two or more datasets, of which the first fixes the order of splits; or folders of shards.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         dataset_id: id of the new dataset; the name of `out` when empty. Shares keep that of their recipe.
         overwrite: replace what is there.
 
     Raises:
-        DatasetError: the datasets are unlike, with every reason; one is damaged; shares are missing; or `out` exists.
+        DatasetError: the datasets are unlike, with every reason; one is damaged; shards are missing; or `out` exists.
     """
     out = real_place(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
-        raise DatasetError("Expected either datasets or shares of one dataset, got both.")
+        raise DatasetError("Expected either datasets or shards of one dataset, got both.")
     is_file = is_one_file(out)
     name = dataset_id or (out.stem if is_file else out.name)
-    contents = _of_datasets(finished, name) if finished else _of_shares(paths)
+    contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)
@@ -108,7 +108,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
     return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files, fields=datasets[0].fields)
 
 
-def _of_shares(folders: Sequence[Path]) -> Contents:
+def _of_shards(folders: Sequence[Path]) -> Contents:
     """Gathers the shards that lie in folders.
 
     Raises:
@@ -117,14 +117,14 @@ def _of_shares(folders: Sequence[Path]) -> Contents:
     shards = [TerrainDataset(path) for folder in folders for path in sorted(folder.glob("*.h5"))]
     if not shards:
         raise DatasetError(
-            f"Expected datasets or shares of one, got {', '.join(map(str, folders))} without any."
+            f"Expected datasets or shards of one, got {', '.join(map(str, folders))} without any."
         )
     first = shards[0].manifest
     for shard in shards:
         for name in ("recipes", "generator"):
             if shard.manifest[name] != first[name]:
                 raise DatasetError(
-                    f"Expected shares of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
+                    f"Expected shards of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
                 )
     recipe = recipe_from_dict(first["recipes"][0], f"in {shards[0].path}")
     files: dict[str, list[Path]] = {}
@@ -140,7 +140,7 @@ def _of_shares(folders: Sequence[Path]) -> Contents:
         if place != spec.maps:
             lacking.append(f"maps {place}–{spec.maps - 1} of {name}")
     if lacking:
-        raise DatasetError(f"Expected all shares of {recipe.id}, got none with {'; '.join(lacking)}.")
+        raise DatasetError(f"Expected all shards of {recipe.id}, got none with {'; '.join(lacking)}.")
     return whole(recipe, files)
 
 

@@ -16,15 +16,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import h5py
 import numpy as np
 
+from benchnav.core.errors import DatasetError
+from benchnav.core.grid import Grid
+from benchnav.core.shipped import shipped_folder
+from benchnav.core.store import unseal
 from benchnav.datagen import schema
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.schema import Maps
-from benchnav.errors import DatasetError
-from benchnav.grid import Grid
-from benchnav.shipped import shipped_folder
 
 if TYPE_CHECKING:
-    from benchnav.terrain import Terrain
+    from benchnav.core.terrain import Terrain
 
 # What HDF5 and h5py raise where a file is damaged, by where the damage lies.
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
@@ -319,7 +320,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         kind, version = manifest["format"], manifest["format_version"]
         major, minor = (int(part) for part in version.split("."))
         if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
-            manifest = schema.unseal(text)
+            manifest = unseal(text)
             schema.check(manifest)
             return manifest
     except (*READ_ERRORS, TypeError, AttributeError, IndexError) as error:

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 
 import benchnav
+from benchnav.core.errors import DatasetError
+from benchnav.core.store import replacing
 from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
-from benchnav.errors import DatasetError
-from benchnav.files import replacing
 
 SHARD_CELLS = 2**20
 
 
 @dataclass(frozen=True, order=True, kw_only=True)
-class Shard:
+class ShardFile:
     """Consecutive maps of a recipe's split.
 
     Args:
@@ -46,17 +46,17 @@ class Shard:
         return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
 
 
-def cut(recipe: Recipe, cells: int = SHARD_CELLS) -> list[Shard]:
+def cut(recipe: Recipe, cells: int = SHARD_CELLS) -> list[ShardFile]:
     """Cuts a recipe into shards of about so many cells, in the order of splits and maps."""
     size = max(1, cells // (recipe.height * recipe.width))
     return [
-        Shard(split=split, first=first, stop=min(first + size, spec.maps))
+        ShardFile(split=split, first=first, stop=min(first + size, spec.maps))
         for split, spec in recipe.splits.items()
         for first in range(0, spec.maps, size)
     ]
 
 
-def make(recipe: Recipe, shard: Shard) -> bytes:
+def make(recipe: Recipe, shard: ShardFile) -> bytes:
     """Makes a shard.
 
     Returns:
@@ -75,7 +75,7 @@ def write(path: Path, content: bytes) -> None:
         partial.write_bytes(content)
 
 
-def is_there(path: Path, recipe: Recipe, shard: Shard) -> bool:
+def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
     """Tells whether a file is this shard of this recipe, made by this version."""
     if not path.exists():
         return False
@@ -90,6 +90,6 @@ def is_there(path: Path, recipe: Recipe, shard: Shard) -> bool:
     return (manifest["recipes"], manifest["generator"]) == own and entry == _entry(recipe, shard)
 
 
-def _entry(recipe: Recipe, shard: Shard) -> dict[str, Any]:
+def _entry(recipe: Recipe, shard: ShardFile) -> dict[str, Any]:
     part = {"maps": shard.maps, "recipe": 0, "split": shard.split, "first": shard.first}
     return {"scenario": recipe.splits[shard.split].scenario, "maps": shard.maps, "parts": [part]}

@@ -5,12 +5,12 @@ from functools import partial
 import numpy as np
 import torch
 
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
-from benchnav.mixture import TraversabilityMixture
-from benchnav.terrain import Terrain
 
 
 def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:

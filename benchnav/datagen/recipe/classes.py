@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)

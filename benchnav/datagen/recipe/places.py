@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchnav import rng
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
 
 _STEPS_A_M = 1024
 _CANDIDATES = 256

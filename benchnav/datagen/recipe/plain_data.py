@@ -6,8 +6,8 @@ from copy import deepcopy
 from functools import cache
 from typing import Any
 
-from benchnav.errors import ConfigError
-from benchnav.options import hint, list_options
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import hint, list_options
 
 
 def parse(kind: type, data: Any) -> Any:

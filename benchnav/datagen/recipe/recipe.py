@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import yaml
 
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units
 from benchnav.datagen.recipe.places import PlacesRule
 from benchnav.datagen.recipe.plain_data import parse, plain
 from benchnav.datagen.recipe.rules import check_recipe
 from benchnav.datagen.recipe.scenario import PRESETS, RECIPES, Scenario, load_presets, resolve
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
 
 REFERENCE_M = 32.0  # side of the square that relief and crater counts of synthesis 2 are for
 

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchnav.copula import LONGEST_CORRELATION
+from benchnav.core.copula import LONGEST_CORRELATION
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.environments import never_shown
 from benchnav.datagen.recipe.places import check_places
 from benchnav.datagen.schema import FIELDS, UNLABELLED
-from benchnav.errors import ConfigError
 
 if TYPE_CHECKING:
     from benchnav.datagen.recipe.recipe import Recipe

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe.plain_data import parse, plain
-from benchnav.errors import ConfigError
 
 RECIPES = Path(__file__).parent
 PRESETS = RECIPES / "presets.yaml"

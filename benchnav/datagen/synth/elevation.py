@@ -8,7 +8,7 @@ Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) f
 
 import numpy as np
 
-from benchnav import rng
+from benchnav.core import rng
 
 
 def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: float) -> np.ndarray:

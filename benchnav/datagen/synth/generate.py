@@ -6,7 +6,8 @@ float64. Letters in shapes: B maps, H×W cells.
 
 import numpy as np
 
-from benchnav import copula, gridgraph, rng
+from benchnav.core import copula, gridgraph, rng
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
@@ -15,7 +16,6 @@ from benchnav.datagen.schema import FIELDS, Maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.noise import fractal_perlin
 from benchnav.datagen.synth.slope import framed, framed_gradient, inclination_deg
-from benchnav.errors import ConfigError
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchnav import rng
+from benchnav.core import rng
 
 
 def perlin(key: int, indices: np.ndarray, shape: tuple[int, int], period: float) -> np.ndarray:

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from benchnav import registry
-from benchnav.registry import NO_DEFAULT, Part
+from benchnav.core import registry
+from benchnav.core.registry import NO_DEFAULT, Part
 
 
 def changed_options(planner: Part) -> list[str]:

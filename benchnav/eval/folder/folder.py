@@ -22,13 +22,12 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import Condition, condition_from
-from benchnav.eval.keep import Keep
-from benchnav.eval.unit import Extent, Unit
-from benchnav.files import replacing, write_text
-from benchnav.options import one_line
-from benchnav.share import Share
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import one_line
+from benchnav.core.store import Shard, replacing, write_text
+from benchnav.eval.experiment.condition import Condition, condition_from
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.unit import Extent, Unit
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 4
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
@@ -62,7 +61,7 @@ class Run:
     folder: Path
     about: dict[str, Any]
     conditions: dict[str, tuple[Condition, Extent]]
-    shard: Share | None = None
+    shard: Shard | None = None
 
 
 def open_run(folder: Path) -> Run:
@@ -92,7 +91,7 @@ def open_run(folder: Path) -> Run:
         conditions = {
             i: (condition_from(entry), Extent.from_dict(entry)) for i, entry in about["conditions"].items()
         }
-        shard = Share(**about["shard"]) if "shard" in about else None
+        shard = Shard(**about["shard"]) if "shard" in about else None
     return Run(folder=folder, about=about, conditions=conditions, shard=shard)
 
 

@@ -17,13 +17,13 @@ from typing import Any
 import torch
 
 import benchnav
-from benchnav import registry
+from benchnav.core import registry
+from benchnav.core.sources import digest_of
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.condition import PART_KINDS, Condition
-from benchnav.eval.unit import Extent
+from benchnav.eval.experiment.condition import PART_KINDS, Condition
+from benchnav.eval.experiment.unit import Extent
 from benchnav.models.predictor import model_identity
 from benchnav.planning.planners.compilation import can_compile
-from benchnav.sources import digest_of
 
 PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
 

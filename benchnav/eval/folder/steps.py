@@ -16,10 +16,10 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import replacing
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.folder import DamageError, damaged, open_run
-from benchnav.eval.unit import Unit
-from benchnav.files import replacing
 
 STEPS = "steps"
 

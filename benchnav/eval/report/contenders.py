@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 
 # Distinct for the colour-blind too (Okabe and Ito, 2008), the ones that are seen best on a map first.
 _COLOURS = (

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from benchnav.errors import BenchnavError
-from benchnav.eval.condition import NOT_USED
+from benchnav.core.errors import BenchnavError
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.charts.failure_sheet import FailedGround, Shown, choose
 from benchnav.eval.report.charts.panels import blocks, several_models
 from benchnav.eval.report.failures import steps_of

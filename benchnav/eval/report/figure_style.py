@@ -6,9 +6,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchnav import drawing
-from benchnav.eval.condition import NOT_USED
-from benchnav.files import replacing
+from benchnav.core import drawing
+from benchnav.core.store import replacing
+from benchnav.eval.experiment.condition import NOT_USED
 
 # As on map sheets and previews; distinct for the colour-blind too.
 TRAVERSABILITY_COLOURS = "viridis"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.findings import Finding, p_in_words
 from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import ALPHA

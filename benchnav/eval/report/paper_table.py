@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.charts.panels import blocks
 from benchnav.eval.report.figure_style import display_name
 from benchnav.eval.report.rendering import latex, latex_label

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.condition import LABELS, NOT_USED
+from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS

@@ -13,6 +13,7 @@ import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
+from benchnav.core.store import write_text
 from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
 from benchnav.eval.report.charts.curves import curve_figure, sweep_name
 from benchnav.eval.report.charts.distributions import distribution_figure
@@ -43,7 +44,6 @@ from benchnav.eval.report.tables import (
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
-from benchnav.files import write_text
 
 PAGE = "report.html"
 

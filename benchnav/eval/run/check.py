@@ -6,22 +6,22 @@ from typing import Any
 
 import torch
 
-from benchnav import registry
+from benchnav.core import registry
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.options import one_line
+from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
-from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.condition import PART_KINDS, Condition, conditions_of
-from benchnav.eval.hypotheses import fix_hypotheses
+from benchnav.eval.experiment.condition import PART_KINDS, Condition, conditions_of
+from benchnav.eval.experiment.hypotheses import fix_hypotheses
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.run.check_world import check_budgets, check_draws, check_known_ground
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Extent
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.predictor import class_mismatch, find_checkpoint, predict
-from benchnav.options import one_line
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import pose_problem
-from benchnav.terrain import Grid, Observation
 
 _MEMBERS = {
     "planner": ("init", "plan"),

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.eval.condition import Condition
+from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import BLOCK_MAPS
 from benchnav.eval.run.episode import noise_key, read_maps
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import BLOCK_MAPS
 from benchnav.planning.world.frozen import check_correlation, draw_frozen
 from benchnav.planning.world.realisation import check_known
 

@@ -16,12 +16,12 @@ from typing import Any
 import joblib
 import torch
 
-from benchnav import cluster
-from benchnav.device import gpu_name
-from benchnav.errors import BenchnavError, ConfigError
+from benchnav.core import cluster
+from benchnav.core.device import gpu_name
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.store import replacing
+from benchnav.eval.experiment.unit import Extent, Unit
 from benchnav.eval.folder import provenance
-from benchnav.eval.unit import Extent, Unit
-from benchnav.files import replacing
 
 RunUnit = Callable[[Unit, Path, str, float, str], None]
 

@@ -14,22 +14,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.device import CPU, GPU_FAULTS, gpu_failed
-from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.condition import Condition
+from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
-from benchnav.eval.unit import Unit
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import Clairvoyant, predict
 from benchnav.planning import risk
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
-from benchnav.terrain import Terrain
 
 
 @dataclass(frozen=True, kw_only=True)

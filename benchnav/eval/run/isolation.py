@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 
-from benchnav.device import GPU_FAULTS, gpu_failed
-from benchnav.errors import BenchnavError
-from benchnav.eval.condition import Condition
+from benchnav.core.device import GPU_FAULTS, gpu_failed
+from benchnav.core.errors import BenchnavError
+from benchnav.eval.experiment.condition import Condition
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
 

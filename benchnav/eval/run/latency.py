@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchnav.eval.condition import Condition
+from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.unit import Extent, Unit
 from benchnav.eval.run.episode import build, one_thread, simulate
-from benchnav.eval.unit import Extent, Unit
 
 _MOST_STEPS = 100
 _MOST_S = 3.0

@@ -7,7 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard, replacing, sole_writer
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import (
     RUN,
@@ -21,11 +24,7 @@ from benchnav.eval.folder.folder import (
 )
 from benchnav.eval.folder.sameness import differences
 from benchnav.eval.folder.steps import align_steps
-from benchnav.eval.keep import Keep
 from benchnav.eval.run.driven_ground import keep_ground
-from benchnav.eval.unit import Unit, in_table_order, units
-from benchnav.files import replacing, sole_writer
-from benchnav.share import Share
 
 _NOT_OF_UNITS = ("units", "figures")
 
@@ -202,6 +201,6 @@ def _copy_rest(part: Path, folder: Path) -> None:
                 shutil.copyfile(path, partial)
 
 
-def _shard(run: Run) -> Share:
+def _shard(run: Run) -> Shard:
     assert run.shard is not None
     return run.shard

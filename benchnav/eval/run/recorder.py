@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchnav.device import device_of_run
-from benchnav.errors import BenchnavError, ConfigError
+from benchnav.core.device import device_of_run
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.terrain import Terrain
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.report.playback.files import playback_path, write_playback
 from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, drawing_interval, drawn_plan, thinned
@@ -17,12 +19,10 @@ from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S
 from benchnav.eval.run.episode import build, one_thread, read_block, simulate
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import path_length_m
-from benchnav.eval.unit import Unit
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
-from benchnav.terrain import Terrain
 
 
 class Recorder:

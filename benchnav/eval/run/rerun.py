@@ -12,20 +12,20 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav import registry
+from benchnav.core import registry
+from benchnav.core.device import device_of_run
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.store import sole_writer
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.device import device_of_run
-from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.condition import PART_KINDS, Condition
+from benchnav.eval.experiment.condition import PART_KINDS, Condition
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import EPISODES, RUN, Run, making, open_run, read_table
 from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
-from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_everywhere
 from benchnav.eval.run.check_world import Say
 from benchnav.eval.run.runner import Work, Workers, run_work
-from benchnav.eval.unit import units
-from benchnav.files import sole_writer
 
 _SHOWN = 5
 

@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.device import GPU_FAULTS, DeviceError, gpu_failed
-from benchnav.errors import BenchnavError
+from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
+from benchnav.core.errors import BenchnavError
+from benchnav.core.options import one_line
 from benchnav.eval.run.clock import Clock
-from benchnav.options import one_line
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.check.boundary import Answer, act, begin, standing_actions
+from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome, tell_standstill

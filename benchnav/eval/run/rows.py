@@ -12,9 +12,9 @@ import pandas as pd
 import pyarrow as pa
 from torch import Tensor
 
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.steps import LAST_COLUMN
 from benchnav.eval.run.rollout import Episodes
-from benchnav.eval.unit import Unit
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 

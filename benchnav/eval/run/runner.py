@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,9 +21,14 @@ import joblib
 import pandas as pd
 import torch
 
-from benchnav.device import find_device, gpu_name
-from benchnav.errors import BenchnavError, ConfigError
-from benchnav.eval.condition import Condition, check_labels
+from benchnav.core.device import find_device, gpu_name
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.store import Shard, sole_writer
+from benchnav.core.workers import end_with
+from benchnav.eval.experiment.condition import Condition, check_labels
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent, Unit, in_table_order, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.changes import changed_options
 from benchnav.eval.folder.folder import (
@@ -43,7 +48,6 @@ from benchnav.eval.folder.folder import (
     write_unit,
 )
 from benchnav.eval.folder.steps import align_steps, write_steps
-from benchnav.eval.keep import Keep
 from benchnav.eval.run.check import check_suite
 from benchnav.eval.run.check_world import Say
 from benchnav.eval.run.cluster import connected, run_on_cluster
@@ -60,13 +64,8 @@ from benchnav.eval.run.episode import (
 from benchnav.eval.run.latency import measure_latencies
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Extent, Unit, in_table_order, units
-from benchnav.files import sole_writer
 from benchnav.planning.planners.planner import what_it_follows
 from benchnav.planning.world.outcome import Outcome
-from benchnav.share import Share
-from benchnav.workers import end_with
 
 Conditions = dict[str, tuple[Condition, Extent]]
 
@@ -91,7 +90,7 @@ class Work:
     conditions: Conditions
     keep: Keep
     planner_limit_s: float = 0.0
-    shard: Share | None = None
+    shard: Shard | None = None
     device: str = "cpu"
     dropped: tuple[Mapping[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
@@ -123,7 +122,7 @@ def run_suite(
     overwrite: bool = False,
     planner_limit_s: float = 0.0,
     say: Say = lambda line: None,
-    shard: Share | None = None,
+    shard: Shard | None = None,
     scheduler: str = "",
     device: str = "cpu",
 ) -> Iterator[tuple[int, int]]:
@@ -368,7 +367,7 @@ def _or_its_device(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     return "" if device == now["device"] else f", pass --device {device}"
 
 
-def _share(shard: Share | None) -> str:
+def _share(shard: Shard | None) -> str:
     return "a whole run" if shard is None else f"shard {shard} of one"
 
 
@@ -408,7 +407,7 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "run_id": earlier["run_id"],
-        **({"shard": work.shard.to_dict()} if work.shard else {}),
+        **({"shard": asdict(work.shard)} if work.shard else {}),
         "suite": dict(work.suite),
         **({"hypotheses": fixed} if (fixed := earlier.get("hypotheses", work.hypotheses)) else {}),
         "conditions": entries,

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import sign_flips, standard_deviation, success_interval
 from benchnav.eval.stats.power import smallest_difference

@@ -15,7 +15,7 @@ import pandas as pd
 from scipy.optimize import brentq
 from statsmodels.stats.multitest import multipletests
 
-from benchnav.eval.hypotheses import METRICS, Hypothesis
+from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
 from benchnav.eval.stats.comparison import ALPHA, time_difference
 from benchnav.eval.stats.difference import (
     by_map,

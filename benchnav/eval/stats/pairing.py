@@ -7,9 +7,9 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav import registry
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import LABELS, NOT_USED
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.condition import LABELS, NOT_USED
 
 # By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
 _KEYS: Mapping[str, tuple[str, ...]] = {

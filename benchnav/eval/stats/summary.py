@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 
-from benchnav.eval.condition import LABELS
+from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.stats.difference import by_map, total_time_interval
 from benchnav.planning.world.outcome import FAILURES
 

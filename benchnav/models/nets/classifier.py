@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torchmetrics import MetricCollection
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig, rebuild
 from benchnav.models.nets.network import build_network
 from benchnav.models.nets.schedule import one_cycle

@@ -16,13 +16,13 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torchmetrics import MeanSquaredError
 
-from benchnav.errors import BenchnavError, CheckpointError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import BenchnavError, CheckpointError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
 from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.schedule import one_cycle
-from benchnav.terrain import Observation
 
 MDN = "mdn"
 LEAST_STD = 0.01

@@ -12,9 +12,9 @@ import timm
 import torch
 from torch import Tensor, nn
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import hint, one_line
 from benchnav.models.config import DEEPEST, ClassifierConfig
-from benchnav.options import hint, one_line
 
 _DETAIL_CHANNELS = 32
 _CONDITION_SIDE = 64

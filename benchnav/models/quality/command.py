@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchnav.command import Device
+from benchnav.core.command import Device
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,10 +48,10 @@ def evaluate(
     from rich.console import Console
 
     from benchnav import __version__
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import write_text
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.errors import ConfigError
-    from benchnav.files import write_text
     from benchnav.models.config import check_seed
 
     check_seed(seed)
@@ -62,7 +62,7 @@ def evaluate(
     for split in splits or ():
         dataset.map_count(split)  # refuses an unknown one before the slow imports
 
-    from benchnav.device import find_device
+    from benchnav.core.device import find_device
     from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.baseline import nearest_colour_accuracy
     from benchnav.models.quality.measure import choose_splits
@@ -127,8 +127,8 @@ def evaluate(
 
 def _check_targets(out: str, json: str, overwrite: bool) -> None:
     """Refuses what cannot be written to before any work is done."""
-    from benchnav.errors import ConfigError
-    from benchnav.files import output_path
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import output_path
 
     target, folder = output_path(json), output_path(out)
     if json and (not target.parent.is_dir() or target.is_dir()):
@@ -231,7 +231,7 @@ def _save_figures(
     folder: Path,
 ) -> list[str]:
     """Draws what applies; returns paths from the page's folder."""
-    from benchnav.command import show_progress
+    from benchnav.core.command import show_progress
     from benchnav.models.quality.figures import save_figure
 
     written: list[str] = []

@@ -18,10 +18,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.stats import binom
 
+from benchnav.core.drawing import PAGE_WIDTH_IN, TEXT, TITLE, save, thin_ticks
+from benchnav.core.store import replacing
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
-from benchnav.drawing import PAGE_WIDTH_IN, TEXT, TITLE, save, thin_ticks
-from benchnav.files import replacing
 from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes

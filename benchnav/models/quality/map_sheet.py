@@ -14,11 +14,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from benchnav.core.drawing import TEXT, add_axes, thin_ticks, write
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import LACKING, class_colours, class_shades
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.drawing import TEXT, add_axes, thin_ticks, write
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy

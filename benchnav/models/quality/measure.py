@@ -18,13 +18,14 @@ from torchmetrics.classification import (
     MulticlassJaccardIndex,
 )
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.device import CPU, exact_convolutions
+from benchnav.core.errors import CheckpointError, DatasetError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.device import CPU, exact_convolutions
-from benchnav.errors import CheckpointError, DatasetError
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import MeanIoU
 from benchnav.models.predictor import PRIVILEGED, AnyModel, ClassModel, EnsembleModel, predict
@@ -43,7 +44,6 @@ from benchnav.models.quality.scores import (
     tail_rate,
 )
 from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
-from benchnav.terrain import Terrain
 
 
 @dataclass(frozen=True, kw_only=True)

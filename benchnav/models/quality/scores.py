@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 
 LEVEL = 0.9
 CONFIDENCE_BINS = 15

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import ConfigError
 from benchnav.models.slope_gp.table import SlopeTable
 
 CHUNK_CELLS = 2**18

@@ -27,7 +27,7 @@ from gpytorch.variational import NaturalVariationalDistribution, UnwhitenedVaria
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.likelihood import expected_log_prob
 from benchnav.models.slope_gp.table import STEP_DEG, SlopeTable, SoftModes, table_slopes

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 
 import torch
 
+from benchnav.core.terrain import Terrain
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.slope_gp.table import SlopeTable
-from benchnav.terrain import Terrain
 
 
 def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = True) -> dict[str, float]:

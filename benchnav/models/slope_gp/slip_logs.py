@@ -18,7 +18,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from benchnav.errors import DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.models.slope_gp.cells import Cells, observed_cells
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")

@@ -14,8 +14,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import DatasetError
 from benchnav.models.slope_gp.cells import Cells, read_cells
 
 BIN_DEG = 0.25

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 
 STEP_DEG = 0.1
 STEEPEST_DEG = 90.0

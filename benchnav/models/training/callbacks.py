@@ -14,8 +14,8 @@ from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from torch import Tensor
 
-from benchnav.errors import ConfigError
-from benchnav.files import replacing, write_text
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import replacing, write_text
 
 
 class KeepBest(Callback):

@@ -16,11 +16,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 from torchvision.transforms.v2 import functional as photometry
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.device import CPU
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.device import CPU
-from benchnav.errors import ConfigError, DatasetError
 
 TRAIN, VALID = "train", "valid"
 

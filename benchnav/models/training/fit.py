@@ -27,15 +27,15 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor
 
+from benchnav.core.device import find_device
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.options import one_line
+from benchnav.core.store import sole_writer, write_text
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.device import find_device
-from benchnav.errors import CheckpointError, ConfigError
-from benchnav.files import sole_writer, write_text
 from benchnav.models.checkpoint import as_stored
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.training.callbacks import History, KeepBest, Progress, WholeFiles, measured
 from benchnav.models.training.data import TRAIN, VALID, MapData, MapDataset, check_maps
-from benchnav.options import one_line
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from benchnav.core.errors import CheckpointError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import CheckpointError
 from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import cell_nll, hold_out

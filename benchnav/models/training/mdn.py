@@ -4,8 +4,8 @@ from dataclasses import asdict
 
 import torch
 
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import Part
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MDN, MixtureDensityNetwork, censored_nll

@@ -15,7 +15,7 @@ from typing import Any
 
 from rich.filesize import decimal
 
-from benchnav.errors import CheckpointError
+from benchnav.core.errors import CheckpointError
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     CONFIG,

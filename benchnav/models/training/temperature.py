@@ -14,10 +14,10 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.device import CPU, exact_convolutions
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.device import CPU, exact_convolutions
-from benchnav.errors import DatasetError
 from benchnav.models.training.data import MapDataset
 
 _MOST_CELLS = 200_000

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav import rng
+from benchnav.core import rng
 
 _RUNS = 4  # length N of a part, in runs of K numbers
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Robot
 
@@ -84,7 +84,7 @@ State = TypeVar("State")
 
 
 class Planner(Protocol[State]):
-    """The contract of a planner, which `benchnav.planning.planners.check.contract.check_planner` tries.
+    """The contract of a planner, which `benchnav.testing.planner.check_planner` tries.
 
     It may also have these attributes:
 

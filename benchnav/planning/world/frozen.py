@@ -1,6 +1,6 @@
 """Frozen λ: drawn once an episode as a correlated field, each cell with its own distribution.
 
-A field of correlated standard normals goes through each cell's quantile function (`benchnav.copula`). Where
+A field of correlated standard normals goes through each cell's quantile function (`benchnav.core.copula`). Where
 ground can immobilise a robot, a field that cuts the start off from the goal is drawn again: what is asked
 is which way to take, and there has to be one. Letters in shapes: B episodes, H×W cells.
 """
@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav import rng
-from benchnav.copula import LONGEST_CORRELATION, correlated_normal
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
+from benchnav.core import rng
+from benchnav.core.copula import LONGEST_CORRELATION, correlated_normal
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.terrain import Terrain
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
 
 MOST_ATTEMPTS = 100
 

@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import label
 from torch import Tensor
 
-from benchnav.grid import Grid
+from benchnav.core.grid import Grid
 
 
 @dataclass(frozen=True, kw_only=True)

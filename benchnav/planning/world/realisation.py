@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav import rng
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.planning.world.frozen import draw_frozen
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
 
 
 class Realisation:

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.world.world import PRESETS, Immobile, World
 

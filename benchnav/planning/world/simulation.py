@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from benchnav.core.terrain import Terrain
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Task
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
-from benchnav.terrain import Terrain
 
 
 @dataclass(frozen=True)

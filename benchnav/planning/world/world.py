@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Rules
 
 NOISES = ("resampled", "stored", "frozen")

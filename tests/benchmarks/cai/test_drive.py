@@ -8,7 +8,7 @@ from torch import Tensor
 from benchmarks.cai.drive import drive, has_arrived, move, traction_at
 from benchmarks.cai.task import STEPS, Setup, pose
 from benchmarks.cai.world import GRID, draw_vegetation
-from benchnav import rng
+from benchnav.core import rng
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from benchmarks.cai import run
 from benchmarks.cai.run import run_trials
 from benchmarks.cai.task import Setup
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.planners.mppi import MPPIConfig
 from benchnav.planning.problem import Problem
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchnav.core.errors import BenchnavError
 from benchnav.datagen.dem.importer import import_dem
 from benchnav.datagen.dem.survey import Rasters
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import BenchnavError
 from tests.factories import tiny_recipe
 
 rasterio = pytest.importorskip("rasterio")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
+from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem import importer
 from benchnav.datagen.dem.importer import import_dem
 from benchnav.datagen.dem.raster import Layer
@@ -19,7 +20,6 @@ from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.places import PlacesRule
 from benchnav.datagen.schema import FIELDS
-from benchnav.errors import BenchnavError, ConfigError, DatasetError
 from tests.datagen.dem.rasters import (
     ANY,
     FLAT,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen.dem.tiling import Tiling, cut, read_shares
-from benchnav.errors import ConfigError, DatasetError
 
 SHARES = {"train": 0.7, "valid": 0.1, "test/site": 0.2}
 

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen import cli, schema
 from benchnav.datagen.export import parquet
 from benchnav.datagen.export.croissant import Publication, is_ours
@@ -23,7 +24,6 @@ from benchnav.datagen.export.export import export
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import ConfigError, DatasetError
 from tests import factories
 
 Call = Callable[..., int]

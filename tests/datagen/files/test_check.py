@@ -5,11 +5,11 @@ import h5py
 import numpy as np
 import pytest
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files.check import Fault, find_faults, summarise
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import DatasetError
 from tests.factories import tiny_dataset, tiny_recipe
 
 CELLS = 32 * 32

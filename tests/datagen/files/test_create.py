@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
+from benchnav.core.store import Shard
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.errors import BenchnavError, ConfigError, DatasetError
-from benchnav.share import Share
 from tests.factories import tiny_dataset, tiny_recipe
 
 ROOT = Path(__file__).parents[3]
@@ -208,7 +208,7 @@ def test_shares_of_a_folder_are_made_by_any_number_of_processes(tmp_path: Path) 
     path = tmp_path / "d"
     made = []
     for index in (2, 1, 3):
-        steps = list(create(tiny_recipe(), path, share=Share(index=index, of=3), shard_cells=3 * CELLS))
+        steps = list(create(tiny_recipe(), path, shard=Shard(index=index, of=3), shard_cells=3 * CELLS))
         made.append(steps[-1][1])
         assert (path / "manifest.json").exists() == (index == 3)
     assert sum(made) == 17
@@ -217,14 +217,14 @@ def test_shares_of_a_folder_are_made_by_any_number_of_processes(tmp_path: Path) 
 
 
 def test_only_one_process_makes_a_share(tmp_path: Path) -> None:
-    first, second = Share(index=1, of=2), Share(index=2, of=2)
-    steps = create(tiny_recipe(), tmp_path / "d", share=first, shard_cells=3 * CELLS)
+    first, second = Shard(index=1, of=2), Shard(index=2, of=2)
+    steps = create(tiny_recipe(), tmp_path / "d", shard=first, shard_cells=3 * CELLS)
     next(steps)
-    make(tmp_path / "d", share=second)
+    make(tmp_path / "d", shard=second)
     with pytest.raises(BenchnavError, match="Another run"):
-        make(tmp_path / "d", share=first)
+        make(tmp_path / "d", shard=first)
     steps.close()
-    make(tmp_path / "d", share=first)
+    make(tmp_path / "d", shard=first)
     assert TerrainDataset(tmp_path / "d").map_count("train") == 8
 
 
@@ -242,8 +242,8 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
     make(folder, replace(tiny_recipe(), seed=3), overwrite=True)
     assert digests(folder) == digests(tiny_dataset(tmp_path / "o.h5", replace(tiny_recipe(), seed=3)))
-    with pytest.raises(ConfigError, match="folder, since a share"):
-        make(tmp_path / "e.h5", share=Share(index=1, of=2))
+    with pytest.raises(ConfigError, match="folder, since a shard"):
+        make(tmp_path / "e.h5", shard=Shard(index=1, of=2))
 
 
 def test_a_cluster_makes_the_same_maps(tmp_path: Path) -> None:
@@ -280,7 +280,7 @@ def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(tmp_path: Pa
     assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", other)) != before
     assert sorted(item.name for item in tmp_path.iterdir()) == ["d", "o.h5"]
     with pytest.raises(DatasetError, match="Remove it first"):
-        make(path, share=Share(index=1, of=2), overwrite=True)
+        make(path, shard=Shard(index=1, of=2), overwrite=True)
     assert find_faults(path) == []
 
 
@@ -298,7 +298,7 @@ def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: 
 
 def begun(path: Path, recipe: Recipe, share: int, overwrite: bool = False) -> Any:
     """The making of a share of two that has looked at what is there, and has made nothing yet."""
-    steps = create(recipe, path, share=Share(index=share, of=2), overwrite=overwrite, shard_cells=3 * CELLS)
+    steps = create(recipe, path, shard=Shard(index=share, of=2), overwrite=overwrite, shard_cells=3 * CELLS)
     next(steps)
     return steps
 
@@ -337,9 +337,9 @@ def test_shares_replace_their_own_shards_alone(tmp_path: Path) -> None:
 def test_a_share_keeps_out_who_makes_the_whole(tmp_path: Path) -> None:
     path = tmp_path / "d"
     one = begun(path, tiny_recipe(), 1)
-    for share in (None, Share(index=1, of=2)):
+    for share in (None, Shard(index=1, of=2)):
         with pytest.raises(BenchnavError, match="Another run"):
-            make(path, share=share, overwrite=True)
+            make(path, shard=share, overwrite=True)
     other = begun(path, tiny_recipe(), 2)
     finish(one, other)
     assert find_faults(path) == []

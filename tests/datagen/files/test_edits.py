@@ -13,12 +13,12 @@ import h5py
 import numpy as np
 import pytest
 
-from benchnav.datagen import schema
+from benchnav.core.errors import BenchnavError
+from benchnav.core.store import seal
 from benchnav.datagen.cli import main
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import BenchnavError
 from tests.factories import tiny_dataset, tiny_recipe
 
 EDITS = pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def edit_manifest(path: Path, rng: random.Random) -> None:
         del place[key]
     else:
         place[key] = rng.choice(VALUES)
-    sealed = schema.seal(manifest)
+    sealed = seal(manifest)
     if is_folder:
         (path / "manifest.json").write_text(sealed)
         return

@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files import maps as maps_module
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import DatasetError
 from tests.factories import tiny_dataset, tiny_recipe
 
 

@@ -5,12 +5,12 @@ import h5py
 import numpy as np
 import pytest
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.errors import DatasetError
 from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 

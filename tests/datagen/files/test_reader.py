@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.files.terrain import terrain_of
 from benchnav.datagen.recipe import classes
 from benchnav.datagen.synth.generate import generate
-from benchnav.errors import DatasetError
 from tests.datagen.small import small_stakes
 from tests.factories import tiny_dataset, tiny_recipe
 

@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
 from tests.datagen.small import SOFT, terrain_class
 
 TABLE = (

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
 from benchnav.datagen.recipe.places import PlacesRule, check_places, draw_places
 from benchnav.datagen.recipe.recipe import Split, load_recipe, recipe_from_dict
 from benchnav.datagen.synth.generate import generate
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
 from tests.datagen.small import small_stakes
 
 KEY = rng.stream_key(0, "places")

@@ -5,9 +5,9 @@ import pytest
 import torch
 import yaml
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes, shipped_sizes
 from benchnav.datagen.recipe.scenario import Scenario, blend
-from benchnav.errors import ConfigError
 
 TINY = yaml.safe_load((Path(load_recipe.__globals__["RECIPES"]) / "tiny-v1.yaml").read_text())
 

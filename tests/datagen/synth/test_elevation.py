@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchnav import rng
+from benchnav.core import rng
 from benchnav.datagen.synth import elevation, slope
 
 INDICES = np.arange(40)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.schema import FIELDS
 from benchnav.datagen.synth.generate import generate
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
 from tests.factories import tiny_recipe
 
 PAPER = load_recipe("paper-v1")

@@ -9,15 +9,15 @@ import pytest
 import torch
 from scipy import stats
 
-from benchnav import rng
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe, Split, load_recipe, recipe_from_dict
 from benchnav.datagen.recipe.scenario import blend
 from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth import elevation
 from benchnav.datagen.synth.generate import generate, reference_time_s
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
 from tests.datagen.small import SOFT, small_stakes, terrain_class
 from tests.factories import tiny_recipe
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import EPISODES, SEAL, open_run, read_table
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,16 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import conditions_of
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent, units
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.folder.steps import align_steps, read_steps
-from benchnav.eval.keep import Keep
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.run.rows import step_table
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Extent, units
 from tests.edits import edit_table
 from tests.eval.run.test_rows import made, unit
 

@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchnav.eval.condition import LABELS
+from benchnav.core.grid import Grid
+from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.report.recorded.drawn_plan import drawn_plan
 from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
-from benchnav.grid import Grid
 
 PAPER = {
     "world": {"noise": "resampled", "time_budget_s": 100.0},

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.errors import BenchnavError
+from benchnav.core.errors import BenchnavError
 from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.failure_choice import Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.eval.hypotheses import digest_of_tests
+from benchnav.eval.experiment.hypotheses import digest_of_tests
 from benchnav.eval.report.charts.forest import forest_figure
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.write import write_report

@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from benchnav.eval.condition import LABELS
+from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
 from benchnav.eval.report.tables import failures_in_words, result_table

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.eval.folder.folder import write_run
 from benchnav.eval.report import write
 from benchnav.eval.report.playback.files import write_playback

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard
 from benchnav.eval.compare import compare_runs
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.report.write import print_report, write_report
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import rerun
 from benchnav.eval.run.runner import Workers, run_suite
-from benchnav.eval.suite import Suite
-from benchnav.share import Share
 
 FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
 LINE = "left out: planner Steering with robot bicycle, which it cannot steer"
@@ -80,7 +80,7 @@ def test_a_run_in_which_nothing_is_left_is_refused(dataset_path: Path, tmp_path:
 def test_a_merged_run_says_what_its_shards_said(dataset_path: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "1", tmp_path / "2"]
     for index, part in enumerate(parts, start=1):
-        list(run_suite(suite_on(dataset_path), part, shard=Share(index=index, of=2)))
+        list(run_suite(suite_on(dataset_path), part, shard=Shard(index=index, of=2)))
     list(merge_shards(parts, tmp_path / "all"))
     about = open_run(tmp_path / "all").about
     assert about["dropped"] == open_run(parts[0]).about["dropped"]

@@ -13,18 +13,18 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav import cluster as dask
-from benchnav.errors import BenchnavError, ConfigError
+from benchnav.core import cluster as dask
+from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.eval import cli
+from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.keep import Keep
 from benchnav.eval.run import cluster
 from benchnav.eval.run.cluster import check_worker
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import units
 
 distributed = pytest.importorskip("distributed")
 
@@ -244,7 +244,7 @@ def test_an_address_is_as_dask_writes_it(address: str, dataset_path: Path, tmp_p
 
 
 def test_parts_of_this_process_alone_are_refused(dataset_path: Path, tmp_path: Path) -> None:
-    from benchnav import registry
+    from benchnav.core import registry
     from tests.eval.parts import Faulty
 
     registry.register("planner", "only_here", Faulty)

@@ -5,10 +5,10 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchnav.errors import BenchnavError
+from benchnav.core.errors import BenchnavError
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import ERRORS
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
 
 
 def run(

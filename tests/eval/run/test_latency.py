@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
+from benchnav.core.store import Shard
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.report.tables import ALONE
 from benchnav.eval.report.write import read_report
 from benchnav.eval.run import latency
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.share import Share
 from tests.eval.conftest import MOST_STEPS
 
 MAPS = 3
@@ -86,7 +86,7 @@ def test_shards_measure_their_own_and_their_run_has_all(dataset_path: Path, tmp_
     suite = suite_on(dataset_path, plain, "straight", seeds=(0, 1), maps=1)
     parts = [tmp_path / "1", tmp_path / "2"]
     for index, part in enumerate(parts, start=1):
-        list(run_suite(suite, part, shard=Share(index=index, of=2)))
+        list(run_suite(suite, part, shard=Shard(index=index, of=2)))
     list(merge_shards(parts, tmp_path / "all"))
     assert None not in latencies(tmp_path / "all")
     assert latencies(tmp_path / "all")[0] in (latencies(parts[0])[0], latencies(parts[1])[0])

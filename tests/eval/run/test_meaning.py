@@ -14,10 +14,10 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav import rng
+from benchnav.core import rng
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
 from tests import factories
 
 MAPS, SEEDS, REALISATIONS = 54, (3, 4), 2

@@ -13,12 +13,12 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav import rng
-from benchnav.copula import correlated_normal
+from benchnav.core import rng
+from benchnav.core.copula import correlated_normal
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.places import PlacesRule
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
 from tests import factories
 
 MAPS, SEEDS, REALISATIONS, RATIO = 53, (3, 4), 2, 0.05

@@ -15,14 +15,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard
 from benchnav.eval import cli
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import open_run, read_table, write_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.share import Share
 
 OF = 3
 KEYS = ["condition", "seed", "realisation", "map"]
@@ -48,7 +48,7 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Its shards; to be copied by those who change them."""
     folder = tmp_path_factory.mktemp("shards")
-    return [finish(suite, folder / f"part{i}", Share(index=i, of=OF)) for i in range(1, OF + 1)]
+    return [finish(suite, folder / f"part{i}", Shard(index=i, of=OF)) for i in range(1, OF + 1)]
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def parts(made: list[Path], tmp_path: Path) -> list[Path]:
     return [shutil.copytree(part, tmp_path / part.name) for part in made]
 
 
-def finish(suite: Suite, folder: Path, shard: Share | None = None) -> Path:
+def finish(suite: Suite, folder: Path, shard: Shard | None = None) -> Path:
     list(run_suite(suite, folder, shard=shard))
     return folder
 
@@ -118,7 +118,7 @@ def test_a_merged_run_is_gone_on_with_and_extended(suite: Suite, parts: list[Pat
 
 def test_shards_that_are_killed_and_extended_are_the_extended_run(suite: Suite, tmp_path: Path) -> None:
     longer = replace(suite, seeds=(0, 1, 2, 3), scenarios=("std",))
-    shards = [Share(index=i, of=2) for i in (1, 2)]
+    shards = [Shard(index=i, of=2) for i in (1, 2)]
     folders = [tmp_path / "one", tmp_path / "two"]
     finish(replace(longer, seeds=(0, 1)), folders[0], shards[0])
     kept = {path: path.stat().st_mtime_ns for path in folders[0].glob("units/*/*")}
@@ -132,21 +132,21 @@ def test_shards_that_are_killed_and_extended_are_the_extended_run(suite: Suite, 
 
 def test_a_shard_has_rows_and_no_tables(parts: list[Path]) -> None:
     part = parts[0]
-    assert open_run(part).shard == Share(index=1, of=OF)
+    assert open_run(part).shard == Shard(index=1, of=OF)
     assert {path.name for path in part.iterdir()} <= {"run.json", "units", "steps", "playback", "errors.txt"}
     with pytest.raises(ConfigError, match=r"shard 1/3 of one and has no tables.*benchnav-eval merge"):
         read_table(part, "episodes.parquet")
 
 
-@pytest.mark.parametrize("other", [None, Share(index=2, of=OF), Share(index=1, of=2)])
-def test_a_folder_holds_one_shard(suite: Suite, parts: list[Path], other: Share | None) -> None:
+@pytest.mark.parametrize("other", [None, Shard(index=2, of=OF), Shard(index=1, of=2)])
+def test_a_folder_holds_one_shard(suite: Suite, parts: list[Path], other: Shard | None) -> None:
     with pytest.raises(ConfigError, match="holds shard 1/3"):
         finish(suite, parts[0], other)
 
 
 def test_a_whole_run_is_no_shard(suite: Suite, whole: Path, parts: list[Path], tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds a whole run"):
-        finish(suite, whole, Share(index=1, of=OF))
+        finish(suite, whole, Shard(index=1, of=OF))
     with pytest.raises(ConfigError, match="whole run"):
         list(merge_shards([*parts, whole], tmp_path / "all"))
 
@@ -156,7 +156,7 @@ def test_a_shard_without_units_is_not_needed(suite: Suite, tmp_path: Path) -> No
     said: list[str] = []
     folders = [tmp_path / f"part{i}" for i in (1, 2)]
     for i, folder in enumerate(folders, start=1):
-        steps = list(run_suite(small, folder, shard=Share(index=i, of=2), say=said.append))
+        steps = list(run_suite(small, folder, shard=Shard(index=i, of=2), say=said.append))
         assert steps in ([], [(0, 1), (1, 1)])
     full = [folder for folder in folders if (folder / "units").exists()]
     assert len(full) == 1
@@ -297,7 +297,7 @@ def test_shards_of_one_suite_share_their_hypotheses(suite: Suite, parts: list[Pa
         "metric": "success",
         "direction": "lower",
     }
-    shard = Share(index=2, of=OF)
+    shard = Shard(index=2, of=OF)
     parts[1] = finish(replace(suite, hypotheses=(claim,)), tmp_path / "other" / "part2", shard)
     with pytest.raises(ConfigError, match="part2: hypotheses"):
         list(merge_shards(parts, tmp_path / "all"))

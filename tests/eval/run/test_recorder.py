@@ -11,9 +11,11 @@ import pandas as pd
 import pytest
 import torch
 
+from benchnav.core.errors import BenchnavError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import SoftSpots
-from benchnav.errors import BenchnavError
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.report.recorded.drawn_plan import drawn_plan, thinned
@@ -21,8 +23,6 @@ from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.run.episode import build
 from benchnav.eval.run.recorder import Recorder, find_recording
 from benchnav.eval.run.runner import run_suite
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Unit
 from benchnav.planning.planners.planner import Plan
 from tests import factories
 from tests.eval.forged import forge_rows

@@ -12,14 +12,14 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard
 from benchnav.eval import cli
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run, write_run
 from benchnav.eval.run.rerun import Comparison, compare, rerun
 from benchnav.eval.run.runner import Workers, run_suite
-from benchnav.eval.suite import Suite
-from benchnav.share import Share
 from tests import factories
 from tests.eval.forged import forge_rows
 
@@ -236,7 +236,7 @@ def test_what_cannot_be_repeated_is_refused(suite: Suite, tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match="another folder"):
         repeat(run, tmp_path / "x" / ".." / "run", overwrite=True)
     assert (run / "episodes.parquet").exists()
-    part = finish(suite, tmp_path / "part", shard=Share(index=1, of=1))
+    part = finish(suite, tmp_path / "part", shard=Shard(index=1, of=1))
     with pytest.raises(ConfigError, match="shard 1/1"):
         repeat(part, tmp_path / "again")
     (run / "episodes.parquet").unlink()

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.eval.condition import conditions_of
+from benchnav.eval.experiment.condition import conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.rollout import Episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, score
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Unit
 from benchnav.planning.robots import Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories

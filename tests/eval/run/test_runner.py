@@ -15,9 +15,11 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav import registry
+from benchnav.core import registry
+from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.errors import BenchnavError, ConfigError
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run
@@ -27,8 +29,6 @@ from benchnav.eval.report.write import write_report
 from benchnav.eval.run import runner
 from benchnav.eval.run.recorder import find_recording
 from benchnav.eval.run.runner import run_suite, run_unit
-from benchnav.eval.suite import Suite
-from benchnav.eval.unit import Unit
 from tests import factories
 from tests.eval.report.playback.rrd import read_path
 
@@ -133,7 +133,7 @@ def test_a_killed_run_goes_on_to_the_same_rows(finished: tuple[Suite, Path], tmp
     suite, whole = finished
     folder = tmp_path / "run"
     code = (
-        "import sys; from pathlib import Path; from benchnav.eval.suite import Suite\n"
+        "import sys; from pathlib import Path; from benchnav.eval.experiment.suite import Suite\n"
         "from benchnav.eval.run.runner import run_suite\n"
         f"for _ in run_suite({suite!r}, Path({str(folder)!r})): pass"
     )
@@ -156,7 +156,7 @@ def test_workers_end_with_a_command_that_was_killed(dataset_path: Path, tmp_path
     asleep = {"part": "tests.eval.parts:Asleep", "options": {"folder": str(tmp_path / "begun")}}
     suite = quick(dataset_path, planners=(asleep,), risks=("mean", "cvar"), scenarios=("std",))
     code = (
-        "from pathlib import Path; from benchnav.eval.suite import Suite\n"
+        "from pathlib import Path; from benchnav.eval.experiment.suite import Suite\n"
         "from benchnav.eval.run.runner import run_suite\n"
         f"for _ in run_suite({suite!r}, Path({str(tmp_path / 'run')!r}), jobs=2): pass"
     )

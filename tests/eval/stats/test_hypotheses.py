@@ -5,13 +5,13 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest, ttest_1samp
 
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import Condition, conditions_of
-from benchnav.eval.hypotheses import Hypothesis, fix_hypotheses
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.condition import Condition, conditions_of
+from benchnav.eval.experiment.hypotheses import Hypothesis, fix_hypotheses
+from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.stats.difference import success_interval
 from benchnav.eval.stats.hypotheses import p_of
 from benchnav.eval.stats.hypotheses import test_hypotheses as run_tests
-from benchnav.eval.suite import Suite
 from tests.eval.report.made import condition, row, rows
 
 WORLD = {"time_budget_s": 100.0}

@@ -4,8 +4,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchnav.errors import ConfigError
-from benchnav.eval.condition import NOT_USED
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.pairing import Compared, Pair, check_one_value_each, find_pairs
 from tests.eval.report.made import condition, row, rows
 

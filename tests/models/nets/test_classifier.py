@@ -7,9 +7,9 @@ import segmentation_models_pytorch as smp
 import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import ConfigError
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import LabelledLoss, MeanIoU, TerrainClassifier
 from benchnav.models.training.classifiers import fit_classifier, measure_classifier

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 from torch import Tensor
 
+from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import CheckpointError, ConfigError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
@@ -33,7 +34,6 @@ from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.mdn import fit_mdn, measure_network
-from benchnav.terrain import Observation, Terrain
 from tests.factories import normal
 from tests.models.support import make_terrain
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchnav import registry
+from benchnav.core import registry
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.cli import main
 from benchnav.models.predictor import Oracle

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav import registry
+from benchnav.core import registry
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe

@@ -4,9 +4,9 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import class_colours
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.map_sheet import map_sheet_figure, read_sheet, shared_scales
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy

@@ -5,11 +5,12 @@ import pytest
 import torch
 from scipy.stats import mannwhitneyu
 
+from benchnav.core.errors import CheckpointError, DatasetError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import CheckpointError, DatasetError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.measure import choose_splits, evaluate, measure
@@ -17,7 +18,6 @@ from benchnav.models.quality.scores import crps
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
 from benchnav.models.slope_gp.measure import measure_latent
 from benchnav.models.slope_gp.table import SoftModes
-from benchnav.terrain import Observation, Terrain
 from tests.factories import normal
 from tests.models.stub import ColourModel
 from tests.models.support import linear_table, make_terrain

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 from torchmetrics.functional.classification import multiclass_calibration_error
 
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.quality.scores import (
     BrierScore,
     ReliabilityCurve,

@@ -6,8 +6,8 @@ import pytest
 import torch
 from scipy.stats import norm
 
+from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import ConfigError
 from benchnav.models.slope_gp.cells import Cells, cell_nll, hold_out, observed_cells, read_cells
 from benchnav.models.slope_gp.table import SoftModes
 from tests.models.support import linear_table, make_cells

@@ -10,9 +10,9 @@ from gpytorch.distributions import MultivariateNormal
 from scipy.optimize import minimize
 from scipy.stats import norm
 
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import Cells, cell_nll
 from benchnav.models.slope_gp.gp import LatentGPs

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav.errors import DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import cell_nll, hold_out
 from benchnav.models.slope_gp.slip_logs import read_slip_logs

@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import Cells
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins

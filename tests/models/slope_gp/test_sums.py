@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.errors import DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.models.slope_gp.cells import Cells
 from benchnav.models.slope_gp.sums import SlopeSums, levels, sum_cells, sum_split
 from tests.models.support import make_cells, make_dataset

@@ -4,8 +4,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.errors import DatasetError
 from benchnav.models.training.data import MapData, MapSampler, apply_jitter, apply_symmetry
 from tests.models.support import make_dataset
 

@@ -14,10 +14,10 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
+from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
+from benchnav.core.store import sole_writer
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
-from benchnav.files import sole_writer
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig

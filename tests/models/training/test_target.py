@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchnav.errors import CheckpointError
+from benchnav.core.errors import CheckpointError
 from benchnav.models.checkpoint import (
     Checkpoint,
     Part,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
-from benchnav import rng
+from benchnav.core import rng
 from benchnav.planning.planners.planner import Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.simulation import Simulation

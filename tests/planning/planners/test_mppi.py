@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners import mppi
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState

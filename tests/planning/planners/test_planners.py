@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav import registry
+from benchnav.core import registry
 from benchnav.planning.planners.planner import PlanStatus, check_steers
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome

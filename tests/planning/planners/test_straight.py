@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.planners.planner import check_steers, what_it_follows
 from benchnav.planning.planners.straight import Straight, steer_toward
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle

@@ -7,14 +7,14 @@ import pytest
 import torch
 from scipy import stats
 
-from benchnav import rng
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Terrain
 from benchnav.planning.world.frozen import draw_frozen
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import Immobile, World
-from benchnav.terrain import Terrain
 from tests import factories
 
 KEY = rng.stream_key(0, "noise")

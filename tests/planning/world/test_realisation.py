@@ -3,9 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchnav import rng
-from benchnav.errors import ConfigError
-from benchnav.mixture import TraversabilityMixture
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.world.realisation import Realisation
 from benchnav.planning.world.world import World
 from tests import factories

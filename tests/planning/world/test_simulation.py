@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchnav import rng
+from benchnav.core import rng
 from benchnav.planning.free_space import Rules
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import FAILURES, Outcome

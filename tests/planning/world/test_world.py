@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.world.world import PRESETS, Immobile, World
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.charts.sweeps import SEVERITY, Line, Sweep
 from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, display_name
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import replacing
 from benchnav.eval.folder.folder import EPISODES, damaged, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.report.contenders import NAMING, condition_colours, contender_names
 from benchnav.eval.report.recorded.ground import IMMOBILISING
-from benchnav.files import replacing
 
 if TYPE_CHECKING:  # runs keep the map of the figure, and draw nothing
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from benchnav.eval.hypotheses import METRICS
+from benchnav.eval.experiment.hypotheses import METRICS
 from benchnav.eval.report.figure_style import OKABE_ITO, TWO_COLUMNS_IN
 from benchnav.eval.report.findings import p_in_words
 

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.figure_style import OKABE_ITO, ONE_COLUMN_IN, TWO_COLUMNS_IN, condition_name
 from benchnav.eval.stats.best import BLOCK
 

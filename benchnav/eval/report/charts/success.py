@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.charts.panels import lay_out, planner_colours
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, condition_name
 from benchnav.eval.report.recorded.drawn_plan import STYLES, LayerStyle
 from benchnav.eval.report.recorded.ground import (

@@ -8,6 +8,7 @@ ended, and time series; and a blueprint that arranges them.
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchnav.core.store import replacing
 from benchnav.eval.report.contenders import condition_colours, contender_names
 from benchnav.eval.report.playback.blueprint import arrange
 from benchnav.eval.report.playback.robot import (
@@ -21,7 +22,6 @@ from benchnav.eval.report.playback.robot import (
 from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
 from benchnav.eval.report.playback.words import describe
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.files import replacing
 
 APPLICATION = "benchnav"
 

@@ -9,10 +9,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from benchnav.core.grid import Grid
 from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
 from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.grid import Grid
 
 START, GOAL = (230, 30, 30), (255, 0, 255)
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import replacing
 from benchnav.eval.report.playback.frames import Frames
 from benchnav.eval.report.recorded.recording import Recording
-from benchnav.files import replacing
 
 FRAMES_A_SECOND = 20
 # Seconds of an episode in a second of video.

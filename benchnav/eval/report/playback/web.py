@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
-from benchnav.errors import BenchnavError
+from benchnav.core.errors import BenchnavError
 
 HOST = "127.0.0.1"
 

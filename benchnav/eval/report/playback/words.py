@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from benchnav.eval.condition import NOT_USED
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.contenders import NAMING
 from benchnav.eval.report.playback.robot import Driver
 from benchnav.eval.report.recorded.recording import Recording

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchnav.core.grid import Grid
+from benchnav.core.store import replacing
 from benchnav.eval.folder.folder import damaged
 from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, join_plans, split_plans, thinned
 from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S, Snapshot
-from benchnav.files import replacing
-from benchnav.grid import Grid
 
 _ARRAYS = (
     *("rgb", "elevation_m", "true_mean", "predicted", "free", "soft", "immobilising"),

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav import gridgraph
-from benchnav.errors import ConfigError
+from benchnav.core import gridgraph
+from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance, path_cost_of
 from benchnav.planning.problem import Problem

@@ -41,8 +41,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav import rng
-from benchnav.errors import ConfigError
+from benchnav.core import rng
+from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt.edges import SPACING_M, ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot, action_limits
 
 _LEAST_CURVATURE = 1e-6

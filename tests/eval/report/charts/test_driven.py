@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.eval.report.charts.driven import (
     GROUND,
     MOST_PATHS,

@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.eval.report.playback.frames import ROBOT, Frames
 from benchnav.eval.report.playback.video import FRAMES_A_SECOND, HOLD_S, SPEED, frame_times, write_video
 from benchnav.eval.report.recorded.recording import Recording

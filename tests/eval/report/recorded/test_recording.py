@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, thinned
 from benchnav.eval.report.recorded.recording import Recording, read_snapshots, take_snapshot
 from tests.eval.report import made

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav import gridgraph
-from benchnav.errors import ConfigError
-from benchnav.grid import Grid
+from benchnav.core import gridgraph
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY, Rules
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import FreeSpace, Rules
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig

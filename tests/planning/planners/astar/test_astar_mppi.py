@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI, AStarMPPIConfig

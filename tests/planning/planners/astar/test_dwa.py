@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import dwa as dwa_module

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.grid import Grid
+from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, TravelTime
 from benchnav.planning.planners.astar import astar

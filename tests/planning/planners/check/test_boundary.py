@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.planning.planners.check.boundary import NOT_FINITE, Answer, act, begin, find_layer_faults
+from benchnav.planning.planners.boundary import NOT_FINITE, Answer, act, begin, find_layer_faults
 from benchnav.planning.planners.planner import Plan, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.check.contract import check_planner
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
+from benchnav.testing.planner import check_planner
 
 FEW = {"samples": 128, "horizon_s": 2.0}
 SMALL = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 50}}

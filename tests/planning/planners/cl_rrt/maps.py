@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.grid import Grid
+from benchnav.core.grid import Grid
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower
 from benchnav.planning.problem import Problem

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav import registry
-from benchnav.errors import ConfigError
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt import cl_rrt

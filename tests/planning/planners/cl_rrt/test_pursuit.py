@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchnav.errors import ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
 

@@ -1,0 +1,1 @@
+"""What every package stands on: values, random streams, the registry of parts, settings, files and commands."""

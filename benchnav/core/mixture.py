@@ -1,0 +1,316 @@
+"""The per-cell probability distribution of traversability, with exact mean, VaR and CVaR.
+
+λ is a Gaussian mixture X clipped to [0, 1]; F is the CDF of X. Risk is the *lower* tail of λ: at level α both VaR and
+CVaR speak of the worst share 1 − α; `cvar` computes them. Arithmetic is in float64 whatever the dtype of the
+parameters, and a cell's numbers do not depend on how many others there are.
+
+The expected time over the ground, in units of its time at λ = 1, is for a least speed ε
+
+    E[1 / max(λ, ε)] = 1 + ∫_ε^1 F(x) / x² dx = Σ_k w_k (1 + ∫_ε^1 Φ((x − m_k) / s_k) / x² dx),
+
+where each integrand is 0 well below m_k and 1 / x² well above, and is integrated in between by
+Gauss-Legendre quadrature over log x.
+
+Source: equation (1) of the paper. Letters in shapes: K components, H×W cells, N cells of a map, *B any leading
+dimensions.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchnav.core.cvar import Cells, added, conditional_value_at_risk, mean, value_at_risk
+from benchnav.core.errors import ConfigError
+
+_SMALLEST_STD = 1e-9
+_REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
+_QUADRATURE_NODES = 24
+_DEEP_TAIL = 1e-6  # under which F has to be exact to its own last bits
+_NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
+_NUMBERS_ON_A_GPU = 2**24  # where few large pieces are quicker than many small ones
+
+
+@dataclass(frozen=True)
+class TraversabilityMixture:
+    """A Gaussian mixture clipped to [0, 1] in each cell of a map.
+
+    Args:
+        weights: probability of each component, summing to 1 over K up to rounding, by which they are divided;
+            shape [*B, K, H, W].
+        means: component means before clipping, shape [*B, K, H, W].
+        stds: component standard deviations before clipping, ≥ 0, shape [*B, K, H, W].
+        group: K numbers: in a cell the components of one number belong to one terrain class together; None
+            where components are no classes.
+
+    Raises:
+        ConfigError: the shapes differ or have fewer than three dimensions, or `group` has another length.
+    """
+
+    weights: Tensor
+    means: Tensor
+    stds: Tensor
+    group: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the shapes."""
+        if not self.weights.shape == self.means.shape == self.stds.shape or self.weights.ndim < 3:
+            raise ConfigError(
+                "Expected `weights`, `means` and `stds` of one shape [*B, K, H, W], got "
+                f"{list(self.weights.shape)}, {list(self.means.shape)} and {list(self.stds.shape)}."
+            )
+        if self.group is not None and len(self.group) != self.weights.shape[-3]:
+            raise ConfigError(
+                f"Expected `group` to name the class of each of {self.weights.shape[-3]} components, "
+                f"got {len(self.group)}."
+            )
+
+    def cdf(self, value: Tensor | float) -> Tensor:
+        """P(λ ≤ value), with the atoms of clipping at 0 and 1.
+
+        Args:
+            value: traversability, a number or shape [*B, H, W].
+
+        Returns:
+            Probability, shape [*B, H, W].
+        """
+        value = torch.as_tensor(value, dtype=torch.float64, device=self.weights.device)
+        inside = self._uncensored_cdf(value)
+        return torch.where(value < 0, 0.0, torch.where(value >= 1, 1.0, inside)).to(self.weights.dtype)
+
+    def mean(self) -> Tensor:
+        """E[λ], shape [*B, H, W]."""
+        return self._in_pieces(mean)
+
+    def var(self, level: float) -> Tensor:
+        """Value at risk: λ falls below it with probability 1 − level.
+
+        Args:
+            level: α in [0, 1); at 0 the result is 1, the supremum of λ's range.
+
+        Returns:
+            Traversability, shape [*B, H, W].
+        """
+        tail = 1 - _check_level(level)
+        if tail == 1:
+            return torch.ones_like(self.weights.select(-3, 0))
+        return self._in_pieces(
+            lambda cells: value_at_risk(cells, torch.full_like(cells.means[0], tail)), deep=tail < _DEEP_TAIL
+        )
+
+    def cvar(self, level: float) -> Tensor:
+        """Conditional value at risk: the mean of λ over its worst share 1 − level.
+
+        Args:
+            level: α in [0, 1); at 0 the result is the mean.
+
+        Returns:
+            Traversability, shape [*B, H, W].
+        """
+        tail = 1 - _check_level(level)
+        if tail == 1:
+            return self.mean()
+        return self._in_pieces(
+            lambda cells: conditional_value_at_risk(cells, torch.full_like(cells.means[0], tail)),
+            deep=tail < _DEEP_TAIL,
+        )
+
+    def chance(self, value: float) -> Tensor:
+        """P(λ ≥ value), shape [*B, H, W].
+
+        Args:
+            value: traversability in [0, 1].
+        """
+        if value <= 0:
+            return torch.ones_like(self.weights.select(-3, 0))
+        below = self._uncensored_cdf(torch.tensor(value, dtype=torch.float64, device=self.weights.device))
+        return (1 - below).to(self.weights.dtype)
+
+    def harmonic_mean(self, floor: float) -> Tensor:
+        """1 / E[1 / max(λ, floor)]: the speed, as a share, that gives the expected time over the ground.
+
+        Args:
+            floor: ε in (0, 1], least speed.
+
+        Returns:
+            In [floor, 1], at most the mean of max(λ, floor); shape [*B, H, W].
+        """
+        if not 0 < floor <= 1:
+            raise ConfigError(f"Expected a least speed in (0, 1], got {floor}.")
+        return self._in_pieces(lambda cells: _harmonic_mean(cells, floor))
+
+    def from_normal(self, normal: Tensor) -> Tensor:
+        """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1).
+
+        A field of correlated standard normals gives a field of λ with each cell's own distribution
+        (a Gaussian copula).
+
+        Args:
+            normal: z, shape [*B, H, W].
+
+        Returns:
+            λ in [0, 1], shape [*B, H, W].
+        """
+        if self.weights.shape[-3] == 1:
+            return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
+        return self._in_pieces(value_at_risk, _probability(normal.double()))
+
+    def select(self, members: Tensor) -> "TraversabilityMixture":
+        """Keeps some maps of the first dimension, by index, shape [M]."""
+        return TraversabilityMixture(
+            self.weights[members], self.means[members], self.stds[members], self.group
+        )
+
+    def at(self, cells: Tensor) -> "TraversabilityMixture":
+        """Keeps some cells as a map of one row, [K, 1, N].
+
+        Args:
+            cells: which of them, bool, shape [B, H, W].
+        """
+        parameters = (self.weights, self.means, self.stds)
+        weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
+        return TraversabilityMixture(weights, means, stds, self.group)
+
+    def to(self, device: torch.device | str) -> "TraversabilityMixture":
+        """The mixture on a device."""
+        weights, means, stds = (values.to(device) for values in (self.weights, self.means, self.stds))
+        return TraversabilityMixture(weights, means, stds, self.group)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log density on (0, 1); log probability mass at 0 and at 1; −∞ elsewhere.
+
+        Args:
+            value: observed traversability, shape [*B, H, W].
+
+        Returns:
+            Shape [*B, H, W].
+        """
+        value = value.to(torch.float64)
+        weights, means, stds = self._parameters()
+        z = (value.unsqueeze(-3) - means) / stds
+        density = -0.5 * z**2 - stds.log() - 0.5 * math.log(2 * math.pi)
+        mass_at_0 = torch.special.log_ndtr(-means / stds)
+        mass_at_1 = torch.special.log_ndtr((means - 1) / stds)
+        at = value.unsqueeze(-3)
+        component = torch.where(at <= 0, mass_at_0, torch.where(at >= 1, mass_at_1, density))
+        total = torch.logsumexp(component + weights.log(), dim=-3)
+        # At an end it is a probability, which rounding must not bring above 1.
+        total = torch.where((value <= 0) | (value >= 1), total.clamp(max=0), total)
+        return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.weights.dtype)
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draws λ independently in each cell.
+
+        Args:
+            count: draws a cell.
+            generator: on the device of the parameters.
+
+        Returns:
+            Traversability in [0, 1], shape [count, *B, H, W].
+        """
+        shape, device = (count, *self.weights.movedim(-3, 0).shape[1:]), self.weights.device
+        pick = torch.rand(shape, generator=generator, device=device, dtype=self.weights.dtype)
+        edges = self.weights.cumsum(-3)
+        component = (pick.unsqueeze(-3) >= edges).sum(-3, keepdim=True).clamp(max=edges.shape[-3] - 1)
+        expanded = (count, *self.weights.shape)
+        mean = torch.gather(self.means.expand(expanded), -3, component).squeeze(-3)
+        std = torch.gather(self.stds.expand(expanded), -3, component).squeeze(-3)
+        noise = torch.randn(shape, generator=generator, device=device, dtype=self.weights.dtype)
+        return (mean + std * noise).clamp(0, 1)
+
+    def most_likely(self) -> "TraversabilityMixture":
+        """Keeps the heaviest class of each cell alone, all its components: the paper's single-class option.
+
+        Raises:
+            ConfigError: the components are not told to belong to classes.
+        """
+        if self.weights.shape[-3] == 1:
+            return TraversabilityMixture(torch.ones_like(self.means), self.means, self.stds, (0,))
+        if self.group is None:
+            raise ConfigError(
+                "Expected components that belong to terrain classes for the single-class option, got a "
+                "mixture without `group`. Take another risk measure, or give the mixture its `group`."
+            )
+        classes = sorted(set(self.group))
+        members = [[k for k, own in enumerate(self.group) if own == c] for c in classes]
+        of_class = torch.stack([self.weights[..., own, :, :].sum(-3) for own in members], dim=-3)
+        best = of_class.argmax(dim=-3, keepdim=True)
+        if len(classes) == len(self.group):  # a component a class: the others need not be kept at no weight
+            order = torch.tensor([own[0] for own in members], device=best.device)[best]
+            means, stds = (torch.gather(t, -3, order) for t in (self.means, self.stds))
+            return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))
+        class_of = torch.tensor([classes.index(own) for own in self.group], device=best.device)
+        kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
+        return replace(self, weights=kept / kept.sum(-3, keepdim=True))
+
+    def _in_pieces(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
+        """Does some work on so many cells at a time that all stays near the processor.
+
+        Args:
+            work: from `Cells` and layers of N cells to numbers [N], each of its own cell alone.
+            layers: of shape [*B, H, W].
+            deep: of the cells.
+
+        Returns:
+            Shape [*B, H, W], in the dtype of the parameters.
+        """
+        parameters = [values.movedim(-3, 0).flatten(1) for values in (self.weights, self.means, self.stds)]
+        flat = [layer.flatten() for layer in layers]
+        count, total = parameters[0].shape
+        numbers = _NUMBERS_AT_ONCE if parameters[0].device.type == "cpu" else _NUMBERS_ON_A_GPU
+        size = max(1, numbers // count)
+        done = []
+        for start in range(0, max(1, total), size):
+            piece = slice(start, start + size)
+            weights, means, stds = (values[:, piece].to(torch.float64) for values in parameters)
+            cells = Cells(
+                weights / added(weights), means, math.sqrt(0.5) / stds.clamp(min=_SMALLEST_STD), deep
+            )
+            done.append(work(cells, *(layer[piece] for layer in flat)))
+        return torch.cat(done).view(self.weights.select(-3, 0).shape).to(self.weights.dtype)
+
+    def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
+        weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
+        return weights / weights.sum(-3, keepdim=True), means, stds.clamp(min=_SMALLEST_STD)
+
+    def _uncensored_cdf(self, value: Tensor) -> Tensor:
+        weights, means, stds = self._parameters()
+        at = value.unsqueeze(-3) if value.ndim else value
+        return (weights * _probability((at - means) / stds)).sum(-3).clamp(0, 1)
+
+
+def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
+    """`harmonic_mean` of N cells, in float32: to within 1e-6."""
+    short = cells.float()
+    # Beyond [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x² is known.
+    reach = _REACH * math.sqrt(0.5) / short.scales
+    low, high = (short.means - reach).clamp(floor, 1), (short.means + reach).clamp(floor, 1)
+    start, span = low.log(), high.log() - low.log()
+    time = 1 + (1 / high - 1)
+    for node, share in _legendre():
+        log_x = start + span * node
+        below = torch.erf((log_x.exp() - short.means).mul_(short.scales)).add_(1)
+        time = torch.addcmul(time, span * (0.5 * share), below.mul_(torch.exp(-log_x)))
+    return (1 / added(short.weights * time)).clamp(floor, 1)
+
+
+def _probability(z: Tensor) -> Tensor:
+    """Φ(z); several times quicker than `torch.special.ndtr`."""
+    return 0.5 * torch.erfc(z * -math.sqrt(0.5))
+
+
+def _check_level(level: float) -> float:
+    if not 0 <= level < 1:
+        raise ConfigError(f"Expected `level` in [0, 1), got {level}. CVaR at level 0 is the mean.")
+    return float(level)
+
+
+@cache
+def _legendre() -> tuple[tuple[float, float], ...]:
+    """Nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
+    return tuple((float(0.5 + 0.5 * x), float(0.5 * w)) for x, w in zip(nodes, weights, strict=True))

@@ -1,0 +1,423 @@
+"""The one registry: how every replaceable part is named, found, configured and identified.
+
+Parts are of five kinds: planners, models, risk measures, robots and objectives. A part is named by one
+of four forms:
+
+- a shipped name (`mppi`) or the name of an entry point of the group `benchnav.<kind>s` of an installed
+  package; the shipped parts are entry points too;
+- `package.module:Name`, from anything that can be imported;
+- `path/to/file.py:Name`, from a file that stands alone;
+- any of these followed by `:VALUE`, which sets its first option: `cvar:0.5` is `cvar` at level 0.5.
+
+What stands at the name is a class or a function. Its keyword parameters are its options; where the one
+parameter is a dataclass named `config`, the fields of that are. A class is made with them; a risk measure
+that is a function is called with them beside its mixture.
+
+A part is identified by its source and all that this imports, by every file or folder that an option names, and by
+those that its class or function lists as `files`, relative to its own file: `files = ("weights.npz",)`. Options that
+name what it writes stand in `writes`: `writes = ("log",)`.
+"""
+
+import importlib
+import inspect
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache, partial
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+import benchnav
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import (
+    NO_DEFAULT,
+    Option,
+    call,
+    config_class,
+    from_text,
+    gone_options,
+    hint,
+    list_options,
+    one_line,
+    parameters,
+    plain,
+    refuse_unknown,
+    type_name,
+    typed,
+)
+from benchnav.core.sources import (
+    attribute,
+    digest_of,
+    digest_of_file_part,
+    digest_of_modules,
+    digest_of_path,
+    digest_of_target,
+    distribution_of,
+    load_file,
+)
+
+__all__ = [
+    "KINDS",
+    "NO_DEFAULT",
+    "Found",
+    "Option",
+    "Part",
+    "complete",
+    "find",
+    "hint",
+    "make",
+    "names",
+    "option_files",
+    "options_of",
+    "read_part",
+    "register",
+    "type_name",
+]
+
+KINDS = ("planner", "model", "risk", "robot", "objective")
+
+# Parameters that the program gives, so no options.
+_GIVEN: Mapping[str, tuple[str, ...]] = {"objective": ("robot", "goal_radius_m")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A part as it was asked for.
+
+    Args:
+        part: a name, `package.module:Name` or `path/to/file.py:Name`.
+        label: what tables call it.
+        options: values of its options.
+    """
+
+    part: str
+    label: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """A part that was found.
+
+    Args:
+        target: the class or function.
+        origin: where it comes from, for people.
+        source_digest: gives the digest of its source and of what that imports; empty for the parts of this
+            package, and where no source is to be had.
+        shipped: it is one of ours.
+        everywhere: other processes find it too.
+    """
+
+    target: Any
+    origin: str
+    source_digest: Callable[[], str] = str
+    shipped: bool = False
+    everywhere: bool = True
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its source, of what that imports, and of the `files` that it lists.
+
+        Raises:
+            ConfigError: a file that it lists is not there.
+        """
+        listed = [digest for pair in _listed_files(self.target) for digest in pair]
+        return digest_of(map(str.encode, (self.source_digest(), *listed))) if listed else self.source_digest()
+
+
+_REGISTERED: dict[tuple[str, str], Any] = {}
+
+
+def register(kind: str, name: str, target: Any) -> None:
+    """Makes a part known by name in this process alone, as a notebook needs it.
+
+    Args:
+        kind: one of `KINDS`.
+        name: what it is to be called.
+        target: the class or function.
+    """
+    _REGISTERED[_checked(kind), name] = target
+
+
+def names(kind: str) -> list[str]:
+    """Names of a kind that are known here, sorted."""
+    registered = {name for known, name in _REGISTERED if known == kind}
+    return sorted(registered | {point.name for point in _points(kind)})
+
+
+def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
+    """Reads a part as users write it: `NAME`, or `{part: NAME, label: L, options: {…}}`.
+
+    Args:
+        kind: one of `KINDS`.
+        given: the text or the mapping.
+
+    Returns:
+        The part, with a value after its last colon moved to its options. Without a label it is called as
+        it was written, less the module or file.
+
+    Raises:
+        ConfigError: it is of neither form.
+    """
+    if isinstance(given, Part):
+        return given
+    fields: Any = {"part": given} if isinstance(given, str) else given
+    if (
+        not isinstance(fields, Mapping)
+        or not {"part"} <= set(fields) <= {"part", "label", "options"}
+        or not isinstance(fields["part"], str)
+        or not isinstance(fields.get("options") or {}, Mapping)
+    ):
+        raise ConfigError(
+            f"Expected a {kind} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
+        )
+    text = fields["part"]
+    source, value = _split_value(kind, text)
+    options = dict(fields.get("options") or {})
+    if value is not None:
+        name, option = _first_option(kind, source, text)
+        if name in options:
+            raise ConfigError(f"Expected option {name!r} of {kind} {text!r} once, got {options[name]!r} too.")
+        options = {name: from_text(f"{kind} {source!r}", name, option, value), **options}
+    place = source.rpartition(":")[0]
+    label = fields.get("label") or (text[len(place) + 1 :] if place else text)
+    return Part(part=source, label=str(label), options=options)
+
+
+def complete(kind: str, part: Part) -> Part:
+    """Checks a part's options and fills in their defaults, so that like parts have like options.
+
+    Raises:
+        ConfigError: there is no such part or option, or a value is of another type.
+    """
+    owner = f"{kind} {part.part!r}"
+    target = find(kind, part.part).target
+    known, given = options_of(kind, target), _typed_options(kind, part, target)
+    options = {}
+    for name, option in known.items():
+        value = given.get(name, option.default)
+        if value is NO_DEFAULT:
+            raise ConfigError(
+                f"Expected option {name!r} of {owner} as {type_name(option.kind)}, got none. It has no default."
+            )
+        try:
+            options[name] = plain(value)
+        except ConfigError as error:
+            raise ConfigError(f"Option {name!r} of {owner} cannot be recorded. {error}") from error
+    return Part(part=part.part, label=part.label, options=options)
+
+
+def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
+    """Makes a part.
+
+    Args:
+        kind: one of `KINDS`.
+        part: which, in any form that `read_part` reads.
+        given: what the part is made for, such as an objective's `robot`; passed on where a parameter bears the name.
+
+    Returns:
+        The object; of a risk measure a function of the mixture alone.
+
+    Raises:
+        ConfigError: there is no such part or option, or it refuses its options.
+    """
+    part = read_part(kind, part)
+    owner = f"{kind} {part.part!r}"
+    target = find(kind, part.part).target
+    complete(kind, part)
+    arguments = _typed_options(kind, part, target)
+    config = config_class(target, _GIVEN.get(kind, ()))
+    if config:
+        arguments = {"config": call(f"options of {owner}", config, arguments)}
+    arguments |= {name: value for name, value in given.items() if name in parameters(target)}
+    if kind == "risk" and not inspect.isclass(target):
+        return partial(target, **arguments)
+    return call(owner, target, arguments)
+
+
+def find(kind: str, source: str) -> Found:
+    """Finds a part by name, module or file.
+
+    Args:
+        kind: one of `KINDS`.
+        source: a name, `package.module:Name` or `path/to/file.py:Name`.
+
+    Raises:
+        ConfigError: there is none, or it cannot be imported.
+    """
+    if (_checked(kind), source) in _REGISTERED:
+        target = _REGISTERED[kind, source]
+        digest = partial(digest_of_target, target)
+        return Found(target=target, origin="this process", source_digest=digest, everywhere=False)
+    points = [point for point in _points(kind) if point.name == source]
+    if len(points) > 1:
+        raise ConfigError(
+            f"Expected one {kind} {source!r}, got several: {', '.join(point.value for point in points)}. "
+            "Write package.module:Name."
+        )
+    place, colon, name = points[0].value.partition(":") if points else source.rpartition(":")
+    if place.endswith(".py"):
+        return _found_in_file(kind, Path(place), name)
+    if colon and place:
+        return _found_in_module(kind, place, name.partition("[")[0].strip())
+    raise _unknown(kind, source)
+
+
+def options_of(kind: str, target: Any) -> dict[str, Option]:
+    """Lists the options of a class or function, in order, by name.
+
+    Parameters that are given by the caller (an objective's `robot` and `goal_radius_m`, a risk measure's mixture)
+    are none.
+    """
+    skipped = _GIVEN.get(kind, ())
+    if kind == "risk" and not inspect.isclass(target):
+        skipped += tuple(parameters(target))[:1]
+    return list_options(target, skipped)
+
+
+def _checked(kind: str) -> str:
+    if kind not in KINDS:
+        raise ConfigError(
+            f"Expected a kind of part among {', '.join(KINDS)}, got {kind!r}.{hint(kind, KINDS)}"
+        )
+    return kind
+
+
+def _points(kind: str) -> tuple[EntryPoint, ...]:
+    return _points_on(_checked(kind), tuple(sys.path))
+
+
+@cache
+def _points_on(kind: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Entry points of what is installed; asked again when the path has changed."""
+    return tuple(entry_points(group=f"benchnav.{kind}s"))
+
+
+def _split_value(kind: str, text: str) -> tuple[str, str | None]:
+    """Splits `NAME:VALUE`; a colon that belongs to a module or file stays."""
+    head, colon, tail = text.rpartition(":")
+    is_part = ":" in head or head in names(kind) or not tail[:1].isidentifier()
+    return (head, tail) if colon and is_part else (text, None)
+
+
+def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
+    known = options_of(kind, find(kind, source).target)
+    if not known:
+        raise ConfigError(f"Expected {kind} {source!r} without a value, got {text!r}: it has no options.")
+    return next(iter(known.items()))
+
+
+def _typed_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
+    owner, known = f"{kind} {part.part!r}", options_of(kind, target)
+    refuse_unknown(owner, part.options, known, gone=gone_options(target, _GIVEN.get(kind, ())))
+    return {name: typed(owner, name, known[name], value) for name, value in part.options.items()}
+
+
+def _unknown(kind: str, source: str) -> ConfigError:
+    remedy = hint(source, names(kind))
+    if source.endswith(".py"):
+        remedy = f" Say which class or function of it: {source}:Name."
+    elif Path(f"{source}.py").is_file():
+        remedy = f" Did you mean './{source}.py:Name'?"
+    return ConfigError(
+        f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or path/to/file.py:Name, "
+        f"got {source!r}.{remedy}"
+    )
+
+
+def _found_in_module(kind: str, place: str, name: str) -> Found:
+    try:
+        module = importlib.import_module(place)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{place}.".startswith(f"{error.name}."):
+            file = Path(*place.split(".")).with_suffix(".py")
+            if file.is_file():
+                remedy = f" Did you mean './{file}:{name}'?"
+            else:
+                remedy = (
+                    hint(place, names(kind)) or " Install its package, or name a file: path/to/file.py:Name."
+                )
+            raise ConfigError(
+                f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or "
+                f"path/to/file.py:Name, got {place + ':' + name!r}, and there is no module {error.name!r}.{remedy}"
+            ) from error
+        raise ConfigError(f"module {place} could not be imported: {one_line(error)}") from error
+    target = attribute(module, place, name)
+    if place.partition(".")[0] == "benchnav":
+        return Found(target=target, origin=f"benchnav {benchnav.__version__}", shipped=True)
+    modules = {place, str(getattr(target, "__module__", place))}
+    foreign = [name for name in modules if name.partition(".")[0] not in ("benchnav", "builtins")]
+    return Found(
+        target=target,
+        origin=distribution_of(place.partition(".")[0]) or f"module {place}",
+        source_digest=partial(digest_of_modules, foreign),
+    )
+
+
+def _found_in_file(kind: str, path: Path, name: str) -> Found:
+    path = path.expanduser()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        near = hint(path.name, (other.name for other in path.parent.glob("*.py")))
+        raise ConfigError(
+            f"Expected a {kind} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
+        ) from error
+    target = attribute(load_file(path.resolve(), content), str(path), name)
+    source = partial(digest_of_file_part, path.resolve(), content)
+    return Found(target=target, origin=f"file {path}", source_digest=source)
+
+
+def _listed_files(target: Any) -> Iterator[tuple[str, str]]:
+    """What a part lists as `files`, each with its digest."""
+    listed = getattr(target, "files", ())
+    if not listed or not isinstance(listed, list | tuple) or "files" in parameters(target):
+        return
+    module = sys.modules.get(str(getattr(target, "__module__", "")))
+    folder = Path(getattr(module, "__file__", None) or "").parent
+    for name in map(str, listed):
+        digest = digest_of_path(folder / name)
+        if not digest:
+            raise ConfigError(
+                f"Expected `files` of {target.__qualname__} in {folder}, got {name!r}, which is not there."
+            )
+        yield name, digest
+
+
+def option_files(kind: str, part: Part) -> dict[str, str]:
+    """Digests of what a part's options name: files and folders, by the path as it is written.
+
+    What reads as a path and is not there is among them, with an empty digest, so that it is seen when it comes or goes.
+    Options that the part lists as `writes` are not.
+
+    Raises:
+        ConfigError: an option names a folder that holds the working folder.
+    """
+    if not part.options:
+        return {}
+    written = getattr(find(kind, part.part).target, "writes", ())
+    found = {}
+    for text in _texts([value for name, value in part.options.items() if name not in written]):
+        path = Path(text).expanduser()
+        there = os.path.exists(path)  # of what cannot be a path false, where Path raises
+        if there and path.is_dir() and Path.cwd().is_relative_to(path.resolve()):
+            raise ConfigError(
+                f"Expected options of {kind} {part.part!r} that name files or folders of their own, got {text!r}, "
+                "which holds the working folder. Name the folder that is read, or list the option in its `writes`."
+            )
+        if there or os.sep in text or re.search(r"\.[A-Za-z]\w*$", text):
+            found[text] = digest_of_path(path) if there else ""
+    return found
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts in a value of plain data."""
+    if isinstance(value, str):
+        if value:
+            yield value
+    elif isinstance(value, Mapping | list | tuple):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(inner)

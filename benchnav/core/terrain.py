@@ -1,0 +1,119 @@
+"""Terrain value types: what is true of the ground, and what a robot may see of it.
+
+Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×W cells.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
+from benchnav.core.mixture import TraversabilityMixture
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The paper's o: all that a traversability model may see.
+
+    Args:
+        rgb: top-down colour image, uint8, shape [B, 3, H, W].
+        elevation_m: shape [B, H, W].
+        slope_deg: inclination by Horn's method, shape [B, H, W].
+        grid: size and resolution.
+    """
+
+    rgb: Tensor
+    elevation_m: Tensor
+    slope_deg: Tensor
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        """Checks that the layers fit the grid and one another."""
+        batch = self.rgb.shape[0]
+        _check_shapes(self.grid, batch, elevation_m=self.elevation_m, slope_deg=self.slope_deg)
+        if self.rgb.dtype != torch.uint8 or self.rgb.shape != (batch, 3, *self.grid.shape):
+            raise ConfigError(
+                f"Expected `rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
+                f"got {self.rgb.dtype} of shape {list(self.rgb.shape)}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Terrain:
+    """The ground as it is. Only the simulation and the `oracle` model are given this.
+
+    Args:
+        rgb: uint8, shape [B, 3, H, W].
+        class_id: index into the dataset's class table, 255 where the class is not known, shape [B, H, W].
+        elevation_m: shape [B, H, W].
+        slope_deg: shape [B, H, W].
+        truth: the true distribution of λ in each cell, parameters of shape [B, K, H, W]: of the cell's
+            own class at its slope, and of its soft spots where the class has them. Means are NaN where the
+            class is not known.
+        traversability: one realised λ, shape [B, H, W].
+        grid: size and resolution.
+        look_alikes: gives what colours can tell at best, from classes and slopes [B, H, W]: the truth of all
+            classes that look like the cell's own, weighted alike; None where no two classes look alike, so
+            that it is the truth.
+    """
+
+    rgb: Tensor
+    class_id: Tensor
+    elevation_m: Tensor
+    slope_deg: Tensor
+    truth: TraversabilityMixture
+    traversability: Tensor
+    grid: Grid
+    look_alikes: Callable[[Tensor, Tensor], TraversabilityMixture] | None = None
+
+    def __post_init__(self) -> None:
+        """Checks that the layers fit the grid and one another."""
+        _check_shapes(
+            self.grid,
+            self.rgb.shape[0],
+            class_id=self.class_id,
+            elevation_m=self.elevation_m,
+            slope_deg=self.slope_deg,
+            truth=self.truth.weights.select(-3, 0),
+            traversability=self.traversability,
+        )
+
+    def __len__(self) -> int:
+        """Number of maps B."""
+        return self.rgb.shape[0]
+
+    def select(self, members: Tensor) -> "Terrain":
+        """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
+        kept: dict[str, Any] = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, TraversabilityMixture):
+                kept[f.name] = value.select(members)
+            else:
+                kept[f.name] = value[members] if isinstance(value, Tensor) else value
+        return Terrain(**kept)
+
+    def to(self, device: torch.device | str) -> "Terrain":
+        """The maps on a device."""
+        movable = (Tensor, TraversabilityMixture)
+        moved: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, value in moved.items():
+            moved[name] = value.to(device) if isinstance(value, movable) else value
+        return Terrain(**moved)
+
+    def observe(self) -> Observation:
+        """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""
+        return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid)
+
+
+def _check_shapes(grid: Grid, batch: int, **layers: Tensor) -> None:
+    for name, layer in layers.items():
+        if layer.shape != (batch, *grid.shape):
+            raise ConfigError(
+                f"Expected `{name}` of shape [{batch}, {grid.height}, {grid.width}], "
+                f"got {list(layer.shape)}. Pass a batch of maps on one grid."
+            )

@@ -1,0 +1,191 @@
+"""The Gymnasium environment `benchnav/OffRoad-v0`, single and vectorised.
+
+Observations hold what a robot may know: where it is, its goal, and the paper's Observation of the map;
+never the truth.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from benchnav.env.batch import AnyPart, AnyWorld, EnvBatch, Observations
+from benchnav.planning.objective import Objective
+from benchnav.planning.robots import Robot
+from benchnav.planning.world.outcome import Outcome
+
+
+class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
+    """Drive to the goal over terrain of uncertain traversability.
+
+    ## Arguments
+    Of `gymnasium.make("benchnav/OffRoad-v0", …)`; `make_vec` takes the same, and `num_envs`.
+
+    | argument        | default       | meaning                                                              |
+    |-----------------|---------------|----------------------------------------------------------------------|
+    | `data`          | `"paper-v1"`  | path or id of a dataset                                              |
+    | `split`         | `""`          | which of its splits; empty for `train`, else its first, with a warning |
+    | `robot`         | `"unicycle"`  | F: a name, `file.py:Name`, `{"part": NAME, "options": {…}}`, or a robot |
+    | `objective`     | `""`          | J, likewise; empty for the shaped reward                             |
+    | `world`         | `"paper"`     | what λ does: `"paper"`, `"stakes"`, or changes to one of them        |
+    | `goal_radius_m` | `1.0`         | a robot this near to its goal has arrived                            |
+
+    ## Action space
+    A `Box` of the robot's bounds, float32. The unicycle's is `Box([0, -1], [1, 1], (2,))`: linear velocity
+    v in m/s and angular velocity ω in rad/s, as commanded. Actions beyond the bounds are clipped. The
+    traversability λ of the cell under the robot scales the motion. A step takes the robot's `dt_s`, 0.1 s.
+
+    ## Observation space
+    A `Dict` of
+
+    | key           | dtype   | shape     | meaning                                                       |
+    |---------------|---------|-----------|---------------------------------------------------------------|
+    | `state`       | float32 | (S,)      | x, y in metres, heading θ in radians, and what the robot adds |
+    | `goal`        | float32 | (2,)      | x, y in metres                                                |
+    | `rgb`         | uint8   | (3, H, W) | top-down colour image                                         |
+    | `elevation_m` | float32 | (H, W)    | elevation                                                     |
+    | `slope_deg`   | float32 | (H, W)    | slope by Horn's method                                        |
+
+    S is 3 for the unicycle and the bicycle, 5 for the differential drive, whose velocities v and ω follow.
+
+    ## Reward
+    Without `objective`: metres gained toward the goal, −0.1 a second, +10 on arrival and −10 off the map or
+    where the ground immobilises the robot for good. With one: minus its stage cost, read at the state before the
+    step and the observed λ there. A step that loses the robot in one of these ways costs as much again for each
+    step that is left, as if the robot stood there until T.
+
+    ## World
+    `"paper"`: λ is drawn anew at each step, low λ ends nothing, T = 100 s. `"stakes"`: λ is drawn once an
+    episode as a correlated field; 2 s on λ under 0.1 end it; T is 3 × the map's reference time at top speed.
+    Changes are given as a mapping, such as `{"preset": "stakes", "correlation_m": 2.0}`,
+    `{"noise": "stored", "time_budget_s": 60.0}` or `{"preset": "stakes", "immobile": None}`; see
+    `benchnav.planning.world.world.World`.
+
+    ## Start and end
+    An episode starts at the start of a map of the split, drawn at random or given by
+    `options={"map": i}`, heading at the goal. It terminates at the goal, off the map, or
+    where the world says that the ground immobilises the robot for good; and is truncated after T.
+
+    ## Info
+
+    | key              | type  | meaning                                                    |
+    |------------------|-------|------------------------------------------------------------|
+    | `map`       | int   | number of the map in its split                             |
+    | `outcome`        | str   | `running`, `success`, `timeout`, `immobilised` or `out_of_bounds` |
+    | `is_success`     | bool  | the goal was reached                                       |
+    | `traversability` | float | observed λ in the step; 1 after a reset                         |
+    | `distance_m`     | float | to the goal                                                |
+
+    ## Version history
+    * v0 of benchnav 0.3: `world` in place of `noise` and `time_budget_s`.
+    * v0 of benchnav 0.2: `robot` in place of `dynamics`; `objective`, `goal_radius_m` and `is_success` are
+      new; `split` is `train` by default, was `test/std`; `noise` "stored", was "frozen".
+    * v0 of benchnav 0.1: first version.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - the base class's contract
+
+    def __init__(
+        self,
+        data: str | Path = "paper-v1",
+        split: str = "",
+        robot: AnyPart | Robot = "unicycle",
+        objective: AnyPart | Objective = "",
+        world: AnyWorld = "paper",
+        goal_radius_m: float = 1.0,
+    ) -> None:
+        """Loads the maps of the split; see the class."""
+        self._batch = EnvBatch(1, data, split, robot, objective, world, goal_radius_m)
+        self.observation_space = self._batch.observation_space
+        self.action_space = self._batch.action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Starts an episode; see the class."""
+        super().reset(seed=seed)
+        chosen = (options or {}).get("map")
+        self._batch.reset([self.np_random], np.array([True]), chosen)
+        return _first(self._batch.observe()), self._info(np.ones(1, np.float32))
+
+    def step(self, action: np.ndarray) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Takes one time step; see the class."""
+        reward, terminated, truncated, met = self._batch.step(np.asarray(action)[None])
+        observation = _first(self._batch.observe())
+        return observation, float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._info(met)
+
+    def _info(self, met: np.ndarray) -> dict[str, Any]:
+        info = {name: values[0].item() for name, values in self._batch.info(met).items()}
+        return {**info, "outcome": Outcome(info["outcome"]).name.lower()}
+
+
+class OffRoadVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
+    """Many `OffRoadEnv` stepped as one batch, with next-step autoreset.
+
+    Sub-environment i seeded with s is the single environment seeded with s + i. `info` holds arrays; its
+    `outcome` is a number, see `benchnav.planning.world.outcome.Outcome`. Arguments, spaces and rewards are
+    those of `OffRoadEnv`.
+
+    Args:
+        num_envs: how many.
+        data: see `OffRoadEnv`, as for all that follow.
+        split: which split.
+        robot: F.
+        objective: J.
+        world: what λ does.
+        goal_radius_m: where a robot has arrived.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        data: str | Path = "paper-v1",
+        split: str = "",
+        robot: AnyPart | Robot = "unicycle",
+        objective: AnyPart | Objective = "",
+        world: AnyWorld = "paper",
+        goal_radius_m: float = 1.0,
+    ) -> None:
+        """Loads the maps of the split; see the class."""
+        self.num_envs = num_envs
+        self._batch = EnvBatch(num_envs, data, split, robot, objective, world, goal_radius_m)
+        self.single_observation_space = self._batch.observation_space
+        self.single_action_space = self._batch.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._generators: list[np.random.Generator] = []
+        self._ended = np.ones(num_envs, dtype=bool)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Starts an episode in each sub-environment."""
+        if seed is not None or not self._generators:
+            _, root = seeding.np_random(seed)
+            self._generators = [seeding.np_random(root + i)[0] for i in range(self.num_envs)]
+        self._batch.reset(self._generators, np.ones(self.num_envs, bool), (options or {}).get("map"))
+        self._ended = np.zeros(self.num_envs, dtype=bool)
+        return self._batch.observe(), self._batch.info(np.ones(self.num_envs, np.float32))
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[Observations, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Takes one time step, or starts anew where the last one ended an episode."""
+        if not self._generators:
+            raise gymnasium.error.ResetNeeded("Call reset() before step().")
+        again = self._ended
+        if again.any():
+            self._batch.reset(self._generators, again, None)
+        reward, terminated, truncated, met = self._batch.step(actions, hold=again)
+        self._ended = terminated | truncated
+        return self._batch.observe(), reward, terminated, truncated, self._batch.info(met)
+
+
+def _first(observations: Observations) -> Observations:
+    return {name: values[0] for name, values in observations.items()}

@@ -1,0 +1,1 @@
+"""What is asked: suites, their conditions, units of work and hypotheses."""

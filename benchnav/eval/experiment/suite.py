@@ -1,0 +1,103 @@
+"""Evaluation suites as users write them: what is to be compared, as plain data.
+
+`condition` makes conditions of a suite. This module imports nothing heavy, so that the command's help is quick.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.keep import Keep, Record, Steps
+
+PartSpec = str | dict[str, Any]
+
+_SEEDS = 2**63  # what a table's column of whole numbers holds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """What is evaluated: the product of everything listed, or of each mapping in `conditions`.
+
+    A planner, model, risk measure, robot or objective is given as NAME, package.module:Name,
+    path/to/file.py:Name, or {part: NAME, label: LABEL, options: {...}}.
+
+    Args:
+        data: Path or id of a dataset with splits test/SCENARIO.
+        scenarios: Test splits by scenario; every one of the data when none is named.
+        model: Model, or checkpoint by folder or by name in `checkpoints/`; `oracle` knows the truth.
+        models: Several models in place of `model`.
+        planners: Planners.
+        risks: Risk settings, such as `mean` or `cvar:0.9`.
+        robots: Robots F.
+        objectives: Objectives J.
+        world: What λ does: a preset by name, paper or stakes, or {preset: NAME, noise: resampled | stored |
+            frozen, correlation_m: 1.5, immobile: {below: 0.1, for_s: 2}, time_budget_s: T or
+            time_budget_ratio: T over the map's reference time}; or a list of several.
+        task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
+            goal_radius_m: 1.0}.
+        noise: Short for `world.noise`.
+        time_budget_s: Short for `world.time_budget_s`; 0 takes the world's.
+        planner_options: Options of planners by name, as {planner: {option: value}}.
+        maps: Maps a scenario, the first ones of the split; 0 takes all.
+        seed: Root seed of all draws.
+        seeds: Several root seeds in place of `seed`.
+        realisations: How often λ is drawn for each map and seed.
+        record: Episodes that are recorded for playback: none, failures, the first map of each condition, or all.
+        steps: Episodes whose steps are stored: none, those that are recorded, or all.
+        conditions: Several products: mappings of the keys above, each taking what it leaves out from there.
+        hypotheses: What the run is to show, fixed before its first unit: mappings of `one` and `other`, conditions by
+            their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
+            path_length; `kind`: difference, non-inferiority or equivalence; `direction`: higher or lower; `margin`.
+    """
+
+    data: str = "paper-v1"
+    scenarios: tuple[str, ...] = ()
+    model: PartSpec = "paper-v1"
+    models: tuple[PartSpec, ...] = ()
+    planners: tuple[PartSpec, ...] = ("straight", "astar_dwa", "cl_rrt", "mppi")
+    risks: tuple[PartSpec, ...] = ("cvar", "var", "mean")
+    robots: tuple[PartSpec, ...] = ("unicycle",)
+    objectives: tuple[PartSpec, ...] = ("goal_distance",)
+    world: tuple[PartSpec, ...] | PartSpec = "paper"
+    task: dict[str, Any] = field(default_factory=dict)
+    noise: str = ""
+    time_budget_s: float = 0.0
+    planner_options: dict[str, dict[str, Any]] = field(default_factory=dict)
+    maps: int = 20
+    seed: int = 0
+    seeds: tuple[int, ...] = ()
+    realisations: int = 1
+    record: Record = "first"
+    steps: Steps = "all"
+    conditions: tuple[dict[str, Any], ...] = ()
+    hypotheses: tuple[dict[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuses suites with nothing in them."""
+        for name in ("planners", "risks", "robots", "objectives", "world"):
+            if not getattr(self, name):
+                raise ConfigError(f"Expected one or more `{name}`, got none.")
+        if self.maps < 0:
+            raise ConfigError(f"Expected `maps` ≥ 0, got {self.maps}.")
+        if self.realisations < 1:
+            raise ConfigError(f"Expected `realisations` ≥ 1, got {self.realisations}.")
+        for seed in self.all_seeds:
+            if not 0 <= seed < _SEEDS:
+                raise ConfigError(f"Expected `seed` ≥ 0 and below 2^63, got {seed}.")
+        if len(set(self.all_seeds)) != len(self.all_seeds):
+            raise ConfigError(f"Expected `seeds` that differ, got {list(self.seeds)}.")
+        _ = self.keep  # refuses what is no choice
+
+    @property
+    def all_seeds(self) -> tuple[int, ...]:
+        """The root seeds."""
+        return self.seeds or (self.seed,)
+
+    @property
+    def keep(self) -> Keep:
+        """What is kept of episodes beside their rows."""
+        return Keep(record=self.record, steps=self.steps)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Gives the suite as plain data for JSON."""
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}

@@ -1,0 +1,89 @@
+"""Sweeps: where a suite gives several values for one, it means each of them."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.options import typed
+from benchnav.core.registry import Part
+
+
+def each_part(kind: str, part: Part) -> list[Part]:
+    """Gives a part for each combination of values where an option is given a list of them.
+
+    A list that the option itself takes, such as a pair of bounds, is one value. Each part is labelled by its
+    values: `cvar:0.9` for the first option, which stands behind a colon, `astar_dwa lookahead_m=4` for others.
+
+    Args:
+        kind: of the part, as in `registry.KINDS`.
+        part: with options that may hold lists.
+
+    Returns:
+        The part itself where nothing is swept.
+    """
+    known = registry.options_of(kind, registry.find(kind, part.part).target)
+    lists = {
+        path: values
+        for name, value in part.options.items()
+        if name in known and not _taken(kind, part.part, name, known[name], value)
+        for path, values in _lists(value, (name,))
+    }
+    first = next(iter(known), None)
+    made = []
+    for values in product(*lists.values()):
+        chosen = dict(zip(lists, values, strict=True))
+        made.append(
+            replace(part, label=_label(part.label, chosen, first), options=_with(part.options, chosen))
+        )
+    return made
+
+
+def each_mapping(given: Any) -> list[Any]:
+    """Gives a mapping for each combination of values where one is a list, at any depth; anything else as it is."""
+    if not isinstance(given, Mapping):
+        return [given]
+    lists = dict(_lists(given, ()))
+    return [
+        _with(given, dict(zip(lists, values, strict=True))) if lists else given
+        for values in product(*lists.values())
+    ]
+
+
+def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
+    try:
+        typed(f"{kind} {source!r}", name, option, value)
+    except ConfigError:
+        return False
+    return True
+
+
+def _lists(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], list[Any]]]:
+    """Lists in a value, at any depth, each with where it stands."""
+    if isinstance(value, list | tuple):
+        if not value:
+            raise ConfigError(f"Expected one or more values of `{'.'.join(path)}`, got none.")
+        yield path, list(value)
+    elif isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _lists(inner, (*path, str(name)))
+
+
+def _with(options: Mapping[str, Any], chosen: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+    made = dict(options)
+    for path, value in chosen.items():
+        name, *inner = path
+        made[name] = _with(made[name], {tuple(inner): value}) if inner else value
+    return made
+
+
+def _label(label: str, chosen: Mapping[tuple[str, ...], Any], first: str | None) -> str:
+    if first is not None and list(chosen) == [(first,)]:
+        return f"{label}:{_text(chosen[(first,)])}"
+    return " ".join([label, *(f"{'.'.join(path)}={_text(value)}" for path, value in chosen.items())])
+
+
+def _text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,1 +1,0 @@
-"""What planners are held to: the contract, and the boundary between a planner and an episode."""

@@ -1,0 +1,1 @@
+"""Checks for the tests of whoever writes a planner or a model."""

@@ -1,0 +1,206 @@
+"""What identifies a part: its source and what that imports, the files that it lists, and those that options name."""
+
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from benchnav.core.errors import ConfigError
+from benchnav.core.registry import Part, find, option_files
+from benchnav.core.sources import imported_sources
+
+PART = """
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent / "lib"))
+import first_aid
+sys.path.pop(0)
+
+
+class Planner:
+    def __init__(self, weights: str = "", inner: dict | None = None) -> None:
+        self.weights = weights
+
+    def plan(self):
+        import late_aid
+        from aid_package.deep import gain
+        import importlib
+        return importlib.import_module("named_aid"), gain
+"""
+IMPORTED = {
+    "lib/first_aid.py": "import second_aid\n",
+    "lib/second_aid.py": "x = 1\n",
+    "late_aid.py": "x = 1\n",
+    "named_aid.py": "x = 1\n",
+    "aid_package/__init__.py": "",
+    "aid_package/deep/__init__.py": "from ..other import gain\n",
+    "aid_package/other.py": "from . import beside\ngain = 1\n",
+    "aid_package/beside.py": "x = 1\n",
+}
+
+
+_DIGEST = (
+    "import sys; from benchnav.core.registry import find; "
+    "print(find('planner', sys.argv[1] + ':Planner').digest)"
+)
+
+
+@pytest.fixture
+def part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A part of several files, away from the working folder."""
+    known, path = set(sys.modules), list(sys.path)
+    place = tmp_path / "parts"
+    for name, text in IMPORTED.items():
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_text(text)
+    (place / "aid_package" / "unused.py").write_text("x = 1\n")
+    (place / "unused_aid.py").write_text("x = 1\n")
+    (place / "part.py").write_text(PART)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    yield place / "part.py"
+    sys.path[:] = path
+    for name in set(sys.modules) - known:
+        del sys.modules[name]
+
+
+def digest(part: Path) -> str:
+    return find("planner", f"{part}:Planner").digest
+
+
+def refusal(call: Callable[[], object]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", IMPORTED)
+def test_a_change_of_any_file_that_is_imported_changes_the_digest(part: Path, name: str) -> None:
+    before = digest(part)
+    assert digest(part) == before
+    changed = part.parent / name
+    changed.write_text(changed.read_text() + "# edited\n")
+    assert digest(part) != before
+
+
+@pytest.mark.parametrize("name", ["unused_aid.py", "aid_package/unused.py"])
+def test_what_is_not_imported_does_not(part: Path, name: str) -> None:
+    before = digest(part)
+    (part.parent / name).write_text("x = 2\n")
+    assert digest(part) == before
+
+
+def test_the_standard_library_and_what_is_installed_have_versions_instead(part: Path) -> None:
+    content = PART + "import torch.nn, json, pytest, benchnav.core.errors\n"
+    modules = imported_sources(part.parent, [("", content.encode())])
+    assert "late_aid" in modules
+    assert not {name.partition(".")[0] for name in modules} & {
+        "numpy",
+        "torch",
+        "json",
+        "pytest",
+        "benchnav",
+        "sys",
+    }
+    assert "numpy" in sys.modules  # it could have been followed
+
+
+def test_the_same_files_elsewhere_have_the_same_digest(part: Path, tmp_path: Path) -> None:
+    """A fresh process says so, which has imported neither."""
+    other = tmp_path / "copy"
+    part.parent.rename(other)
+    ran = subprocess.run(
+        [sys.executable, "-c", _DIGEST, str(other / "part.py")], capture_output=True, text=True, check=True
+    )
+    other.rename(part.parent)
+    assert ran.stdout.strip() == digest(part)
+
+
+def test_a_process_that_has_imported_an_older_file_is_like_no_other(part: Path) -> None:
+    """Python imports a module once: what a long-lived worker runs is not what now lies on the disk."""
+    helper = part.parent / "lib" / "second_aid.py"
+    older = digest(part)
+    helper.write_text("x = 2\n")
+    with_both = digest(part)
+    fresh = subprocess.run(
+        [sys.executable, "-c", _DIGEST, str(part)], capture_output=True, text=True, check=True
+    )
+    assert len({older, with_both, fresh.stdout.strip()}) == 3
+    helper.write_text("x = 1\n")
+    assert digest(part) == older
+
+
+def test_a_part_of_a_module_is_its_package_and_what_that_imports(
+    part: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(part.parent)
+    inner = part.parent / "aid_package" / "planner.py"
+    inner.write_text("import late_aid\n\n\nclass Planner:\n    files = ('planner.txt',)\n")
+    inner.with_suffix(".txt").write_text("1")
+    importlib.invalidate_caches()
+
+    def now() -> str:
+        return find("planner", "aid_package.planner:Planner").digest
+
+    seen = [now()]
+    for changed in ("aid_package/unused.py", "late_aid.py", "aid_package/planner.txt"):
+        (part.parent / changed).write_text("x = 2\n")
+        seen.append(now())
+    assert len(set(seen)) == 4
+    (part.parent / "unused_aid.py").write_text("x = 2\n")
+    assert now() == seen[-1]
+
+
+def test_files_that_a_part_lists_are_in_its_digest(part: Path) -> None:
+    part.write_text("class Planner:\n    files = ('weights.bin', 'tables')\n")
+    assert "got 'weights.bin', which is not there" in refusal(lambda: digest(part))
+    (part.parent / "weights.bin").write_bytes(b"1")
+    (part.parent / "tables").mkdir()
+    seen = {digest(part)}
+    for changed in ("weights.bin", "tables/a", "tables/b"):
+        (part.parent / changed).write_bytes(b"22")
+        seen.add(digest(part))
+    assert len(seen) == 4
+    part.write_text("class Planner:\n    def __init__(self, files: tuple[str, ...] = ('x',)) -> None: ...\n")
+    assert digest(part)  # an option of that name lists nothing
+
+
+def test_files_and_folders_that_options_name_are_known_by_what_they_hold(part: Path) -> None:
+    Path("weights.npz").write_bytes(b"1")
+    Path("tables").mkdir()
+    Path("tables", "a").write_bytes(b"1")
+    options = {"weights": "weights.npz", "inner": {"tables": ["tables", "", "mean"], "level": 0.5}}
+    asked = Part(part=f"{part}:Planner", label="", options=options)
+    seen = [option_files("planner", asked)]
+    assert set(seen[0]) == {"weights.npz", "tables"}
+    Path("weights.npz").write_bytes(b"2")
+    seen.append(option_files("planner", asked))
+    assert [seen[1][name] == seen[0][name] for name in ("weights.npz", "tables")] == [False, True]
+    os.rename("tables/a", "tables/b")
+    assert option_files("planner", asked)["tables"] != seen[0]["tables"]
+    Path("weights.npz").unlink()
+    assert option_files("planner", asked)["weights.npz"] == ""
+
+
+def test_what_a_part_writes_is_not_what_it_reads(part: Path) -> None:
+    Path("log").mkdir()
+    asked = Part(part=f"{part}:Planner", label="", options={"weights": "log"})
+    assert set(option_files("planner", asked)) == {"log"}
+    part.write_text(PART.replace("class Planner:\n", "class Planner:\n    writes = ('weights',)\n"))
+    assert option_files("planner", asked) == {}
+
+
+@pytest.mark.parametrize("folder", [".", "..", "/"])
+def test_a_folder_that_holds_the_working_folder_is_refused(part: Path, folder: str) -> None:
+    asked = Part(part=f"{part}:Planner", label="", options={"weights": folder})
+    assert f"got {folder!r}, which holds the working folder" in refusal(
+        lambda: option_files("planner", asked)
+    )

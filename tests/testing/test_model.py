@@ -1,0 +1,300 @@
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav.core import registry
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.terrain import Observation
+from benchnav.models.checkpoint import load_checkpoint, member_name
+from benchnav.models.config import MDNConfig
+from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
+from benchnav.models.predictor import ModelFamily, load_model, open_checkpoint
+from benchnav.testing.model import check_model
+
+NAMES = ("soft", "firm")
+
+
+class Good:
+    """Two components whose parameters hang on what the cell shows."""
+
+    class_names = NAMES
+
+    def predict(self, observation: Observation) -> TraversabilityMixture:
+        share = observation.rgb.float().mean(1) / 255
+        weights = torch.stack([share, 1 - share], 1)
+        means = torch.stack([share, 1 - observation.slope_deg.float() / 90], 1)
+        return TraversabilityMixture(weights, means, torch.full_like(means, 0.1))
+
+    def member_probabilities(self, observation: Observation) -> Tensor:
+        return torch.stack([self.predict(observation).weights] * 3)
+
+
+def changed(change: Callable[[TraversabilityMixture, Observation], TraversabilityMixture]) -> Good:
+    """A model that is good but for one thing."""
+
+    class Bad(Good):
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            return change(super().predict(observation), observation)
+
+        def member_probabilities(self, observation: Observation) -> Tensor:
+            return torch.stack([Good.predict(self, observation).weights])
+
+    return Bad()
+
+
+def with_members(members: Callable[[Tensor], object]) -> Good:
+    class Bad(Good):
+        def member_probabilities(self, observation: Observation) -> Tensor:
+            return members(self.predict(observation).weights)  # type: ignore[return-value]
+
+    return Bad()
+
+
+def with_soft_spots(owner: int) -> Good:
+    """The second class is split into a firm and a soft component, of which the latter is told to be another's."""
+
+    class Split(Good):
+        def predict(self, observation: Observation) -> TraversabilityMixture:
+            whole = super().predict(observation)
+            first, second = whole.weights.unbind(1)
+            weights = torch.stack([first, 0.1 * second, 0.9 * second], 1)
+            means, stds = whole.means[:, [0, 1, 1]], whole.stds[:, [0, 1, 1]]
+            return TraversabilityMixture(weights, means, stds, (0, 1, owner))
+
+        def member_probabilities(self, observation: Observation) -> Tensor:
+            return Good.predict(self, observation).weights[None]
+
+    return Split()
+
+
+def meddling(act: Callable[[Observation], object]) -> Good:
+    def change(mixture: TraversabilityMixture, observation: Observation) -> TraversabilityMixture:
+        act(observation)
+        return mixture
+
+    return changed(change)
+
+
+def poked(name: str, value: float) -> Good:
+    """One number alone is wrong, in the last cell."""
+
+    def change(mixture: TraversabilityMixture, observation: Observation) -> TraversabilityMixture:
+        values = getattr(mixture, name).clone()
+        values[-1, -1, -1, -1] = value
+        return replace(mixture, **{name: values})
+
+    return changed(change)
+
+
+class Forgetful(Good):
+    """Gives another answer each time it is asked."""
+
+    asked = 0
+
+    def predict(self, observation: Observation) -> TraversabilityMixture:
+        self.asked += 1
+        found = super().predict(observation)
+        return replace(found, means=found.means + 1e-6 * self.asked)
+
+
+class Needy(Good):
+    """Takes square maps alone."""
+
+    def predict(self, observation: Observation) -> TraversabilityMixture:
+        if observation.grid.height != observation.grid.width:
+            raise ValueError("sides differ")
+        return super().predict(observation)
+
+
+class Nameless(Good):
+    class_names = None  # type: ignore[assignment]
+
+
+class Misnamed(Good):
+    class_names = (*NAMES, "third")
+
+
+def crop(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
+    return TraversabilityMixture(
+        mixture.weights[..., :-1, :], mixture.means[..., :-1, :], mixture.stds[..., :-1, :]
+    )
+
+
+def transpose(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
+    return TraversabilityMixture(mixture.weights.mT, mixture.means.mT, mixture.stds.mT)
+
+
+def whole(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
+    weights = torch.zeros_like(mixture.weights)
+    weights[:, 0] = 1
+    return TraversabilityMixture(weights.long(), mixture.means.long(), mixture.stds.long())
+
+
+def of_batch(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
+    return replace(mixture, means=mixture.means - mixture.means.mean())
+
+
+def elsewhere(mixture: TraversabilityMixture, _: Observation) -> TraversabilityMixture:
+    return TraversabilityMixture(mixture.weights.to("meta"), mixture.means, mixture.stds)
+
+
+BAD = {
+    "no predict": (object(), "AttributeError"),
+    "an error": (Needy(), "ValueError: sides differ [maps of 20×37]"),
+    "no mixture": (
+        changed(lambda mixture, _: mixture.weights),
+        "TraversabilityMixture of shape [3, K, 32, 32], got Tensor",
+    ),
+    "one map for all": (
+        changed(lambda m, _: TraversabilityMixture(m.weights[:1], m.means[:1], m.stds[:1])),
+        "[3, K, 32, 32], got [1, 2, 32, 32]",
+    ),
+    "a row short": (changed(crop), "[3, K, 32, 32], got [3, 2, 31, 32]"),
+    "height for width": (changed(transpose), "[3, K, 20, 37], got [3, 2, 37, 20]"),
+    "integers": (changed(whole), "one floating-point dtype, got torch.int64"),
+    "two dtypes": (changed(lambda m, _: replace(m, means=m.means.double())), "got torch.float32, torch.float64"),
+    "elsewhere": (changed(elsewhere), "parameters on the observation's device cpu, got meta"),
+    "a weight that is no number": (poked("weights", float("nan")), "finite `weights`"),
+    "an infinite mean": (poked("means", float("inf")), "finite `means`"),
+    "an infinite std": (poked("stds", float("inf")), "finite `stds`"),
+    "a negative std": (poked("stds", -0.1), "`stds` ≥ 0"),
+    "a negative weight": (
+        changed(lambda m, _: replace(m, weights=3 * m.weights - 1)),
+        "`weights` ≥ 0",
+    ),
+    "weights of another sum": (poked("weights", 0.0), "sum to 1"),
+    "an observation brightened": (meddling(lambda seen: seen.rgb.add_(1)), "got another rgb"),
+    "an observation flattened": (meddling(lambda seen: seen.slope_deg.zero_()), "got another slope_deg"),
+    "PyTorch's generator": (meddling(lambda _: torch.rand(1)), "PyTorch's global generator"),
+    "PyTorch's seed": (meddling(lambda _: torch.manual_seed(54321)), "PyTorch's global generator"),
+    "NumPy's generator": (meddling(lambda _: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
+    "Python's generator": (meddling(lambda _: random.random()), "Python's global generator"),
+    "another answer": (Forgetful(), "got another when asked again"),
+    "an answer of the batch": (changed(of_batch), "Expected of a map alone"),
+    "too many names": (Misnamed(), "each of 2 components, got 3"),
+    "members without names": (Nameless(), "`class_names` beside"),
+    "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
+    "too few maps of members": (with_members(lambda weights: weights[None, :1]), "got [1, 1, 2, 32, 32]"),
+    "no members": (with_members(lambda weights: weights[None][:0]), "got [0, 3, 2, 32, 32]"),
+    "members that are none": (with_members(lambda weights: None), "got NoneType"),
+    "members of another average": (
+        with_members(lambda weights: weights.flip(1)[None]),
+        "order of the average of `member_probabilities`",
+    ),
+    "components of a class without a name": (
+        changed(lambda mixture, _: replace(mixture, group=(0, 2))),
+        "classes in `group` under 2, the number of `class_names`, got 2",
+    ),
+    "members whose soft spots are summed up wrongly": (with_soft_spots(0), "order of the average"),
+    "members that raise": (with_members(lambda weights: weights[9]), "IndexError"),
+    "members that draw": (
+        with_members(lambda weights: weights[None] + 0 * torch.rand(1)),
+        "PyTorch's global generator",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "expected"), BAD.values(), ids=BAD.keys())
+def test_a_breach_is_caught_and_named(model: object, expected: str) -> None:
+    states = torch.random.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    try:
+        with pytest.raises(ConfigError) as caught:
+            check_model(model)  # type: ignore[arg-type]
+    finally:
+        torch.random.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_breach_is_named_once_with_the_maps_it_was_found_on() -> None:
+    model = poked("stds", -0.1)
+    model.class_names = (*NAMES, "third")  # type: ignore[assignment]
+    with pytest.raises(ConfigError) as caught:
+        check_model(model, shapes=((9, 9), (12, 7)))
+    message = str(caught.value)
+    assert message.count("`stds` ≥ 0") == message.count("each of 2 components") == 1
+    assert message.count("[maps of 9×9, 12×7]") == 2
+    assert "(1) " in message
+    assert "(2) " in message
+
+
+def test_components_of_one_class_are_summed_up() -> None:
+    check_model(with_soft_spots(1))
+
+
+def test_a_pool_may_be_calibrated_as_a_whole() -> None:
+    class Sharper(Good):
+        def member_probabilities(self, observation: Observation) -> Tensor:
+            return self.predict(observation).weights.sqrt().div(2)[None]
+
+    check_model(Sharper())
+
+
+def test_a_model_that_takes_one_size_alone_names_it() -> None:
+    check_model(Needy(), shapes=((24, 24),))
+
+
+def test_the_tolerance_is_of_sums_and_of_maps_alone() -> None:
+    model = changed(lambda m, _: replace(m, weights=m.weights * 1.001))
+    check_model(model, tolerance=0.01)
+    with pytest.raises(ConfigError, match="sum to 1"):
+        check_model(model)
+
+
+def test_a_good_model_keeps_the_contract_and_is_tried_on_maps_of_many_colours_and_slopes() -> None:
+    seen: list[Observation] = []
+    check_model(meddling(seen.append))
+    assert sorted({(len(one.rgb), *one.grid.shape) for one in seen}) == [
+        (1, 20, 37),
+        (1, 32, 32),
+        (3, 20, 37),
+        (3, 32, 32),
+    ]
+    for one in seen:
+        assert len(one.rgb.movedim(1, -1).flatten(0, 2).unique(dim=0)) > 50
+        assert float(one.slope_deg.std()) > 1
+    first, second = seen[0].rgb[:2]
+    assert not torch.equal(first, second)
+
+
+def is_family(name: str) -> bool:
+    return isinstance(registry.find("model", name).target, ModelFamily)
+
+
+@pytest.mark.parametrize("name", [name for name in registry.names("model") if not is_family(name)])
+def test_every_registered_model_keeps_the_contract(name: str) -> None:
+    check_model(load_model(name))
+
+
+def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_has() -> None:
+    own = {name for name in registry.names("model") if registry.find("model", name).shipped}
+    assert {name for name in own if is_family(name)} == {"fused", "mdn"}
+
+
+@pytest.mark.parametrize("members", [1, 2])
+def test_fused_models_keep_the_contract(checkpoint_path: Path, members: int) -> None:
+    checkpoint = load_checkpoint(checkpoint_path)
+    for index in range(1, members):
+        part = checkpoint.part("classifier")
+        generator = torch.Generator().manual_seed(index)
+        tensors = {
+            name: value * torch.rand(value.shape, generator=generator) if value.ndim > 3 else value
+            for name, value in part.tensors.items()
+        }
+        checkpoint = checkpoint.with_part(member_name(index), replace(part, tensors=tensors))
+    check_model(open_checkpoint(checkpoint))
+
+
+def test_a_mixture_density_model_keeps_the_contract() -> None:
+    mean, std, scale = torch.full((3,), 90.0), torch.full((3,), 40.0), torch.tensor(9.0)
+    network = MixtureDensityNetwork(MDNConfig(encoder="mobilenet_v2"), mean, std, scale)
+    check_model(MixtureDensityModel(network))
