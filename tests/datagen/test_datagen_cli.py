@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.store import Shard
 from benchnav.datagen import cli
 from benchnav.datagen.files import create
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.shard import ShardFile
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
 from tests.factories import tiny_dataset
@@ -142,7 +142,7 @@ def test_options_of_create_reach_it(datagen: Call, monkeypatch: pytest.MonkeyPat
         assert datagen(*plain, *options) == 2
     none = (1, "", None, False)
     assert seen == [
-        none, (3, "", None, False), (1, "tcp://a:1", None, False), (1, "", ShardFile(index=2, of=3), False),
+        none, (3, "", None, False), (1, "tcp://a:1", None, False), (1, "", Shard(index=2, of=3), False),
         (1, "", None, True),
     ]  # fmt: skip
 
