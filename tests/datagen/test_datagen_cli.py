@@ -13,6 +13,7 @@ from benchnav.core.store import Shard
 from benchnav.datagen import cli
 from benchnav.datagen.files import create
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.files.shard import ShardFile
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes
 from tests.factories import tiny_dataset
