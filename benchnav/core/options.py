@@ -21,7 +21,13 @@ NO_DEFAULT = inspect.Parameter.empty
 
 # Names of earlier versions, with those of today.
 RENAMED = {
-    **{"instances": "maps", "instance": "map", "trials": "conditions", "slowest": "min_traversability"},
+    **{
+        "steps": "record",
+        "instances": "maps",
+        "instance": "map",
+        "trials": "conditions",
+        "slowest": "min_traversability",
+    },
     **{"recorded": "record", "split": "splits"},
 }
 

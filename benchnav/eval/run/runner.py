@@ -15,7 +15,7 @@ from typing import Any
 from benchnav.core.device import find_device, gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard, sole_writer
-from benchnav.core.workers import run_calls
+from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Suite
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder.folder import Finished, caveats, find_units, finish_run, write_errors
@@ -85,6 +85,9 @@ def run_work(
     work: Work, folder: Path, jobs: int, scheduler: str, overwrite: bool, say: Say
 ) -> Iterator[tuple[int, int]]:
     """Runs what is not finished of some work in a folder that the caller holds; otherwise as `run_suite`."""
+    if scheduler:
+        with connected(scheduler):  # else nothing is dropped or written
+            pass
     if work.settings.device == "cuda":
         say(f"computing on {gpu_name(work.settings.device)}")
     if overwrite:
@@ -136,11 +139,11 @@ def _missing(tasks: list[Task], folder: Path, reuse_code: bool, say: Say) -> lis
     if done := len(tasks) - len(missing):
         say(f"{done} of {len(tasks)} units were there already")
     if again:
-        say(f"{again} finished units are run again for recordings or steps that they were not asked for")
+        say(f"run again for recordings or steps that were not asked for: {again} of {len(tasks)} units")
     if unused:
         say(
-            f"{unused} finished units are of other code or maps ({'; '.join(other)}) and are not used; --reuse-code "
-            "takes those of other code"
+            f"finished by other code or maps ({'; '.join(other)}), so not used: {unused} of {len(tasks)} units; "
+            "--reuse-code takes those of other code"
         )
     return missing
 
