@@ -246,6 +246,7 @@ def test_rows_have_the_group_of_their_map(
             return {"group": np.array([40 + index // 2 for index in indices], np.int32)}
 
     monkeypatch.setattr(units_of_run, "TerrainDataset", Grouped)
+    units_of_run._block.cache_clear()
     block = units_of_run.read_maps(Grouped(dataset_path), "test/std", [0, 1])
     assert (block.groups.tolist(), block.groups.dtype) == ([40, 40], np.int64)
     list(run_suite(quick(dataset_path, maps=2), tmp_path / "grouped"))

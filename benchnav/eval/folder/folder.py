@@ -172,8 +172,8 @@ class Finished:
 
     Args:
         path: its file.
-        about: the metadata of the file: `key`, `code`, `maps`, `digests` of the maps, `record`, `made` (a token of this
-            one making of it, which copies keep), `traceback` and `errors`.
+        about: the metadata of the file: `unit` (what was run), `key`, `code`, `digests` of the maps, `record`, `made`
+            (a token of this one making of it, which copies keep), `traceback` and `errors`.
     """
 
     path: Path
@@ -195,7 +195,11 @@ def find_units(folder: Path, unit: Unit) -> list[Finished]:
         reverse=True,
     )
     found = [Finished(path=path, about=metadata(path)) for path in files]
-    return [finished for finished in found if finished.about.get("maps") == list(unit.maps)]
+    return [finished for finished in found if finished.about.get("unit") == _identity(unit)]
+
+
+def _identity(unit: Unit) -> list[Any]:
+    return [unit.condition.id, unit.seed, unit.realisation, *unit.maps]
 
 
 def metadata(path: Path) -> dict[str, Any]:
@@ -230,7 +234,7 @@ def write_unit(
     """
     key = origin.key(unit)
     about = {
-        **{"key": key, "code": origin.code, "maps": list(unit.maps), "digests": list(origin.maps)},
+        **{"unit": _identity(unit), "key": key, "code": origin.code, "digests": list(origin.maps)},
         **{
             "record": unit.record,
             "made": secrets.token_hex(8),

@@ -3,7 +3,7 @@
 Nothing is predicted and nothing is planned, but a planner prepares itself on a tiny map of its own.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -116,7 +116,7 @@ class Builder:
     """Builds conditions on the first map of their splits; what is the same in several is built once.
 
     Args:
-        datasets: by path or id.
+        datasets: those that are open, by path or id.
         seed: root seed of the draw of λ.
         maps: of each split; 0 for all.
 
@@ -124,7 +124,7 @@ class Builder:
         warnings: what readers of the results should know.
     """
 
-    def __init__(self, datasets: Mapping[str, TerrainDataset], seed: int, maps: int) -> None:
+    def __init__(self, datasets: dict[str, TerrainDataset], seed: int, maps: int) -> None:
         """Has built nothing yet."""
         self.datasets, self.seed, self.maps = datasets, seed, maps
         self.warnings: list[str] = []
@@ -136,6 +136,8 @@ class Builder:
         Raises:
             BenchnavError: it cannot be run.
         """
+        if condition.data not in self.datasets:
+            self.datasets[condition.data] = TerrainDataset(find_dataset(condition.data))
         dataset, task = self.datasets[condition.data], condition.make_task()
         if self._is_new("planner", condition.planner, condition.robot, condition.objective):
             _check_planner(condition, task)

@@ -6,6 +6,7 @@ What is repeated are the conditions of `run.json`, each as often as it was run, 
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -146,24 +147,25 @@ def _makings(folder: Path, unit: Unit) -> set[str]:
 def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
     lacking: dict[str, None] = {}
-    datasets: dict[str, TerrainDataset] = {}
-    builder = Builder(datasets, seed=0, maps=1)
+    builder = Builder({}, seed=0, maps=1)
     for condition, extent in run.conditions.values():
-        try:
-            if condition.data not in datasets:
-                datasets[condition.data] = TerrainDataset(find_dataset(condition.data))
-            count = datasets[condition.data].map_count(condition.split)
-            if count < extent.maps:
-                raise ConfigError(
-                    f"Expected {extent.maps} maps of {condition.data} {condition.split}, got {count}."
-                )
+        for check in (partial(_check_maps, extent.maps), provenance.describe_parts):
+            try:
+                check(condition)
+            except BenchnavError as error:
+                lacking[str(error)] = None
+        if not lacking:
             builder.build(condition)
-        except BenchnavError as error:
-            lacking[str(error)] = None
     if lacking:
         raise ConfigError(
             f"{run.folder} cannot be repeated here, since something is no longer there. {' '.join(lacking)}"
         )
+
+
+def _check_maps(maps: int, condition: Condition) -> None:
+    count = TerrainDataset(find_dataset(condition.data)).map_count(condition.split)
+    if count < maps:
+        raise ConfigError(f"Expected {maps} maps of {condition.data} {condition.split}, got {count}.")
 
 
 def _verdict(conditions: Mapping[str, Condition], rows: int, different: list[Difference]) -> list[str]:
