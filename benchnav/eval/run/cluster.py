@@ -8,18 +8,18 @@ there once. Before each unit its worker compares what rows depend on with what t
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import chdir, contextmanager, nullcontext
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import joblib
 import torch
 
-from benchnav.core import cluster
+from benchnav.core import workers
 from benchnav.core.device import gpu_name
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.store import replacing
+from benchnav.core.workers import run_calls
 from benchnav.eval.experiment.unit import Extent, Unit
 from benchnav.eval.folder import provenance
 
@@ -38,7 +38,7 @@ def connected(scheduler: str, planner_limit_s: float, device: str) -> Iterator[A
     Raises:
         ConfigError: the scheduler cannot be reached, has no worker, or has one that is not fit.
     """
-    with cluster.connected(scheduler) as client:
+    with workers.connected(scheduler) as client:
         own = {
             "code": provenance.describe_code(),
             "datasets": {},
@@ -70,14 +70,11 @@ def run_on_cluster(
     """
     if not missing:
         return
-    calls = (
-        joblib.delayed(_make)(run_unit, Path.cwd(), unit, about["run_id"], _subset(about, unit))
-        for unit in missing
-    )
-    with cluster.told_when_lost(client.scheduler.address):
-        for unit, files in cluster.parallel(client)(calls):
-            _store(folder, unit, files)
-            yield
+    given = about["run_id"]
+    calls = [partial(_make, run_unit, Path.cwd(), unit, given, _subset(about, unit)) for unit in missing]
+    for unit, files in run_calls(calls, scheduler=client.scheduler.address):
+        _store(folder, unit, files)
+        yield
 
 
 def describe_worker(dask_worker: Any) -> dict[str, Any]:

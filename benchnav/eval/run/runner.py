@@ -7,9 +7,7 @@ import json
 import os
 import secrets
 import traceback
-import warnings
 from collections.abc import Collection, Iterator, Mapping
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import chdir, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -17,14 +15,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import joblib
 import pandas as pd
 import torch
 
 from benchnav.core.device import find_device, gpu_name
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard, sole_writer
-from benchnav.core.workers import end_with
+from benchnav.core.workers import run_calls
 from benchnav.eval.experiment.condition import Condition, check_labels
 from benchnav.eval.experiment.keep import Keep
 from benchnav.eval.experiment.suite import Suite
@@ -274,27 +271,7 @@ def _run_here(missing: list[Unit], folder: Path, about: Mapping[str, Any], jobs:
     # Workers may be older than this call, so that they are told where names of files begin.
     here, target = Path.cwd(), folder.resolve()
     given = about["run_id"], about["planner_limit_s"], about["device"]
-    run = partial(_run_in_worker, os.getpid()) if jobs > 1 else _run_at
-    calls = (joblib.delayed(run)(here, unit, target, *given) for unit in missing)
-    finished = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(calls)
-    for _ in missing:
-        with warnings.catch_warnings():
-            # A worker whose memory has grown is replaced; that is no concern of a user's.
-            warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-            try:
-                next(finished)
-            except BrokenProcessPool as error:
-                raise BenchnavError(
-                    "A worker was killed, perhaps for want of memory. What was finished is kept: give the same "
-                    "command again, if need be with fewer `jobs`."
-                ) from error
-        yield
-
-
-def _run_in_worker(parent: int, *given: Any) -> None:
-    if os.getpid() != parent:  # joblib may make the calls here, where it can start no processes
-        end_with(parent)
-    _run_at(*given)
+    return run_calls([partial(_run_at, here, unit, target, *given) for unit in missing], jobs)
 
 
 def _run_at(here: Path, unit: Unit, folder: Path, run_id: str, planner_limit_s: float, device: str) -> None:

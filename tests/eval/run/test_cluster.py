@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchnav.core import cluster as dask
+from benchnav.core import workers as dask
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.eval import cli
 from benchnav.eval.experiment.keep import Keep
