@@ -17,8 +17,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.predictor import load_model
-from benchnav.models.training import classifiers
-from benchnav.models.training import mdn as mdn_training
+from benchnav.models.training import networks
 from benchnav.models.training.data import read_maps
 from benchnav.models.training.networks import measure
 from tests.models.support import make_dataset
@@ -367,8 +366,7 @@ def test_how_maps_are_read_reaches_the_training(
         seen.append((in_memory, workers))
         raise KeyboardInterrupt
 
-    module = mdn_training if kind == "mdn" else classifiers
-    monkeypatch.setattr(module, "MapData", opened)
+    monkeypatch.setattr(networks, "MapData", opened)
     quick = QUICK_GP if kind == "all" else []
     for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):
         where = ["--data", dataset.path, "--out", tmp_path / str(number)]

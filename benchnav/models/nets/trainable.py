@@ -3,6 +3,7 @@
 Letters in shapes: B maps, H×W cells.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any, ClassVar, Self
@@ -32,7 +33,8 @@ class TrainableNetwork(lightning.LightningModule):
         """Prepares what is measured."""
         super().__init__()
         self.config: Any = config
-        metrics = {"loss": MeanMetric(), **self.configure_metrics()}
+        # A loss that is no number is to be seen, not left out.
+        metrics = {"loss": MeanMetric(nan_strategy=math.nan), **self.configure_metrics()}
         self.metrics = MetricCollection(metrics, prefix="valid_", compute_groups=False)
 
     @classmethod

@@ -151,8 +151,12 @@ def train_parts(
         if target.holds(part, asdict(config), seed + number, asdict(type(config)()), half_precision):
             continue
         network, metrics = fit_network(config, dataset, seed + number, options, part, half_precision)
-        names = ("accuracy", "miou", "rmse", "loss")
-        shown = [f"{name} {metrics[f'valid_{name}']:.4f}" for name in names if f"valid_{name}" in metrics]
+        names = {"accuracy": "accuracy", "miou": "mIoU", "rmse": "RMSE", "loss": "loss"}
+        shown = [
+            f"{title} {metrics[f'valid_{name}']:.4f}"
+            for name, title in names.items()
+            if f"valid_{name}" in metrics
+        ]
         calibrated = set(network.settings()) - set(asdict(config))
         shown += [f"{name} {getattr(network, name):.3f}" for name in sorted(calibrated)]
         say(f"{part}: best epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")

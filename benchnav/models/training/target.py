@@ -152,10 +152,11 @@ def open_target(
         kept = {name: part for name, part in checkpoint.parts.items() if name not in dropped}
         checkpoint = replace(checkpoint, parts=kept)
     elif trained and not options.resume and is_first_process():
+        # The processes alone are trained in a moment, and so not gone on with.
+        resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
-            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace "
-            "it, or --resume to go on with what an interrupted training has left."
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it{resume}."
         )
     elif trained and not options.resume:
         checkpoint = fresh

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import torchmetrics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
@@ -28,7 +29,6 @@ from benchnav.models.nets.mdn import (
     censored_nll,
 )
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
-from benchnav.models.training import mdn as mdn_training
 from benchnav.models.training import networks
 from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
@@ -379,7 +379,7 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
             super().__init__(*arguments, **named)
             jitters.append(self.jitter)
 
-    monkeypatch.setattr(mdn_training, "MapData", Watched)
+    monkeypatch.setattr(networks, "MapData", Watched)
     network, _ = fit_network(
         replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
     )
@@ -392,16 +392,16 @@ def test_what_is_measured_in_validation_leaves_out_what_was_not_observed() -> No
     network, terrain = build(), make_terrain(size=32)
     observed = terrain.traversability.clone()
     observed[:, ::2] = float("nan")
-    logged: dict[str, object] = {}
-    network.log = lambda name, value, **_: logged.update({name: value})  # type: ignore[method-assign, assignment, misc]
+    logged: dict[str, torchmetrics.Metric] = {}
+    network.log_dict = lambda metrics, **_: logged.update(metrics)  # type: ignore[method-assign, assignment]
     batch = {"rgb": terrain.rgb, "slope_deg": terrain.slope_deg, "traversability": observed}
     with torch.no_grad():
         network.validation_step(batch, 0)
     mixture = MixtureDensityModel(network).predict(terrain.observe())
     error = (mixture.mean() - observed)[:, 1::2].square().mean().sqrt()
     nll = -mixture.log_prob(terrain.traversability)[:, 1::2].mean()
-    torch.testing.assert_close(network.rmse.compute(), error)
-    torch.testing.assert_close(logged["valid_loss"], nll)
+    torch.testing.assert_close(logged["valid_rmse"].compute(), error)
+    torch.testing.assert_close(logged["valid_loss"].compute(), nll)
 
 
 # --- checkpoints and the command -----------------------------------------------------------------
@@ -460,7 +460,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     where = ["mdn", "--data", dataset.path, "--out", "mine", *QUICK]
     assert call(monkeypatch, *where, "--trainer.max_epochs", 2, "--seed", 7, "--mdn.components", 2) == 0
     out, err = capfd.readouterr()
-    assert "validation NLL" in out
+    assert "validation RMSE" in out
     assert "wrote mine with mdn" in out
     assert [line.split(",")[0] for line in err.strip().splitlines()] == ["mdn: epoch 1/2", "mdn: epoch 2/2"]
     there = load_checkpoint("mine")
