@@ -36,8 +36,7 @@ from benchnav.datagen.recipe.latent import latent_mean
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.quality.scores import coverage, crps, pit, tail_rate
-from benchnav.models.slope_gp.cells import Cells, read_cells
-from benchnav.models.slope_gp.sums import SlopeSums, sum_cells, sum_split
+from benchnav.models.slope_gp.cells import Cells, SlopeSums, read_cells, sum_cells, sum_split
 from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.models.training.gps import fit_gps
 

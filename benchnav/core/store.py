@@ -10,7 +10,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,12 +126,44 @@ def _is_same(descriptor: int, path: Path) -> bool:
         return False
 
 
+def refuse_taken(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> None:
+    """Refuses a place for an output that is taken; one rule for files, folders and checkpoints.
+
+    Args:
+        out: file or folder that is to be written.
+        overwrite: whether what is there may be replaced.
+        foreign: says of a place that is taken why it is of another kind, which no option may replace, such as "holds
+            notes.txt"; empty where it is not.
+
+    Raises:
+        ConfigError: something of another kind is there; or something is there, and may not be replaced.
+    """
+    if not out.exists() and not out.is_symlink():
+        return
+    if why := foreign(out):
+        raise ConfigError(
+            f"Expected `out` to be new or what is made here, but {out} {why}. Choose another `out`."
+        )
+    if not overwrite and not (out.is_dir() and not any(out.iterdir())):
+        raise ConfigError(f"Expected `out` to be new, but {out} exists. Pass --overwrite to replace it.")
+
+
 def new_folder(place: Path) -> Path:
     """Makes an empty folder beside a place, to be filled and then given to `take_place`; one that a kill left goes."""
     partial = place.with_name(f".{place.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     return partial
+
+
+@contextmanager
+def building(place: Path) -> Iterator[Path]:
+    """Gives an empty folder beside a place, to be filled and then given to `take_place`; where it was not, it goes."""
+    partial = new_folder(place.with_name(f"{place.name}.building"))
+    try:
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def take_place(partial: Path, place: Path, last: str = "") -> None:

@@ -80,9 +80,9 @@ def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Itera
     warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
     waiting, pending = iter(calls), set[Future[Result]]()
     try:
-        # A few at a time, so that few are to be undone at an interruption.
+        # Few at a time: the library cannot undo at an interruption what has not reached its processes.
         while pending := pending | {
-            executor.submit(call) for call in islice(waiting, 2 * jobs - len(pending))
+            executor.submit(call) for call in islice(waiting, jobs + 1 - len(pending))
         }:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:

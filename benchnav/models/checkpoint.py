@@ -9,9 +9,8 @@ import hashlib
 import json
 import os
 import platform
-import shutil
-import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -23,8 +22,8 @@ import torch
 from torch import Tensor
 
 import benchnav
-from benchnav.core.errors import CheckpointError
-from benchnav.core.store import seal, unseal
+from benchnav.core.errors import BenchnavError, CheckpointError
+from benchnav.core.store import building, refuse_taken, restore, seal, sole_writer, take_place, unseal
 
 FORMAT = "benchnav-checkpoint"
 FORMAT_VERSION = (2, 2)
@@ -35,6 +34,23 @@ FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
+
+
+@contextmanager
+def refitting() -> Iterator[None]:
+    """Says of a model that is rebuilt from a checkpoint that its tensors do not fit its settings.
+
+    Raises:
+        CheckpointError: they do not.
+    """
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (BenchnavError, KeyError, RuntimeError) as error:
+        raise CheckpointError(
+            f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
+        ) from error
 
 
 def _versions() -> dict[str, str]:
@@ -78,7 +94,7 @@ class Checkpoint:
         class_names: names of the C classes, in the order of their ids.
         parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
         model: registered name of the family that rebuilds the model.
-        pool_temperature: of the averaged probabilities of several classifiers (see `models.training.temperature`);
+        pool_temperature: of the averaged probabilities of several classifiers (see `models.nets.temperature`);
             1 changes nothing.
     """
 
@@ -141,33 +157,27 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         checkpoint: what to write.
 
     Raises:
-        CheckpointError: it cannot be written, or the name is that of something else.
+        CheckpointError: it cannot be written.
+        ConfigError: the name is that of something else.
+        BenchnavError: another process is writing it.
     """
     folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
-    if folder.exists() and not (folder / CONFIG).is_file():
-        raise CheckpointError(
-            f"Expected `out` to be a new folder or a checkpoint, got {folder}, which is something else. "
-            "Choose another `out`."
-        )
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        workplace = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        try:
-            _write(workplace / "new", checkpoint)
-            if folder.exists():
-                os.replace(folder, workplace / "old")
-            try:
-                os.replace(workplace / "new", folder)
-            except OSError:
-                if (workplace / "old").exists():
-                    os.replace(workplace / "old", folder)
-                raise
-        finally:
-            shutil.rmtree(workplace)
+        with sole_writer(folder, str(folder)):
+            restore(folder)
+            refuse_taken(folder, True, foreign)
+            with building(folder) as partial:
+                _write(partial, checkpoint)
+                take_place(partial, folder, last=CONFIG)
     except OSError as error:
         raise CheckpointError(
             f"Could not write checkpoint {folder}: {error.strerror or error}. Choose another `out`."
         ) from error
+
+
+def foreign(folder: Path) -> str:
+    """Says why what is at a place is no checkpoint; empty where it is one. For `refuse_taken`."""
+    return "" if (folder / CONFIG).is_file() else "is something else than a checkpoint"
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:
@@ -272,7 +282,6 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def _write(folder: Path, checkpoint: Checkpoint) -> None:
-    folder.mkdir()
     parts = {}
     for name, part in checkpoint.parts.items():
         tensors = {key: _to_store(value, part.half_precision) for key, value in part.tensors.items()}

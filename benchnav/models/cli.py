@@ -1,9 +1,9 @@
 """The command `benchnav-train`: train models and measure them."""
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from benchnav.core.command import INTERRUPTED, Command, Device, run
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig, check_seed
@@ -16,46 +16,50 @@ if TYPE_CHECKING:
 
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
-Config = TypeVar("Config", ClassifierConfig, MDNConfig)
 
 
-def train_classifier(
-    data: str,
-    out: str,
-    classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
-    members: int = 1,
-    seed: int = 0,
-    device: Device = "auto",
-    trainer: dict[str, Any] | None = None,
-    workers: int = 0,
-    in_memory: bool = False,
-    half_precision: bool = True,
-    resume: bool = False,
-    overwrite: bool = False,
-) -> None:
-    """Train the terrain classifier, or an ensemble of them.
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """How networks are trained.
 
     Args:
-        data: Path or id of a dataset with splits train and valid.
-        out: Checkpoint folder; Gaussian processes in it for the same classes are kept. Logs go to OUT.training.
-        classifier: Settings of the classifier.
-        members: How many to train, with the seeds SEED, SEED + 1, …; their probabilities are averaged.
-        seed: Root seed of weights, order and augmentation.
+        seed: Root seed of weights, order and augmentation; members of an ensemble have SEED, SEED + 1, ….
         device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
         trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory, in place of reading them as they are asked for.
-        half_precision: Store the weights as float16.
-        resume: Go on with a training that was interrupted; whole epochs are kept.
-        overwrite: Replace classifiers, or a checkpoint of other classes, that are there.
+        half_precision: Store the weights of networks as float16.
+        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
+        overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
     """
-    from benchnav.models.training.classifiers import check_classifier, train_members
 
-    names, dataset = _members(members, seed), _open_dataset(data)
-    classifier, options = _options(out, classifier, device, trainer, resume, workers, in_memory)
-    check_classifier(classifier, dataset, options)
-    target = _open_target(out, dataset, names, options, overwrite)
-    train_members(target, classifier, dataset, members, seed, options, half_precision)
+    seed: int = 0
+    device: Device = "auto"
+    trainer: dict[str, Any] | None = None
+    workers: int = 0
+    in_memory: bool = False
+    half_precision: bool = True
+    resume: bool = False
+    overwrite: bool = False
+
+
+def train_classifier(
+    options: TrainOptions,
+    data: str,
+    out: str,
+    classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
+    members: int = 1,
+) -> None:
+    """Train the terrain classifier, or an ensemble of them.
+
+    Args:
+        options: How.
+        data: Path or id of a dataset with splits train and valid.
+        out: Checkpoint folder; Gaussian processes in it for the same classes are kept. Logs go to OUT.training.
+        classifier: Settings of the classifier.
+        members: How many to train; their probabilities are averaged.
+    """
+    _train(options, data, out, classifier, members=members)
 
 
 def train_gp(
@@ -95,87 +99,79 @@ def train_gp(
 
 
 def train_all(
+    options: TrainOptions,
     data: str,
     out: str,
     classifier: ClassifierConfig = _DEFAULT_CLASSIFIER,
     gp: LatentGPConfig = _DEFAULT_GP,
     members: int = 1,
-    seed: int = 0,
-    device: Device = "auto",
-    trainer: dict[str, Any] | None = None,
-    workers: int = 0,
-    in_memory: bool = False,
-    half_precision: bool = True,
-    resume: bool = False,
-    overwrite: bool = False,
 ) -> None:
     """Train a whole model: Gaussian processes and classifiers.
 
     Args:
+        options: How.
         data: Path or id of a dataset with splits train and valid.
         out: Checkpoint folder. Logs go to OUT.training.
         classifier: Settings of the classifier.
         gp: Settings of the GPs.
         members: How many classifiers to train; their probabilities are averaged.
-        seed: Root seed.
-        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
-        trainer: Settings of Lightning's trainer for the classifiers.
-        workers: Processes that read maps ahead. The result is the same for any number.
-        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
-        half_precision: Store the classifiers' weights as float16.
-        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
-        overwrite: Replace a checkpoint that is there.
     """
-    from benchnav.models.training.classifiers import check_classifier, train_members
-    from benchnav.models.training.gps import train_gps_on_maps
-
-    names, dataset = _members(members, seed), _open_dataset(data)
-    classifier, options = _options(out, classifier, device, trainer, resume, workers, in_memory)
-    check_classifier(classifier, dataset, options)
-    target = _open_target(out, dataset, ["gp", *names], options, overwrite)
-    if not target.holds("gp", asdict(gp), seed, asdict(LatentGPConfig())):
-        target.add("gp", train_gps_on_maps(gp, dataset, seed, options))
-    train_members(target, classifier, dataset, members, seed, options, half_precision)
+    _train(options, data, out, classifier, gp, members)
 
 
-def train_mdn(
-    data: str,
-    out: str,
-    mdn: MDNConfig = _DEFAULT_MDN,
-    seed: int = 0,
-    device: Device = "auto",
-    trainer: dict[str, Any] | None = None,
-    workers: int = 0,
-    in_memory: bool = False,
-    half_precision: bool = True,
-    resume: bool = False,
-    overwrite: bool = False,
-) -> None:
+def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN) -> None:
     """Train a mixture-density network, which needs no terrain classes.
 
     Args:
+        options: How.
         data: Path or id of a dataset with splits train and valid.
         out: Checkpoint folder. Logs go to OUT.training.
         mdn: Settings of the network.
-        seed: Root seed of weights, order and augmentation.
-        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
-        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
-        workers: Processes that read maps ahead. The result is the same for any number.
-        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
-        half_precision: Store the weights as float16.
-        resume: Go on with a training that was interrupted; whole epochs are kept.
-        overwrite: Replace a checkpoint that is there.
     """
-    from benchnav.models.nets.mdn import MDN
-    from benchnav.models.training.mdn import check_mdn, train_mdn_part
+    _train(options, data, out, mdn)
 
-    check_seed(seed)
-    dataset = _open_dataset(data)
-    mdn, options = _options(out, mdn, device, trainer, resume, workers, in_memory)
-    check_mdn(mdn, dataset, options)
-    target = _open_target(out, dataset, [MDN], options, overwrite, model=MDN)
-    if not target.holds(MDN, asdict(mdn), seed, asdict(MDNConfig()), half_precision):
-        target.add(MDN, train_mdn_part(mdn, dataset, seed, options, half_precision))
+
+def _train(
+    how: TrainOptions,
+    data: str,
+    out: str,
+    config: ClassifierConfig | MDNConfig,
+    gp: LatentGPConfig | None = None,
+    members: int = 1,
+) -> None:
+    """Trains what a checkpoint lacks of a model: the class-wise GPs where they are asked for, then networks."""
+    from benchnav.core.errors import ConfigError
+    from benchnav.core.store import output_path
+    from benchnav.models.checkpoint import CLASSIFIER, FUSED, GP, member_name, training_folder
+    from benchnav.models.training.fit import FitOptions
+    from benchnav.models.training.gps import train_gps_on_maps
+    from benchnav.models.training.networks import NETWORKS, check_network, train_parts
+
+    if members < 1:
+        raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
+    check_seed(how.seed, members)
+    output_path(out)  # refuses addresses
+    dataset, trainer = _open_dataset(data), dict(how.trainer or {})
+    # The length of training is the network's own setting, wherever it is said.
+    config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
+    options = FitOptions(
+        folder=training_folder(out),
+        resume=how.resume,
+        trainer=trainer,
+        workers=how.workers,
+        in_memory=how.in_memory,
+        device=how.device,
+    )
+    check_network(config, dataset, options)
+    part = NETWORKS[type(config)].part
+    parts = [member_name(index) for index in range(members)] if part == CLASSIFIER else [part]
+    model = FUSED if part == CLASSIFIER else part
+    target = _open_target(out, dataset, [*([GP] if gp else []), *parts], options, how.overwrite, model)
+    if gp and not target.holds(GP, asdict(gp), how.seed, asdict(LatentGPConfig())):
+        target.add(GP, train_gps_on_maps(gp, dataset, how.seed, options))
+    train_parts(target, config, dataset, parts, how.seed, options, how.half_precision)
+    if not target.changed:
+        print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
 
 
 def _open_dataset(data: str) -> "TerrainDataset":
@@ -191,63 +187,29 @@ def _open_dataset(data: str) -> "TerrainDataset":
     return dataset
 
 
-def _options(
-    out: str,
-    config: Config,
-    device: str,
-    trainer: dict[str, Any] | None,
-    resume: bool,
-    workers: int,
-    in_memory: bool,
-) -> "tuple[Config, FitOptions]":
-    """Gives the trainer's settings; the length of training is the model's own setting, wherever it is said."""
-    from benchnav.core.store import output_path
-    from benchnav.models.checkpoint import training_folder
-    from benchnav.models.training.fit import FitOptions
-
-    output_path(out)  # refuses addresses
-    settings = dict(trainer or {})
-    if "max_epochs" in settings:
-        config = replace(config, max_epochs=settings.pop("max_epochs"))
-    folder = training_folder(out)
-    return config, FitOptions(
-        folder=folder, resume=resume, trainer=settings, workers=workers, in_memory=in_memory, device=device
-    )
-
-
-def _members(count: int, seed: int) -> list[str]:
-    from benchnav.core.errors import ConfigError
-    from benchnav.models.checkpoint import member_name
-
-    if count < 1:
-        raise ConfigError(f"Expected `members` ≥ 1, got {count}.")
-    check_seed(seed, count)
-    return [member_name(index) for index in range(count)]
-
-
 def _open_target(
     out: str,
     dataset: "TerrainDataset",
     parts: list[str],
     options: "FitOptions",
     overwrite: bool,
-    model: str = "",
+    model: str = "fused",
 ) -> "Target":
-    from benchnav.models.checkpoint import FUSED, Checkpoint
+    from benchnav.models.checkpoint import Checkpoint
     from benchnav.models.training.data import training_digest
     from benchnav.models.training.target import open_target
 
-    fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model or FUSED)
+    fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
     return open_target(Path(out), fresh, parts, training_digest(dataset), options, overwrite)
 
 
 def main() -> None:
     """Entry point of `benchnav-train`."""
     commands = {
-        "classifier": Command(train_classifier),
+        "classifier": Command(train_classifier, settings=TrainOptions),
         "gp": Command(train_gp),
-        "all": Command(train_all),
-        "mdn": Command(train_mdn),
+        "all": Command(train_all, settings=TrainOptions),
+        "mdn": Command(train_mdn, settings=TrainOptions),
         "evaluate": Command(evaluate, ("checkpoint",)),
     }
     status = run("benchnav-train", "Train and measure models of traversability.", commands)

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
-from benchnav.models.checkpoint import GP, Checkpoint, member_names
+from benchnav.models.checkpoint import GP, Checkpoint, member_names, refitting
 from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_gp.table import SlopeTable
 
@@ -30,7 +30,7 @@ class FusedModel:
         classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         table: the GPs over slope.
         class_names: names of the C classes.
-        pool_temperature: of the averaged probabilities (see `models.training.temperature`).
+        pool_temperature: of the averaged probabilities (see `models.nets.temperature`).
     """
 
     def __init__(
@@ -96,16 +96,11 @@ class FusedModel:
         names = checkpoint.class_names
         members = [checkpoint.part(name) for name in member_names(checkpoint)]
         tensors = checkpoint.part(GP).tensors
-        try:
+        with refitting():
             classifiers = [
                 TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
             ]
-            table = SlopeTable.from_tensors(tensors)
-            return cls(classifiers, table, names, checkpoint.pool_temperature)
-        except (BenchnavError, KeyError, RuntimeError) as error:
-            raise CheckpointError(
-                f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
-            ) from error
+            return cls(classifiers, SlopeTable.from_tensors(tensors), names, checkpoint.pool_temperature)
 
     def _probabilities(self, classifier: nn.Module, observation: Observation) -> Tensor:
         rgb, (height, width), classes = observation.rgb, observation.grid.shape, len(self.class_names)

@@ -19,16 +19,15 @@ from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
+from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
-from benchnav.models.training import classifiers
+from benchnav.models.training import classifiers, networks
 from benchnav.models.training import fit as fit_module
-from benchnav.models.training.classifiers import fit_classifier, measure_classifier
 from benchnav.models.training.data import VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.mdn import fit_mdn, measure_network
-from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.training.networks import fit_network, measure
 from tests.elsewhere.device import elsewhere, waits
 from tests.models.conftest import checkpoint_path as _checkpoint_path
 from tests.models.conftest import dataset as _dataset
@@ -104,9 +103,9 @@ def test_networks_are_measured_in_training_on_another_device_as_here(
 ) -> None:
     classifier, mdn = pair(checkpoint_path).classifiers[0], network()
     maps, all_maps = read_maps(dataset, VALID), read_maps(dataset, VALID, ("slope_deg", "traversability"))
-    here = measure_classifier(classifier, maps) | measure_network(mdn, all_maps)
+    here = measure(classifier, maps) | measure(mdn, all_maps)
     with elsewhere() as device:
-        there = measure_classifier(classifier.to(device), maps) | measure_network(mdn.to(device), all_maps)
+        there = measure(classifier.to(device), maps) | measure(mdn.to(device), all_maps)
         assert waits
     assert_close(there, here)
 
@@ -134,11 +133,10 @@ def test_each_command_uses_the_device_that_it_is_given(
         asked.append(device)
         raise Enough
 
-    for module in ("classifiers", "mdn"):  # a condition of the network would ask the GPU that is not there
-        monkeypatch.setattr(f"benchnav.models.training.{module}.check_network", lambda *_: None)
-    for module in ("classifiers", "gps", "mdn"):
-        name = "fit" if module == "gps" else "fit_network"
-        monkeypatch.setattr(f"benchnav.models.training.{module}.{name}", begin)
+    # A trial of the network would ask the GPU that is not there.
+    monkeypatch.setattr("benchnav.models.training.networks.check_network", lambda *_: None)
+    for name in ("networks.fit_network", "gps.fit"):
+        monkeypatch.setattr(f"benchnav.models.training.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
     monkeypatch.setattr("benchnav.models.training.gps.find_soft_modes", lambda sums: (None, None))
     (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)
@@ -184,7 +182,7 @@ def test_lightning_trains_on_the_device(monkeypatch: pytest.MonkeyPatch) -> None
         given.append(settings["accelerator"])
         raise Enough
 
-    monkeypatch.setattr(fit_module, "_trainer", begin)
+    monkeypatch.setattr(fit_module, "make_trainer", begin)
     monkeypatch.setattr(fit_module, "default_precision", lambda accelerator: "32-true")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for device in ("cpu", "cuda", "auto"):
@@ -204,14 +202,14 @@ def test_what_was_trained_is_measured_and_calibrated_where_it_was(
         return chunks(maps, device)
 
     monkeypatch.setattr(MapDataset, "chunks", watched)
-    monkeypatch.setattr(fit_module, "fit", lambda *given, **named: {"epoch": 1.0})
+    monkeypatch.setattr(networks, "fit", lambda *given, **named: {"epoch": 1.0})
     with elsewhere() as device:
         monkeypatch.setattr(FitOptions, "place", device)
-        for train, config in (
-            (fit_classifier, ClassifierConfig(encoder="mobilenet_v2", batch_size=5)),
-            (fit_mdn, MDNConfig(encoder="mobilenet_v2", hidden=16, batch_size=5)),
+        for config in (
+            ClassifierConfig(encoder="mobilenet_v2", batch_size=5),
+            MDNConfig(encoder="mobilenet_v2", hidden=16, batch_size=5),
         ):
-            trained, _ = train(config, dataset, 0, FitOptions(device="cpu"), half_precision=True)  # type: ignore[operator]
+            trained, _ = fit_network(config, dataset, 0, FitOptions(device="cpu"), half_precision=True)
             assert {value.device for value in trained.parameters()} == {CPU}
     # The classifier is measured and calibrated, the other network measured; before, colours are read on the CPU.
     assert [place for place in read if place != CPU] == [device] * 3

@@ -11,8 +11,7 @@ from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.models.slope_gp.cells import Cells
-from benchnav.models.slope_gp.sums import SlopeSums
+from benchnav.models.slope_gp.cells import Cells, SlopeSums
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 
 NAMES = ("a", "b", "c")

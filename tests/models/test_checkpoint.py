@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from benchnav.core.errors import BenchnavError, CheckpointError
+from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.store import seal, unseal
 from benchnav.core.terrain import Terrain
@@ -218,7 +218,7 @@ def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pyte
 def test_a_save_never_replaces_what_is_no_checkpoint(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "notes.txt").write_text("keep")
-    with pytest.raises(CheckpointError, match="something else"):
+    with pytest.raises(ConfigError, match="something else"):
         save_checkpoint(tmp_path / "precious", load_checkpoint(folder))
     assert (tmp_path / "precious" / "notes.txt").read_text() == "keep"
 

@@ -15,12 +15,11 @@ from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.predictor import load_model
-from benchnav.models.training import classifiers
-from benchnav.models.training import mdn as mdn_training
-from benchnav.models.training.classifiers import measure_classifier
+from benchnav.models.training import networks
 from benchnav.models.training.data import read_maps
-from benchnav.models.training.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.training.networks import measure
 from tests.models.support import make_dataset
 
 QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
@@ -353,7 +352,7 @@ def test_what_is_stored_is_what_was_measured_and_calibrated(
     assert part.half_precision == half_precision
     plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, 10, part.tensors)
     assert part.config["temperature"] == fit_temperature(*sample_logits(plain, valid))
-    for name, value in measure_classifier(plain, valid).items():
+    for name, value in measure(plain, valid).items():
         assert part.metrics[name] == pytest.approx(value, rel=0 if half_precision else 1e-3, abs=1e-12), name
 
 
@@ -367,8 +366,7 @@ def test_how_maps_are_read_reaches_the_training(
         seen.append((in_memory, workers))
         raise KeyboardInterrupt
 
-    module = mdn_training if kind == "mdn" else classifiers
-    monkeypatch.setattr(module, "MapData", opened)
+    monkeypatch.setattr(networks, "MapData", opened)
     quick = QUICK_GP if kind == "all" else []
     for number, how in enumerate(([], ["--workers", 2], ["--in_memory", "true"])):
         where = ["--data", dataset.path, "--out", tmp_path / str(number)]

@@ -12,7 +12,6 @@ to be left out between them, and gives no more units than maps side by side.
 
 import hashlib
 import json
-import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
@@ -23,15 +22,13 @@ from typing import Any
 import numpy as np
 
 from benchnav.core.errors import DatasetError
-from benchnav.core.store import real_place, restore, sole_writer, take_place
+from benchnav.core.store import building, real_place, replacing, restore, sole_writer
 from benchnav.datagen.dem.raster import load_rasterio
 from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
-from benchnav.datagen.files.create import check_place, join
-from benchnav.datagen.files.folder import Contents, write_manifest
-from benchnav.datagen.files.hdf5 import is_one_file, named_errors, pack
+from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
+from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, named_errors, pack
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.files.shard import SHARD_CELLS, ShardFile, write
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
@@ -77,8 +74,8 @@ def import_dem(
         overwrite: replace what is there.
 
     Raises:
-        ConfigError: rasterio is not installed, or a setting does not fit the recipe.
-        DatasetError: a raster does not fit, a split is left without maps, or `out` exists or cannot be written.
+        ConfigError: rasterio is not installed, a setting does not fit the recipe, or `out` is taken.
+        DatasetError: a raster does not fit, a split is left without maps, or `out` cannot be written.
     """
     out = real_place(out)
     check_place(out, overwrite)
@@ -88,14 +85,11 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         ground = survey(stack, rasters, recipe, shares, stride_m)
-        folder = out.with_name(f".{out.name}.importing")
         with named_errors(out):
             stack.enter_context(sole_writer(out, str(out)))
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
             restore(out)
             check_place(out, overwrite)
-            shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed
-            folder.mkdir()
+            folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
         done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
         for run in ground.tiling.runs(most):
@@ -119,11 +113,7 @@ def import_dem(
                 fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
             )
             check_place(out, overwrite)
-            if is_one_file(out):
-                join(out, contents)
-            else:
-                write_manifest(folder, contents)
-                take_place(folder, out)
+            assemble(contents, folder, out)
 
 
 @dataclass(kw_only=True)
@@ -159,9 +149,13 @@ class _Part:
             return
         maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}
         self.files.append(self.folder / shard.name)
-        content = pack(self.recipe.id, self.recipe, self.name, self.entry(shard.first), maps)
-        write(self.files[-1], content)
+        self._write(self.files[-1], maps, shard.first, shard.stop)
         self.pending, self.written = [], shard.stop
+
+    def _write(self, file: Path, maps: Maps, first: int, stop: int) -> None:
+        content = pack(self.recipe.id, self.recipe, self.name, self.entry(first, stop), maps)
+        with replacing(file) as unfinished:
+            unfinished.write_bytes(content)
 
     def add_groups(self) -> None:
         """Writes the shards anew with each map's group, which is known only when all maps are.
@@ -182,8 +176,7 @@ class _Part:
             maps = TerrainDataset(file).read(self.name)
             stop = begin + len(maps["environment"])
             maps["group"] = np.array([numbers[first] for first in groups[begin:stop]])
-            content = pack(self.recipe.id, self.recipe, self.name, self.entry(begin, stop), maps)
-            write(file, content)
+            self._write(file, maps, begin, stop)
             begin = stop
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:

@@ -2,14 +2,12 @@
 
 import datetime
 import json
-import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from benchnav.core.errors import DatasetError
-from benchnav.core.store import sole_writer
+from benchnav.core.store import building, refuse_taken, restore, sole_writer, take_place
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
 from benchnav.datagen.files.hdf5 import named_errors
@@ -37,7 +35,8 @@ def export(
         overwrite: replace an exported dataset that is there.
 
     Raises:
-        DatasetError: no such split or field, the dataset is damaged, or `out` is there or cannot be written.
+        DatasetError: no such split or field, the dataset is damaged, or `out` cannot be written.
+        ConfigError: `out` is taken.
     """
     names = split_names(_chosen("splits", splits, list(dataset.splits)))
     columns = _chosen("fields", fields, list(dataset.fields))
@@ -46,28 +45,27 @@ def export(
     if not publication.date:
         today = datetime.datetime.now(datetime.UTC).date()
         publication = replace(publication, date=today.isoformat())
-    _check_target(out, overwrite)
+    refuse_taken(out, overwrite, _foreign)
     out = out.resolve()
     done, total = 0, sum(dataset.map_count(split) for split in names)
-    partial, dropped = (out.with_name(f".{out.name}.{what}") for what in ("partial", "dropped"))
-    with named_errors(out), sole_writer(out, str(out)), ExitStack() as stack:
-        _check_target(out, overwrite)  # it may have come while another run held it
-        for left in (partial, dropped):  # by a run that was killed
-            shutil.rmtree(left, ignore_errors=True)
-        stack.callback(shutil.rmtree, partial, ignore_errors=True)
-        (partial / FOLDER).mkdir(parents=True)
-        yield done, total
-        for split, name in names.items():
-            for maps in write_split(partial / FOLDER, name, dataset, split, columns, maps_a_file):
-                done += maps
-                yield done, total
-        about = metadata(dataset, names, columns, publication, partial)
-        (partial / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-        (partial / CARD).write_text(card(dataset, names, publication))
-        if out.exists():
-            out.rename(dropped)
-        partial.rename(out)
-        shutil.rmtree(dropped, ignore_errors=True)
+    with named_errors(out), sole_writer(out, str(out)):
+        restore(out)
+        refuse_taken(out, overwrite, _foreign)  # it may have come while another run held it
+        with building(out) as folder:
+            (folder / FOLDER).mkdir()
+            yield done, total
+            for split, name in names.items():
+                for maps in write_split(folder / FOLDER, name, dataset, split, columns, maps_a_file):
+                    done += maps
+                    yield done, total
+            about = metadata(dataset, names, columns, publication, folder)
+            (folder / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+            (folder / CARD).write_text(card(dataset, names, publication))
+            take_place(folder, out)
+
+
+def _foreign(out: Path) -> str:
+    return "" if (out / METADATA).is_file() else "is no exported dataset"
 
 
 def _chosen(what: str, asked: Sequence[str] | None, known: list[str]) -> list[str]:
@@ -77,18 +75,3 @@ def _chosen(what: str, asked: Sequence[str] | None, known: list[str]) -> list[st
     if unknown or not asked:
         raise DatasetError(f"Expected `{what}` among {known}, got {unknown or 'none'}.")
     return [name for name in known if name in asked]
-
-
-def _check_target(out: Path, overwrite: bool) -> None:
-    """Refuses what is there, unless it is an exported dataset that is to be replaced."""
-    if not out.exists() and not out.is_symlink():
-        return
-    if not (out / METADATA).is_file():
-        raise DatasetError(
-            f"Expected `out` to be a new folder, got {out}, which is there and is no exported dataset. "
-            "Choose another `out`."
-        )
-    if not overwrite:
-        raise DatasetError(
-            f"Expected `out` to be a new folder, but {out} exists. Pass --overwrite to replace it."
-        )

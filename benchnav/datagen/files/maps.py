@@ -1,22 +1,14 @@
 """A split as a map-style PyTorch dataset, for training loops of one's own."""
 
-import os
-from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import h5py
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, find_dataset, open_file
-
-# Files that a process keeps open; far fewer than systems allow.
-_MOST_OPEN = 100
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
 
 class TerrainMaps(Dataset[dict[str, Tensor]]):
@@ -43,23 +35,15 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         in_memory: bool = False,
     ) -> None:
         """Checks split and fields, and reads the maps where that is asked for."""
-        self.dataset, self.split, self.fields = (
-            TerrainDataset(find_dataset(path).resolve()),
-            split,
-            tuple(fields),
-        )
-        unknown = sorted(set(fields) - set(self.dataset.field_names))
-        if unknown or not fields:
-            raise DatasetError(
-                f"Expected `fields` among {list(self.dataset.field_names)}, got {unknown or list(fields)}."
-            )
+        self.dataset = TerrainDataset(find_dataset(path).resolve(), keep_open=True)
+        self.split, self.fields = split, tuple(fields)
+        if not fields:
+            raise DatasetError(f"Expected `fields` among {list(self.dataset.field_names)}, got none.")
+        self.dataset.read(split, [], self.fields)
         self._maps = self.dataset.map_count(split)
-        self._pieces = self.dataset.pieces(split)
         self._memory: dict[str, Tensor] | None = None
         if in_memory:
-            read = self.dataset.read(split, fields=self.fields)
-            self._memory = {name: torch.from_numpy(values) for name, values in read.items()}
-        self._opened: tuple[int, dict[Path, dict[str, h5py.Dataset]]] = (0, {})
+            self._memory = self.read(range(self._maps))
 
     def __len__(self) -> int:
         """Number of maps."""
@@ -79,26 +63,12 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         index = int(index) % len(self)
         if self._memory is not None:
             return {name: values[index].clone() for name, values in self._memory.items()}
-        piece = self._pieces[bisect_right(self._pieces, index, key=lambda piece: piece.first) - 1]
-        sample, name = {}, self.fields[0]
-        try:
-            for name, array in self._arrays(piece.path).items():
-                sample[name] = torch.from_numpy(np.asarray(array[index - piece.first]))
-        except READ_ERRORS as error:
-            raise damage(piece.path, self.split, name, error) from error
-        return sample
+        return {name: values[0] for name, values in self.read([index]).items()}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Leaves out the open files, so that it may be sent to other processes."""
-        return self.__dict__ | {"_opened": (0, {})}
-
-    def _arrays(self, path: Path) -> dict[str, h5py.Dataset]:
-        if self._opened[0] != os.getpid():
-            self._opened = os.getpid(), {}
-        opened = self._opened[1]
-        if path not in opened:
-            if len(opened) == _MOST_OPEN:
-                opened.pop(next(iter(opened)))
-            group = open_file(path)[self.split]
-            opened[path] = {name: group[name] for name in self.fields}
-        return opened[path]
+    def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
+        """Reads maps by their indices ≥ 0, in any order; tensors by field, each of shape [B, *entry shape]."""
+        if self._memory is None:
+            read = self.dataset.read(self.split, indices, self.fields)
+            return {name: torch.from_numpy(values) for name, values in read.items()}
+        which = torch.as_tensor(indices)
+        return {name: values[which] for name, values in self._memory.items()}

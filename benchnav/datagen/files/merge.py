@@ -6,7 +6,6 @@ What is merged is packed already: files are copied into a folder, or their chunk
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, is_dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -15,11 +14,9 @@ from typing import Any
 import numpy as np
 
 from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.core.store import real_place, restore, sole_writer, take_place
+from benchnav.core.store import building, real_place, restore, sole_writer
 from benchnav.datagen import schema
-from benchnav.datagen.files.create import check_place, join
-from benchnav.datagen.files.folder import Contents, whole, write_manifest
-from benchnav.datagen.files.hdf5 import is_one_file, named_errors
+from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, is_one_file, named_errors, whole
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.recipe.rules import check_name
@@ -43,14 +40,14 @@ def merge(
         overwrite: replace what is there.
 
     Raises:
-        DatasetError: the datasets are unlike, with every reason; one is damaged; shards are missing; or `out` exists.
+        DatasetError: the datasets are unlike, with every reason; one is damaged; or shards are missing.
+        ConfigError: `out` is taken.
     """
     out = real_place(out)
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
         raise DatasetError("Expected either datasets or shards of one dataset, got both.")
-    is_file = is_one_file(out)
-    name = dataset_id or (out.stem if is_file else out.name)
+    name = dataset_id or (out.stem if is_one_file(out) else out.name)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
     with named_errors(out), sole_writer(out, str(out)):
@@ -61,30 +58,21 @@ def merge(
                 for count in _check(TerrainDataset(path), split):
                     done += count
                     yield done, total
-        if is_file:
-            join(out, contents)
-        else:
-            _copy(out, contents, overwrite)
+        if is_one_file(out):
+            assemble(contents, out.parent, out)
+            return
+        with building(out) as folder:
+            assemble(replace(contents, files=_copies(contents, folder)), folder, out)
 
 
-def _copy(out: Path, contents: Contents, overwrite: bool) -> None:
-    """Copies files into a folder that takes its place when it is whole."""
-    partial = out.with_name(f".{out.name}.partial")
-    with ExitStack() as stack:
-        stack.callback(shutil.rmtree, partial, ignore_errors=True)
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        copies: dict[Path, Path] = {}
-        for files in contents.files.values():
-            for path in files:
-                if path not in copies:
-                    taken = {copy.name for copy in copies.values()}
-                    name = path.name if path.name not in taken else f"{len(copies)}-{path.name}"
-                    copies[path] = Path(shutil.copy2(path, partial / name))
-        copied = {split: [copies[path] for path in own] for split, own in contents.files.items()}
-        write_manifest(partial, replace(contents, files=copied))
-        check_place(out, overwrite)  # others may have put something there meanwhile
-        take_place(partial, out)
+def _copies(contents: Contents, folder: Path) -> dict[str, list[Path]]:
+    """Copies each file into a folder, under its own name where that is free; gives the copies by split."""
+    copies: dict[Path, Path] = {}
+    for path in (path for files in contents.files.values() for path in files):
+        if path not in copies:
+            name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
+            copies[path] = Path(shutil.copy2(path, folder / name))
+    return {split: [copies[path] for path in files] for split, files in contents.files.items()}
 
 
 def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:

@@ -1,11 +1,13 @@
 """Reading datasets of formats 1.0 to 1.3: a file (HDF5), or a folder of such files with one manifest.
 
-Readers open files at each call, so they may be passed to other processes. PyTorch is imported where Terrain is
-asked for. Letters in shapes: B maps.
+All that reads maps goes through `TerrainDataset.read`, which may be passed to other processes. PyTorch is imported
+where Terrain is asked for. Letters in shapes: B maps.
 """
 
 import hashlib
 import json
+import os
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 
 CHUNK_CELLS = 2**17
+_MOST_OPEN = 100  # files that a process keeps open; far fewer than systems allow
 FOLDER_MANIFEST = "manifest.json"
 
 
@@ -60,15 +63,23 @@ class TerrainDataset:
 
     Args:
         path: the file, or the folder.
+        keep_open: keep files open from call to call, for many reads of few maps. Each process opens them for itself,
+            forked or spawned. Otherwise they are open during a call alone, and may be changed in between.
 
     Raises:
         DatasetError: there is no such file, or it is damaged, foreign, or of a newer format.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, keep_open: bool = False) -> None:
         """Reads and checks the manifest."""
-        self.path = Path(path)
+        self.path, self.keep_open = Path(path), keep_open
         self.manifest: dict[str, Any] = read_manifest(self.path)
+        self._opened: tuple[int, dict[Path, tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]]] = (0, {})
+        self._pieces: dict[str, list[Piece]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the open files, so that it may be sent to other processes."""
+        return self.__dict__ | {"_opened": (0, {})}
 
     @property
     def id(self) -> str:
@@ -163,14 +174,10 @@ class TerrainDataset:
         unknown = [name for name in names if name not in self.fields]
         if unknown:
             raise DatasetError(f"Expected `fields` among {list(self.fields)}, got {unknown}.")
-        if indices is not None:
-            chosen = np.asarray(indices)
-            whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
-            if not whole or (chosen < 0).any() or (chosen >= size).any():
-                raise DatasetError(
-                    f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen.tolist()}."
-                )
-        return self._read(split, names, indices)
+        chosen = range(size) if indices is None else np.asarray(indices).tolist()
+        if indices is not None and not all(type(i) is int and 0 <= i < size for i in chosen):
+            raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
+        return self._read(split, names, chosen)
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
@@ -178,8 +185,9 @@ class TerrainDataset:
         Raises:
             DatasetError: no such split, or a stored chunk is damaged.
         """
-        self.map_count(split)
-        return self._read(split, (schema.ENTRY_DIGESTS,), indices)[schema.ENTRY_DIGESTS]
+        every = range(self.map_count(split))
+        chosen = every if indices is None else indices
+        return self._read(split, (schema.ENTRY_DIGESTS,), chosen)[schema.ENTRY_DIGESTS]
 
     def chunks(
         self, split: str, fields: Iterable[str] | None = None, cells: int = CHUNK_CELLS
@@ -211,56 +219,83 @@ class TerrainDataset:
     def pieces(self, split: str) -> list[Piece]:
         """The files that hold a split's maps, in their order."""
         count = self.map_count(split)
-        if "shards" not in self.manifest:
-            return [Piece(path=self.path, first=0, maps=count)]
-        shards = self.manifest["shards"][split]
-        firsts = accumulate((shard["maps"] for shard in shards), initial=0)
-        return [
-            Piece(path=self.path / shard["file"], first=first, maps=shard["maps"])
-            for shard, first in zip(shards, firsts, strict=False)
-        ]
+        if split not in self._pieces:
+            files = [
+                (shard["file"], shard["maps"]) for shard in self.manifest.get("shards", {}).get(split, ())
+            ]
+            firsts = accumulate((maps for _, maps in files), initial=0)
+            self._pieces[split] = [
+                Piece(path=self.path / name, first=first, maps=maps)
+                for (name, maps), first in zip(files, firsts, strict=False)
+            ] or [Piece(path=self.path, first=0, maps=count)]
+        return self._pieces[split]
 
-    def _read(self, split: str, names: Sequence[str], indices: Sequence[int] | None) -> Maps:
-        pieces = self.pieces(split)
-        if indices is None:
-            return _joined([self._read_piece(split, piece, names, slice(None)) for piece in pieces])
-        # HDF5 reads ascending indices, each once; the asked order is made afterwards.
-        chosen, order = np.unique(np.asarray(indices, dtype=np.int64), return_inverse=True)
-        ends = [piece.first + piece.maps for piece in pieces]
-        parts = np.split(chosen, np.searchsorted(chosen, ends[:-1]))
-        wanted = [(piece, part) for piece, part in zip(pieces, parts, strict=True) if len(part)]
-        wanted = wanted or [(pieces[0], chosen)]  # of no map the shape is still asked
-        read = _joined([self._read_piece(split, piece, names, part - piece.first) for piece, part in wanted])
-        return {name: values[order] for name, values in read.items()}
+    def _read(self, split: str, names: Sequence[str], indices: Sequence[int]) -> Maps:
+        """Reads maps run by run: those that follow one another in a file together."""
+        pieces, runs, place = self.pieces(split), list[Maps](), 0
+        while place < len(indices):
+            index, start = indices[place], place
+            piece = pieces[bisect_right(pieces, index, key=_first) - 1]
+            end = min(len(indices), place + piece.first + piece.maps - index)
+            while place < end and indices[place] == index + place - start:
+                place += 1
+            first = index - piece.first
+            runs.append(self._read_run(split, piece, names, slice(first, first + place - start)))
+        if len(runs) == 1:
+            return runs[0]
+        empty = [{name: np.empty((0, *self._shapes[name][1]), self._shapes[name][0]) for name in names}]
+        return {name: np.concatenate([run[name] for run in runs or empty]) for name in names}
 
-    def _read_piece(self, split: str, piece: Piece, names: Sequence[str], which: Any) -> Maps:
-        with open_file(piece.path) as file:
-            read = {}
+    def _read_run(self, split: str, piece: Piece, names: Sequence[str], which: slice) -> Maps:
+        file, arrays = self._open(piece.path)
+        read: Maps = {}
+        try:
             for name in names:
-                try:
-                    array = file[split][name]
-                    self._check_array(name, array, piece.maps)
-                    read[name] = _values(array, which)
-                    self._check_classes(read)
-                except READ_ERRORS as error:
-                    raise damage(piece.path, split, name, error) from error
-            return read
+                if (split, name) not in arrays:
+                    arrays[split, name] = self._array(file, split, name, piece.maps)
+                read[name] = _values(arrays[split, name], which)
+                if name == "class_id":
+                    self._check_classes(read[name])
+        except READ_ERRORS as error:
+            raise damage(piece.path, split, name, error) from error
+        finally:
+            if not self.keep_open:
+                file.close()
+        return read
 
-    def _check_array(self, name: str, array: h5py.Dataset, maps: int) -> None:
-        """Refuses, by a ValueError, an array that is not what the manifest says."""
-        if name == schema.ENTRY_DIGESTS:
-            kind, shape = "|u1", [maps, len(self.fields), schema.DIGEST_BYTES]
-        else:
-            field = self.fields[name]
-            kind, shape = field.dtype, [maps, *field.entry_shape(*self.grid.shape)]
-        if array.dtype.str != kind or list(array.shape) != shape:
-            raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {shape}")
+    def _open(self, path: Path) -> tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]:
+        """A file, and those of its arrays that were read before, by split and name."""
+        if not self.keep_open:
+            return open_file(path), {}
+        if self._opened[0] != os.getpid():  # another process's files are not for this one
+            self._opened = os.getpid(), {}
+        opened = self._opened[1]
+        if path not in opened:
+            if len(opened) == _MOST_OPEN:
+                opened.pop(next(iter(opened)))[0].close()
+            opened[path] = open_file(path), {}
+        return opened[path]
 
-    def _check_classes(self, read: Maps) -> None:
+    @cached_property
+    def _shapes(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Dtype and shape of a map's entry in each stored array."""
+        shapes = {
+            name: (field.dtype, field.entry_shape(*self.grid.shape)) for name, field in self.fields.items()
+        }
+        return {**shapes, schema.ENTRY_DIGESTS: ("|u1", (len(self.fields), schema.DIGEST_BYTES))}
+
+    def _array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
+        """A stored array; refuses, by a ValueError, one that is not what the manifest says."""
+        array, (kind, entry) = file[split][name], self._shapes[name]
+        if (array.dtype.str, array.shape) != (kind, (maps, *entry)):
+            raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {[maps, *entry]}")
+        return array
+
+    def _check_classes(self, found: np.ndarray) -> None:
         """Refuses, by a ValueError, classes that the table lacks."""
-        found = read.get("class_id", np.empty(0))
-        if ((found >= len(self.recipe.classes)) & (found != schema.UNLABELLED)).any():
-            raise ValueError(f"it has classes beyond {len(self.recipe.classes) - 1}")
+        most = len(self.recipe.classes) - 1
+        if found.max() > most and ((found > most) & (found != schema.UNLABELLED)).any():
+            raise ValueError(f"it has classes beyond {most}")
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
@@ -335,13 +370,12 @@ def read_manifest(path: Path) -> dict[str, Any]:
     )
 
 
-def _values(array: h5py.Dataset, which: Any) -> np.ndarray:
+def _values(array: h5py.Dataset, which: slice) -> np.ndarray:
     """Some maps of an array; one at a time where they cannot be read together, which may be for want of memory."""
     try:
         return array[which]
     except OSError:
-        indices = np.arange(len(array))[which]
-        return np.concatenate([array[index : index + 1] for index in indices])
+        return np.concatenate([array[index : index + 1] for index in range(which.start, which.stop)])
 
 
 def _manifest_text(path: Path) -> str | bytes:
@@ -363,10 +397,8 @@ def _truth(part: dict[str, Any]) -> str:
     return "generated" if "recipe" in part else part["source"].get("truth", "unknown")
 
 
-def _joined(parts: Sequence[Maps]) -> Maps:
-    if len(parts) == 1:
-        return parts[0]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+def _first(piece: Piece) -> int:
+    return piece.first
 
 
 def dataset_folders() -> list[Path]:

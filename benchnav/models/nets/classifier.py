@@ -6,21 +6,21 @@ in shapes: B maps, H×W cells, C classes.
 """
 
 import math
-from typing import Any
+from typing import Any, Self
 
-import lightning
 import segmentation_models_pytorch as smp
 import torch
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
-from torchmetrics import MetricCollection
+from torchmetrics import Metric
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.models.checkpoint import CLASSIFIER
 from benchnav.models.config import ClassifierConfig, rebuild
 from benchnav.models.nets.network import build_network
-from benchnav.models.nets.schedule import one_cycle
+from benchnav.models.nets.temperature import fit_temperature, sample_logits
+from benchnav.models.nets.trainable import TrainableNetwork
 
 
 class LabelledLoss(nn.Module):
@@ -68,7 +68,7 @@ class MeanIoU(MulticlassJaccardIndex):
         return super().compute()[self.confmat.sum(1) > 0].mean()
 
 
-class TerrainClassifier(lightning.LightningModule):
+class TerrainClassifier(TrainableNetwork):
     """Predicts the terrain class of every cell from colour.
 
     Args:
@@ -77,9 +77,11 @@ class TerrainClassifier(lightning.LightningModule):
         colour_mean: of the training maps, 0–255, shape [3].
         colour_std: of the training maps, shape [3].
         seed: root seed of the initial weights.
-        temperature: by which logits are divided once training is over (see `models.training.temperature`).
+        temperature: by which logits are divided once training is over (see `models.nets.temperature`).
     """
 
+    part = CLASSIFIER
+    fields = ("class_id",)
     colour_mean: Tensor
     colour_std: Tensor
 
@@ -93,13 +95,19 @@ class TerrainClassifier(lightning.LightningModule):
         temperature: float = 1.0,
     ) -> None:
         """Builds the network with fresh weights."""
-        super().__init__()
-        self.config, self.class_count, self.temperature = config, class_count, temperature
+        self.class_count = class_count
+        super().__init__(config)
+        self.temperature = temperature
         self.register_buffer("colour_mean", colour_mean.clone().view(3, 1, 1))
         self.register_buffer("colour_std", colour_std.clone().view(3, 1, 1))
         self.network = self.configure_network(seed)
         self.loss = self.configure_losses()
-        self.metrics = self.configure_metrics()
+
+    @classmethod
+    def untrained(cls, config: Any, class_count: int, data: Any = None, seed: int = 0) -> Self:
+        """Builds it with fresh weights, for images of the colours of `data`."""
+        colours = data.colour_statistics() if data else (torch.zeros(3), torch.ones(3))
+        return cls(config, class_count, *colours, seed)
 
     def configure_network(self, seed: int) -> nn.Module:
         """Builds the network; leaves PyTorch's global generator as it was.
@@ -113,19 +121,16 @@ class TerrainClassifier(lightning.LightningModule):
         """The training loss: cross-entropy, a proper score, unless more is asked for."""
         return LabelledLoss(self.config.dice, self.config.label_smoothing)
 
-    def configure_metrics(self) -> MetricCollection:
-        """What is measured on the validation maps."""
-        return MetricCollection(
-            {
-                "accuracy": MulticlassAccuracy(self.class_count, average="micro", ignore_index=UNLABELLED),
-                "miou": MeanIoU(self.class_count, ignore_index=UNLABELLED),
-            },
-            prefix="valid_",
-        )
+    def configure_metrics(self) -> dict[str, Metric]:
+        """Share of the labelled cells that are right, and mean intersection over union."""
+        return {
+            "accuracy": MulticlassAccuracy(self.class_count, average="micro", ignore_index=UNLABELLED),
+            "miou": MeanIoU(self.class_count, ignore_index=UNLABELLED),
+        }
 
-    def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW under a one-cycle schedule over all steps."""
-        return one_cycle(self, self.config.learning_rate, self.config.weight_decay)
+    def settings(self) -> dict[str, Any]:
+        """The configuration and the temperature."""
+        return {**super().settings(), "temperature": self.temperature}
 
     def forward(self, rgb: Tensor) -> Tensor:
         """Computes the logits of the classes; maps of any size are padded and the result cropped.
@@ -144,22 +149,17 @@ class TerrainClassifier(lightning.LightningModule):
         logits = logits[..., :height, :width]
         return logits if self.training else logits / self.temperature
 
-    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        """Computes the loss of a batch with `rgb` and `class_id`."""
-        rgb, class_id = batch["rgb"], batch["class_id"].long()
-        loss = self.loss(self(rgb), class_id)
-        self.log(
-            "train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=_labelled(class_id)
-        )
-        return loss
+    def calibrate(self, maps: Any, seed: int, device: torch.device) -> None:
+        """Fits the temperature."""
+        self.temperature = fit_temperature(*sample_logits(self, maps, seed, device))
 
-    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        """Measures a batch with `rgb` and `class_id`."""
-        logits, class_id = self(batch["rgb"]).float(), batch["class_id"].long()
-        loss = self.loss(logits, class_id)
-        self.metrics.update(logits.argmax(1), class_id)
-        self.log("valid_loss", loss, on_epoch=True, batch_size=_labelled(class_id), sync_dist=True)
-        self.log_dict(dict(self.metrics.items()), on_epoch=True, batch_size=len(logits))
+    def assess(self, batch: dict[str, Tensor]) -> tuple[Tensor, int]:
+        """Computes the loss of a batch, and how many of its cells are labelled; in evaluation updates `metrics`."""
+        logits, class_id = self(batch["rgb"]), batch["class_id"].long()
+        if not self.training:
+            for name in ("accuracy", "miou"):
+                self.metrics[name].update(logits.argmax(1), class_id)
+        return self.loss(logits, class_id), int((class_id != UNLABELLED).sum())
 
     @classmethod
     def from_tensors(
@@ -184,8 +184,3 @@ class TerrainClassifier(lightning.LightningModule):
         model = cls(built, class_count, torch.zeros(3), torch.ones(3), temperature=float(temperature))
         model.load_state_dict(tensors)
         return model.eval()
-
-
-def _labelled(class_id: Tensor) -> int:
-    """Cells whose class is known, of which a loss is the mean."""
-    return int((class_id != UNLABELLED).sum())

@@ -8,21 +8,18 @@ limited dependent variables". Letters in shapes: B maps, H×W cells, K component
 """
 
 import math
-from typing import Any
+from typing import Any, Self
 
-import lightning
 import torch
-from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
-from torchmetrics import MeanSquaredError
+from torchmetrics import MeanSquaredError, Metric
 
-from benchnav.core.errors import BenchnavError, CheckpointError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
-from benchnav.models.checkpoint import Checkpoint
+from benchnav.models.checkpoint import Checkpoint, refitting
 from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.nets.schedule import one_cycle
+from benchnav.models.nets.trainable import TrainableNetwork
 
 MDN = "mdn"
 LEAST_STD = 0.01
@@ -79,7 +76,7 @@ def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Ten
     return -torch.where(seen, total, 0.0).sum() / seen.sum().clamp(min=1)
 
 
-class MixtureDensityNetwork(lightning.LightningModule):
+class MixtureDensityNetwork(TrainableNetwork):
     """Predicts the mixture of every cell from colour and slope.
 
     Args:
@@ -90,6 +87,8 @@ class MixtureDensityNetwork(lightning.LightningModule):
         seed: root seed of the initial weights.
     """
 
+    part = MDN
+    fields = ("slope_deg", "traversability")
     slope_scale_deg: Tensor
 
     def __init__(
@@ -101,8 +100,7 @@ class MixtureDensityNetwork(lightning.LightningModule):
         seed: int = 0,
     ) -> None:
         """Builds the network with fresh weights."""
-        super().__init__()
-        self.config = config
+        super().__init__(config)
         self.register_buffer("slope_scale_deg", slope_scale_deg.clone())
         image = ClassifierConfig(
             architecture=config.architecture, encoder=config.encoder, pretrained=config.pretrained
@@ -110,7 +108,21 @@ class MixtureDensityNetwork(lightning.LightningModule):
         # The classifier's network, whose outputs tell of the ground by features rather than by classes.
         self.ground = TerrainClassifier(image, _FEATURES, colour_mean, colour_std, seed)
         self.joint, self.head = self.configure_head(seed)
-        self.rmse = MeanSquaredError(squared=False)
+
+    @classmethod
+    def untrained(cls, config: Any, class_count: int, data: Any = None, seed: int = 0) -> Self:
+        """Builds it with fresh weights, for images of the colours and slopes of `data`; classes do not matter."""
+        if data is None:
+            return cls(config, torch.zeros(3), torch.ones(3), torch.ones(()), seed)
+        squares = sum(maps["slope_deg"].double().square().sum() for _, maps in data.train.chunks())
+        cells = len(data.train) * data.train.shape[0] * data.train.shape[1]
+        # Flat ground alone would have no scale.
+        scale = (torch.as_tensor(squares) / cells).sqrt().clamp(min=1).float()
+        return cls(config, *data.colour_statistics(), scale, seed)
+
+    def configure_metrics(self) -> dict[str, Metric]:
+        """The error of the expectation, in root mean square over the observed cells."""
+        return {"rmse": MeanSquaredError(squared=False)}
 
     def configure_head(self, seed: int) -> tuple[nn.Module, nn.Module]:
         """Builds the layers that join features and slope; leaves PyTorch's global generator as it was.
@@ -130,10 +142,6 @@ class MixtureDensityNetwork(lightning.LightningModule):
         head.load_state_dict({"weight": _FIRST_SPREAD * head.weight, "bias": first})
         return joint.to(memory_format=torch.channels_last), head
 
-    def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW under a one-cycle schedule over all steps."""
-        return one_cycle(self, self.config.learning_rate, self.config.weight_decay)
-
     def forward(self, rgb: Tensor, slope_deg: Tensor) -> Parameters:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.
 
@@ -151,26 +159,17 @@ class MixtureDensityNetwork(lightning.LightningModule):
             logits, means, widths = self.head(hidden.to(self.head.weight.dtype)).chunk(3, dim=1)
             return logits.log_softmax(1), means, nn.functional.softplus(widths) + LEAST_STD
 
-    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        """Computes the loss of a batch with `rgb`, `slope_deg` and `traversability`."""
-        loss, _ = self._measure(batch)
-        self.log("train_loss", loss, on_step=False, on_epoch=True, batch_size=_seen(batch))
-        return loss
-
-    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        """Measures a batch with `rgb`, `slope_deg` and `traversability`."""
-        loss, (log_weights, means, stds) = self._measure(batch)
-        expected = TraversabilityMixture(log_weights.exp(), means, stds).mean()
-        seen = batch["traversability"].isfinite()
-        self.rmse.update(expected[seen], batch["traversability"][seen])
-        self.log("valid_loss", loss, on_epoch=True, batch_size=_seen(batch), sync_dist=True)
-        self.log("valid_rmse", self.rmse, on_epoch=True, batch_size=_seen(batch))
-
-    def _measure(self, batch: dict[str, Tensor]) -> tuple[Tensor, Parameters]:
-        parameters = self(batch["rgb"], batch["slope_deg"])
-        with torch.autocast(batch["rgb"].device.type, enabled=False):
+    def assess(self, batch: dict[str, Tensor]) -> tuple[Tensor, int]:
+        """Computes the loss of a batch, and how many of its cells were observed; in evaluation updates `metrics`."""
+        parameters, observed = self(batch["rgb"], batch["slope_deg"]), batch["traversability"]
+        seen = observed.isfinite()
+        with torch.autocast(observed.device.type, enabled=False):
+            loss = censored_nll(*parameters, observed)
+        if not self.training:
             log_weights, means, stds = parameters
-            return censored_nll(log_weights, means, stds, batch["traversability"]), parameters
+            expected = TraversabilityMixture(log_weights.exp(), means, stds).mean()
+            self.metrics["rmse"].update(expected[seen], observed[seen])
+        return loss, int(seen.sum())
 
     @classmethod
     def from_tensors(cls, config: dict[str, Any], tensors: dict[str, Tensor]) -> "MixtureDensityNetwork":
@@ -230,13 +229,5 @@ class MixtureDensityModel:
             CheckpointError: the part is missing, or its tensors do not fit its settings.
         """
         part = checkpoint.part(MDN)
-        try:
+        with refitting():
             return cls(MixtureDensityNetwork.from_tensors(part.config, part.tensors))
-        except (BenchnavError, RuntimeError) as error:
-            raise CheckpointError(
-                f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
-            ) from error
-
-
-def _seen(batch: dict[str, Tensor]) -> int:
-    return int(batch["traversability"].isfinite().sum())

@@ -13,13 +13,17 @@ step; they are not whitened, so that the data hold the function in place while t
 few steps of Rprop settle the kernel and the noise. Sources: paper III-B; Hensman et al. (2015),
 "Scalable variational Gaussian process classification"; Salimbeni et al. (2018), "Natural gradients in
 practice". Letters in shapes: C classes, M inducing points, B bins of slope, G nodes of the table.
+
+The likelihood is that of the censored Gaussian: observed traversability is the latent plus Gaussian noise, clipped to
+[0, 1]. Inside (0, 1) an observation has the Gaussian density; at 0 and 1 it has the probability mass of all that was
+clipped there. Source: Tobin (1958), "Estimation of relationships for limited dependent variables".
 """
 
 import math
-from typing import Any
 
 import gpytorch
 import lightning
+import numpy as np
 import torch
 from gpytorch.constraints import Interval
 from gpytorch.distributions import MultivariateNormal
@@ -27,15 +31,16 @@ from gpytorch.variational import NaturalVariationalDistribution, UnwhitenedVaria
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from benchnav.core.errors import ConfigError
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.slope_gp.likelihood import expected_log_prob
-from benchnav.models.slope_gp.table import STEP_DEG, SlopeTable, SoftModes, table_slopes
+from benchnav.models.slope_gp.table import SlopeTable, SoftModes, table_slopes
 
 _SLOPE_UNIT_DEG = 10.0
 _LEAST_SPAN_DEG = 5.0
-_GONE = {"max_points"}  # settings of earlier versions that change nothing any more
+_QUADRATURE_NODES = 12
 _NATURAL_RATE, _RPROP_STEP, _RPROP_RANGE = 0.9, 0.1, (1e-6, 0.5)
+_NODES, _SHARES = (
+    torch.from_numpy(values) for values in np.polynomial.hermite_e.hermegauss(_QUADRATURE_NODES)
+)
 
 
 class SlopeGP(gpytorch.models.ApproximateGP):
@@ -180,73 +185,10 @@ class LatentGPs(lightning.LightningModule):
             soft=self.soft,
         )
 
-    @torch.no_grad()
-    def tabulation_error(self) -> tuple[Tensor, Tensor]:
-        """Bounds how far linear interpolation in the table is off these GPs, at any slope.
-
-        On the step h interpolation of g errs by at most h²/8·max|g''|. In the space H of the kernel k of
-        a class, with features φ(x), f''(x) has the prior standard deviation ‖φ''‖ = 5A/ℓ² and f'(x) the
-        variance ‖φ'‖² = 5A²/(3ℓ²) + τ², for a Matérn 5/2 process of amplitude A and length scale ℓ and a
-        trend of spread τ. Let K = LLᵀ be the prior covariance of the inducing values, m and S mean and
-        covariance of their posterior, μ their prior mean.
-
-        - The posterior mean is linear plus an element of H of norm ‖v‖, v = L⁻¹(m − μ): |mean''| ≤ ‖v‖·‖φ''‖.
-        - The variance is ‖u(x)‖² for a curve u = (σ, Rφ(x)), σ² that of the noise, and ‖R‖ ≤ r with
-          r² = max(1, ‖L⁻¹SL⁻ᵀ‖). From ‖u‖·‖u‖'' + ‖u‖'² = ‖u'‖² + ⟨u, u''⟩ follows
-          |std''| ≤ r²‖φ'‖²/σ + r‖φ''‖.
-
-        Returns:
-            Bounds of mean and standard deviation, float64, each of shape [C], rounding to float32 aside.
-        """
-        mean, covariance = self.gp.prior()
-        root = torch.linalg.cholesky(covariance)
-        posterior = self.gp.variational_strategy.variational_distribution
-        shift = (posterior.mean - mean).unsqueeze(-1)
-        norm = torch.linalg.solve_triangular(root, shift, upper=False).squeeze(-1).norm(dim=-1)
-        half = torch.linalg.solve_triangular(root, posterior.covariance_matrix, upper=False)
-        white = torch.linalg.solve_triangular(root, half.mT, upper=False)
-        stretch = torch.linalg.matrix_norm(white, 2).clamp(min=1)
-        amplitude = self.gp.matern.outputscale.sqrt()
-        reach = self.gp.matern.base_kernel.lengthscale.flatten() * _SLOPE_UNIT_DEG
-        bend = 5 * amplitude / reach**2
-        slope = 5 / 3 * (amplitude / reach) ** 2 + self.config.prior_fall_std**2
-        noise = self.likelihood.noise.sqrt().flatten()
-        share = STEP_DEG**2 / 8
-        return share * norm * bend, share * (stretch * slope / noise + stretch.sqrt() * bend)
-
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the table and all parameters by name, for a checkpoint."""
         state = {f"state.{name}": value for name, value in self.state_dict().items()}
         return {**self.tabulate().to_tensors(), **state}
-
-    @classmethod
-    def from_tensors(
-        cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]
-    ) -> "LatentGPs":
-        """Rebuilds trained GPs.
-
-        Args:
-            config: fields of `LatentGPConfig`, and `steepest_deg`.
-            class_count: C.
-            tensors: from `to_tensors`.
-
-        Raises:
-            ConfigError: the settings are not those of the GPs.
-            RuntimeError: the tensors do not fit them.
-        """
-        try:
-            settings: dict[str, Any] = {
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in config.items()
-                if name not in {"steepest_deg", *_GONE}
-            }
-            soft = SlopeTable.from_tensors(tensors).soft
-            model = cls(LatentGPConfig(**settings), class_count, torch.tensor(config["steepest_deg"]), soft)
-        except (KeyError, TypeError) as error:
-            raise ConfigError(f"Expected the settings of the GPs, got {sorted(config)}.") from error
-        prefix = "state."
-        model.load_state_dict({n.removeprefix(prefix): v for n, v in tensors.items() if n.startswith(prefix)})
-        return model.eval()
 
 
 def load_batches(config: LatentGPConfig, bins: dict[str, Tensor]) -> DataLoader[dict[str, Tensor]]:
@@ -258,3 +200,27 @@ def load_batches(config: LatentGPConfig, bins: dict[str, Tensor]) -> DataLoader[
     """
     # A generator of its own keeps the loader from drawing on PyTorch's global one.
     return DataLoader([bins] * config.epoch_steps, batch_size=None, generator=torch.Generator())  # type: ignore[arg-type]
+
+
+def expected_log_prob(bins: dict[str, Tensor], mean: Tensor, variance: Tensor, noise: Tensor) -> Tensor:
+    """E[log p(observations | f)] under f ~ N(mean, variance), summed over a bin's cells.
+
+    In closed form inside (0, 1); by Gauss-Hermite quadrature at 0 and 1, where the integrand log Φ is
+    smooth.
+
+    Args:
+        bins: from `SlopeSums.bins`.
+        mean: of the latent function at the bins, shape [C, B].
+        variance: of the latent function there, shape [C, B].
+        noise: variance of the noise, shape [C, 1].
+
+    Returns:
+        Shape [C, B].
+    """
+    square = bins["squares"] - 2 * mean * bins["total"] + bins["inside"] * (mean**2 + variance)
+    inside = -0.5 * (square / noise + bins["inside"] * (noise.log() + math.log(2 * math.pi)))
+    shares = (_SHARES / _SHARES.sum()).to(mean).view(-1, 1, 1)
+    latent = mean + variance.sqrt() * _NODES.to(mean).view(-1, 1, 1)
+    below = torch.special.log_ndtr(-latent / noise.sqrt())
+    above = torch.special.log_ndtr((latent - 1) / noise.sqrt())
+    return inside + (shares * (bins["zeros"] * below + bins["ones"] * above)).sum(0)

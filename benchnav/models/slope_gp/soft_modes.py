@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.models.slope_gp.sums import INSIDE_BINS, SlopeSums, levels
+from benchnav.models.slope_gp.cells import INSIDE_BINS, SlopeSums, levels
 from benchnav.models.slope_gp.table import SoftModes
 
 LEAST_CELLS, LEAST_WEIGHT, LEAST_GAIN = 100, 0.01, 2e-3

@@ -1,7 +1,7 @@
 """The class-wise GPs as tables over slope: what prediction reads instead of computing them again.
 
 Between nodes the tables are linear; for a function g that is off by at most h²/8·max|g''| on the
-step h = 0.1°. `LatentGPs.tabulation_error` bounds |g''|, and with it the error, from the parameters
+step h = 0.1°. `tabulation_error` in the tests bounds |g''|, and with it the error, from the parameters
 of the GPs: under 10⁻⁴ for those fitted to the shipped maps, and growing with h². Letters in shapes: C
 classes, G nodes, *B any leading dimensions, H×W cells.
 """

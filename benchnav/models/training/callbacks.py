@@ -1,4 +1,4 @@
-"""What happens beside a training: the best weights are kept, what is measured is written, progress is shown."""
+"""What happens beside a training where Lightning has no such thing: the best weights are kept, a table is written."""
 
 import sys
 from pathlib import Path
@@ -8,10 +8,7 @@ import lightning
 import pandas as pd
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
-from lightning.pytorch.callbacks import Callback
-from rich.console import Console
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
+from lightning.pytorch.callbacks import Callback, RichProgressBar
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
@@ -19,7 +16,11 @@ from benchnav.core.store import replacing, write_text
 
 
 class KeepBest(Callback):
-    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end."""
+    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end.
+
+    They are part of what a training goes on from. Lightning's `ModelCheckpoint` would put them into a second file,
+    which a kill could leave of another epoch than the first, and knows the loss alone of all that was measured.
+    """
 
     def __init__(self) -> None:
         """Starts with none."""
@@ -62,6 +63,8 @@ class KeepBest(Callback):
 class History(Callback):
     """Writes what was measured to a table, a row an epoch.
 
+    Lightning's `CSVLogger` writes training and validation to rows of their own, and begins anew when it is resumed.
+
     Args:
         path: the table, CSV.
     """
@@ -87,59 +90,39 @@ class History(Callback):
         self.rows = list(state["rows"])
 
 
-class Progress(Callback):
-    """Shows how far training is: a bar in a terminal, a line an epoch elsewhere.
+class EpochLines(Callback):
+    """Says on standard error what each epoch brought, where there is no terminal for Lightning's bar.
 
     Args:
         what: what is trained.
     """
 
     def __init__(self, what: str) -> None:
-        """Shows nothing yet."""
+        """Says nothing yet."""
         self.what = what
-        self.bar: Bar | None = None
-
-    def on_train_start(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Shows the bar where there is a terminal."""
-        console = Console(stderr=True)
-        if console.is_terminal and trainer.is_global_zero:
-            columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-            self.bar = Bar(TextColumn("{task.description}"), *columns, console=console)
-            total = int(trainer.estimated_stepping_batches)
-            self.task = self.bar.add_task(self.what, total=total, completed=trainer.global_step)
-            self.bar.start()
-
-    def on_train_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: lightning.LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-    ) -> None:
-        """Moves the bar."""
-        if self.bar:
-            self.bar.update(self.task, completed=trainer.global_step)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Says what the epoch brought."""
-        epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-        found = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
-        shown = found or measured(trainer)
+        """Says it."""
+        found = measured(trainer)
+        shown = {name: value for name, value in found.items() if name.startswith("valid_")} or found
         values = [f"{name.removeprefix('valid_')} {value:.4f}" for name, value in shown.items()]
-        if self.bar:
-            self.bar.update(self.task, description=f"{epoch}, {values[0]}")
-        elif trainer.is_global_zero:
+        if trainer.is_global_zero:
+            epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
             print(", ".join([epoch, *values]), file=sys.stderr, flush=True)
 
-    def teardown(self, trainer: lightning.Trainer, module: lightning.LightningModule, stage: str) -> None:
-        """Ends the bar, also when training was interrupted."""
-        if self.bar:
-            self.bar.stop()
+
+def progress(what: str) -> Callback:
+    """Shows how far training is: Lightning's bar in a terminal, a line an epoch elsewhere."""
+    if sys.stderr.isatty():
+        return RichProgressBar(console_kwargs={"stderr": True})
+    return EpochLines(what)
 
 
 class WholeFiles(TorchCheckpointIO):
-    """Writes a Lightning checkpoint whole or not at all, also where temporary files are on another disk."""
+    """Writes a Lightning checkpoint whole or not at all.
+
+    Lightning's own way moves a temporary file, which is no one step where these are on another disk.
+    """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Writes it beside its name, then renames it."""

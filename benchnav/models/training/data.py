@@ -6,7 +6,6 @@ processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import lightning
@@ -19,6 +18,7 @@ from torchvision.transforms.v2 import functional as photometry
 from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 
@@ -273,15 +273,5 @@ def read_maps(
     dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",), in_memory: bool = False
 ) -> MapDataset:
     """The colours and other fields of a split, read as they are asked for, or at once."""
-    names, count, shape = ("rgb", *fields), dataset.map_count(split), dataset.grid.shape
-    stored = partial(_read, dataset, split, names)
-    return MapDataset(partial(_take, stored(range(count))) if in_memory else stored, count, shape)
-
-
-def _read(dataset: TerrainDataset, split: str, names: tuple[str, ...], indices: Sequence[int]) -> Batch:
-    return {name: torch.from_numpy(values) for name, values in dataset.read(split, indices, names).items()}
-
-
-def _take(fields: Batch, indices: Sequence[int]) -> Batch:
-    which = torch.as_tensor(list(indices), dtype=torch.int64)
-    return {name: values[which] for name, values in fields.items()}
+    maps = TerrainMaps(dataset.path, split, ("rgb", *fields), in_memory)
+    return MapDataset(maps.read, len(maps), dataset.grid.shape)

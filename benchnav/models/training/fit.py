@@ -13,52 +13,33 @@ import os
 import pickle
 import signal
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from torch import Tensor
 
 from benchnav.core.device import find_device
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.options import one_line
 from benchnav.core.store import sole_writer, write_text
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.checkpoint import as_stored
-from benchnav.models.config import ClassifierConfig, MDNConfig
-from benchnav.models.training.callbacks import History, KeepBest, Progress, WholeFiles, measured
-from benchnav.models.training.data import TRAIN, VALID, MapData, MapDataset, check_maps
+from benchnav.models.training.callbacks import History, WholeFiles, measured, progress
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 
-Network = TypeVar("Network", bound=lightning.LightningModule)
-
-_OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "barebones", "fast_dev_run"}
-_OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps"}
-_OWN |= {
-    "accelerator",
-    "use_distributed_sampler",
-    "inference_mode",
-    "enable_autolog_hparams",
-    "model_registry",
-    "profiler",
-}
-
-
-_OF_NO_ACCOUNT = {
-    "max_epochs",
-    "log_every_n_steps",
-    "detect_anomaly",
-    "accelerator",
-}  # to the outcome, or said elsewhere
+# Settings of Lightning's trainer that are made here, and those that the outcome does not depend on.
+_OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "accelerator", "fast_dev_run"}
+_OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "enable_autolog_hparams"}
+_OWN |= {"barebones", "num_sanity_val_steps", "use_distributed_sampler", "inference_mode"}
+_OWN |= {"model_registry", "profiler"}
+_OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,121 +135,21 @@ def fit(
         KeyboardInterrupt: the user has stopped it.
     """
     folder = options.folder / part if options.folder else None
-    chosen = options.chosen(**trainer)
-    callbacks = [*callbacks, Progress(part)]
-    with _quiet():
-        if folder is None:
-            lightning_trainer = _trainer(callbacks, logger=False, enable_checkpointing=False, **chosen)
-            _run(lightning_trainer, module, data, None)
-            return measured(lightning_trainer)
-        with sole_writer(folder, f"{folder}") if is_first_process() else nullcontext():
-            folder.mkdir(parents=True, exist_ok=True)
+    held = sole_writer(folder, str(folder)) if folder and is_first_process() else nullcontext()
+    callbacks, state = [*callbacks, progress(part)], None
+    kept: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
+    with quiet(), held:
+        if folder:
             trainers = {f"trainer.{name}": value for name, value in options.trainer_settings.items()}
             state = _prepare(folder, options.resume, {**settings, **trainers})
-            keep = ModelCheckpoint(
+            last = ModelCheckpoint(
                 folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
             )
-            lightning_trainer = _trainer(
-                [*callbacks, History(folder / HISTORY), keep],
-                logger=TensorBoardLogger(folder, name="", version=""),
-                plugins=[WholeFiles()],
-                **chosen,
-            )
-            _run(lightning_trainer, module, data, state)
-            return measured(lightning_trainer)
-
-
-def check_network(
-    network: lightning.LightningModule,
-    inputs: Sequence[Tensor],
-    config: ClassifierConfig | MDNConfig,
-    dataset: TerrainDataset,
-    options: FitOptions,
-) -> None:
-    """Refuses what could not be trained before anything is: builds the trainer and tries the network on a batch.
-
-    Args:
-        network: like the one that is to be trained; it is not to be used afterwards.
-        inputs: what it takes of one map, each of shape [1, *, H, W].
-        config: its settings.
-        dataset: the maps.
-        options: how it is to be trained.
-
-    Raises:
-        ConfigError: Lightning or the network does not take the settings, or nothing would be trained or measured.
-        DatasetError: there are too few maps.
-    """
-    check_maps(dataset)
-    with _quiet():
-        trainer = _trainer(
-            [], logger=False, enable_checkpointing=False, **options.chosen(max_epochs=config.max_epochs)
-        )
-    every = trainer.check_val_every_n_epoch
-    if every is not None and every > config.max_epochs:
-        raise ConfigError(
-            f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
-            f"got {every}."
-        )
-    for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
-        maps, limit = dataset.map_count(split), getattr(trainer, name)
-        batches = -(-maps // config.batch_size)
-        if (batches * limit if isinstance(limit, float) else limit) < 1:
-            raise ConfigError(
-                f"Expected `trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
-                "Leave it out to take all."
-            )
-    together = min(2, dataset.map_count(TRAIN) // -(-dataset.map_count(TRAIN) // config.batch_size))
-    try:
-        with torch.no_grad():
-            network.train()(*(values.expand(together, *values.shape[1:]) for values in inputs))
-    except (RuntimeError, ValueError, TypeError, AssertionError) as error:
-        height, width = dataset.grid.shape
-        raise ConfigError(
-            f"Expected a network that takes batches of {together} maps of {height}×{width} cells, got "
-            f"{config.architecture} of {config.encoder}, which does not: {one_line(error)} Choose another."
-        ) from error
-
-
-def fit_network(
-    network: Network,
-    part: str,
-    config: ClassifierConfig | MDNConfig,
-    data: MapData,
-    seed: int,
-    options: FitOptions,
-    half_precision: bool,
-    measure: Callable[[Network, MapDataset], dict[str, float]],
-) -> dict[str, float]:
-    """Trains a network in place until the split `valid` no longer gains, and leaves it on the device it was trained on.
-
-    Args:
-        network: what to train.
-        part: name of the part of a model that it is.
-        config: its settings.
-        data: the maps.
-        seed: root seed of weights, order and augmentation.
-        options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
-        half_precision: whether its kernels will be kept as float16, to which they are rounded before it is measured.
-        measure: measures it on maps, as training does.
-
-    Returns:
-        What was measured on `valid` in the best epoch, whose weights it has.
-    """
-    stopping = EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)
-    metrics = fit(
-        network,
-        part,
-        options,
-        {"config": asdict(config), "data": data.digest, "seed": seed, "half_precision": half_precision},
-        [KeepBest(), stopping],
-        {"datamodule": data},
-        max_epochs=config.max_epochs,
-    )
-    network.to(options.place).eval()
-    if half_precision:
-        network.load_state_dict(as_stored(network.state_dict(), half_precision))
-        metrics = {**metrics, **measure(network, data.valid)}
-    return metrics
+            callbacks += [History(folder / HISTORY), last]
+            kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
+        lightning_trainer = make_trainer(callbacks, **kept, **options.chosen(**trainer))
+        _run(lightning_trainer, module, data, state)
+        return measured(lightning_trainer)
 
 
 def say(line: str) -> None:
@@ -304,6 +185,7 @@ def default_precision(accelerator: str) -> str:
 
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
     """Makes the folder; gives the state to go on from, if any."""
+    folder.mkdir(parents=True, exist_ok=True)
     state, described = folder / STATE, json.loads(json.dumps(settings, default=str))
     if resume and state.exists():
         there = json.loads((folder / SETTINGS).read_text()) if (folder / SETTINGS).exists() else {}
@@ -351,27 +233,27 @@ def _run(
         ) from error
 
 
-def _trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
+def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
+    """Makes Lightning's trainer.
+
+    Raises:
+        ConfigError: it does not take the settings.
+    """
     try:
         return lightning.Trainer(
             callbacks=callbacks,
-            enable_progress_bar=False,
+            enable_progress_bar=any(isinstance(callback, ProgressBar) for callback in callbacks),
             enable_model_summary=False,
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
             **settings,
         )
-    except (
-        ValueError,
-        TypeError,
-        RuntimeError,
-        MisconfigurationException,
-    ) as error:
+    except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
         raise ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {error}") from error
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keeps Lightning's hints to its developers out of a user's terminal."""
     loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]

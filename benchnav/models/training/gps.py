@@ -9,12 +9,10 @@ from benchnav.core.errors import CheckpointError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.slope_gp.cells import cell_nll, hold_out
+from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, measure_latent, sum_split
 from benchnav.models.slope_gp.gp import LatentGPs, load_batches
-from benchnav.models.slope_gp.measure import measure_latent
 from benchnav.models.slope_gp.slip_logs import read_slip_logs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
-from benchnav.models.slope_gp.sums import SlopeSums, sum_split
 from benchnav.models.training.data import TRAIN, VALID, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
 from benchnav.models.training.target import open_target
@@ -58,27 +56,18 @@ def train_gps_on_maps(
     config: LatentGPConfig, dataset: TerrainDataset, seed: int, options: FitOptions
 ) -> Part:
     """Trains the GPs on the split `train` and gives them as a part of a checkpoint."""
-
-    model = fit_gps(config, sum_split(dataset, TRAIN), options)
-    _say_soft_modes(model, [item.name for item in dataset.recipe.classes])
+    names = [item.name for item in dataset.recipe.classes]
+    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options)
     known = dataset.truth_of(VALID) == "generated"
-    measured = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
-    metrics = {f"valid_{name}": value for name, value in measured.items()}
+    found = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     errors = (
-        f"RMSE of the latent mean {metrics['valid_latent_rmse']:.4f}, largest error of the "
-        f"noise {metrics['valid_noise_error']:.1%}, "
+        f"RMSE of the latent mean {found['latent_rmse']:.4f}, largest error of the noise {found['noise_error']:.1%}, "
         if known
         else "(of their errors nothing is known: the true distribution of λ of this ground is unknown) "
     )
-    say(f"gp: validation {errors}NLL {metrics['valid_nll']:.4f}")
-    return Part(
-        config={**asdict(config), "steepest_deg": model.steepest_deg},
-        tensors=model.to_tensors(),
-        seed=seed,
-        metrics=metrics,
-        data_id=dataset.id,
-        data_digest=training_digest(dataset),
-    )
+    say(f"gp: validation {errors}NLL {found['nll']:.4f}")
+    metrics = {f"valid_{name}": value for name, value in found.items()}
+    return _part(model, seed, metrics, dataset.id, training_digest(dataset))
 
 
 def train_gps_on_logs(
@@ -89,34 +78,48 @@ def train_gps_on_logs(
     there = _there(out, overwrite)
     names = there.class_names if there else logs.class_names
     cells = logs.cells(names)
-    sums = SlopeSums.of(cells, len(names))
-    target = open_target(
-        Path(out), Checkpoint(class_names=names), [GP], f"file:{logs.digest}", options, overwrite
-    )
+    sums, digest = SlopeSums.of(cells, len(names)), f"file:{logs.digest}"
+    target = open_target(Path(out), Checkpoint(class_names=names), [GP], digest, options, overwrite)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
     _warn_of_rows(data, counts, out if there and GP in there.parts else "")
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
         kept, held = hold_out(cells, _HELD_OUT, seed)
-        condition = fit_gps(config, SlopeSums.of(kept, len(names)), options)
-        metrics["held_out_nll"] = cell_nll(held, condition.tabulate())
+        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options)
+        metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
         say(
             f"gp: NLL of {len(held)} rows held out, which follow one another in each class, "
             f"{metrics['held_out_nll']:.4f}; now with all rows"
         )
+    model = _fit_and_say(config, sums, names, options)
+    say(f"gp: rows learned from: {', '.join(f'{name} {count}' for name, count in counts.items())}")
+    target.add(GP, _part(model, seed, metrics, Path(data).name, digest))
+
+
+def _fit_and_say(
+    config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], options: FitOptions
+) -> LatentGPs:
+    """Trains the GPs, and names the classes that were found to have a second mode."""
     model = fit_gps(config, sums, options)
-    _say_soft_modes(model, names)
-    seen = ", ".join(f"{name} {count}" for name, count in counts.items())
-    say(f"gp: rows learned from: {seen}")
-    part = Part(
-        config={**asdict(config), "steepest_deg": model.steepest_deg},
+    if model.soft is not None:
+        numbers = (values.tolist() for values in (model.soft.weight, model.soft.mean, model.soft.std))
+        modes = zip(class_names, *numbers, strict=True)
+        found = [
+            f"{name} {share:.1%} of N({mean:.3f}, {std:.3f})" for name, share, mean, std in modes if share
+        ]
+        say(f"gp: soft spots of {', '.join(found)}")
+    return model
+
+
+def _part(model: LatentGPs, seed: int, metrics: dict[str, float], data_id: str, data_digest: str) -> Part:
+    return Part(
+        config={**asdict(model.config), "steepest_deg": model.steepest_deg},
         tensors=model.to_tensors(),
         seed=seed,
         metrics=metrics,
-        data_id=Path(data).name,
-        data_digest=f"file:{logs.digest}",
+        data_id=data_id,
+        data_digest=data_digest,
     )
-    target.add(GP, part)
 
 
 def _there(out: str, overwrite: bool) -> Checkpoint | None:
@@ -154,15 +157,3 @@ def _warn_of_rows(data: str, counts: Mapping[str, int], replaced: str) -> None:
 
 def _warn(line: str) -> None:
     print(f"benchnav-train: warning: {line}", file=sys.stderr)
-
-
-def _say_soft_modes(model: LatentGPs, class_names: Sequence[str]) -> None:
-    """Names the classes that were found to have a second mode."""
-    if model.soft is None:
-        return
-    numbers = (values.tolist() for values in (model.soft.weight, model.soft.mean, model.soft.std))
-    modes = zip(class_names, *numbers, strict=True)
-    listed = [
-        f"{name} {weight:.1%} of N({mean:.3f}, {std:.3f})" for name, weight, mean, std in modes if weight
-    ]
-    say(f"gp: soft spots of {', '.join(listed)}")

@@ -6,7 +6,6 @@ and writes.
 
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,11 +15,12 @@ from typing import Any
 from rich.filesize import decimal
 
 from benchnav.core.errors import CheckpointError
+from benchnav.core.store import building, refuse_taken, restore
 from benchnav.models.checkpoint import (
     CLASSIFIER,
-    CONFIG,
     Checkpoint,
     Part,
+    foreign,
     is_member,
     load_checkpoint,
     save_checkpoint,
@@ -41,7 +41,7 @@ class Target:
     def __init__(self, folder: Path, checkpoint: Checkpoint, digest: str, options: FitOptions) -> None:
         """Starts with what is there."""
         self.folder, self.checkpoint = folder, checkpoint
-        self.digest, self.options = digest, options
+        self.digest, self.options, self.changed = digest, options, False
 
     def holds(
         self,
@@ -102,11 +102,12 @@ class Target:
 
     def set_pool_temperature(self, temperature: float) -> None:
         """Saves the temperature of the pool of classifiers with the rest."""
-        self.checkpoint = replace(self.checkpoint, pool_temperature=temperature)
-        if is_first_process():
+        if temperature != self.checkpoint.pool_temperature and is_first_process():
+            self.checkpoint = replace(self.checkpoint, pool_temperature=temperature)
             self._save()
 
     def _save(self) -> None:
+        self.changed = True
         save_checkpoint(self.folder, self.checkpoint)
         size = sum(path.stat().st_size for path in self.folder.iterdir())
         parts = " and ".join(sorted(self.checkpoint.parts))
@@ -131,7 +132,8 @@ def open_target(
         overwrite: whether what is there may be replaced.
 
     Raises:
-        CheckpointError: the folder is something else, or what is there would be lost or does not fit.
+        CheckpointError: what is there would be lost or does not fit.
+        ConfigError: the folder is something else.
     """
     folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
     left = interrupted(options.folder, parts) if options.folder else []
@@ -150,10 +152,11 @@ def open_target(
         kept = {name: part for name, part in checkpoint.parts.items() if name not in dropped}
         checkpoint = replace(checkpoint, parts=kept)
     elif trained and not options.resume and is_first_process():
+        # The processes alone are trained in a moment, and so not gone on with.
+        resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
-            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace "
-            "it, or --resume to go on with what an interrupted training has left."
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it{resume}."
         )
     elif trained and not options.resume:
         checkpoint = fresh
@@ -161,16 +164,12 @@ def open_target(
 
 
 def _what_is_there(folder: Path, fresh: Checkpoint, overwrite: bool) -> Checkpoint:
+    restore(folder)
+    refuse_taken(folder, True, foreign)
     if not folder.exists():
         # Whether a checkpoint can be written there shows now rather than after the training.
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        os.rmdir(tempfile.mkdtemp(dir=folder.parent))
-        return fresh
-    if not (folder / CONFIG).is_file():
-        raise CheckpointError(
-            f"Expected `out` to be a new folder or a checkpoint, got {folder}, which is something else. "
-            "Choose another `out`."
-        )
+        with building(folder):
+            return fresh
     try:
         there = load_checkpoint(folder)
     except CheckpointError:

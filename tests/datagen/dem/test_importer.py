@@ -106,7 +106,7 @@ def test_an_import_that_stops_leaves_nothing_and_one_that_was_killed_is_cleared_
         assert next(steps) == (8, 64)
         steps.close()
         assert [path.name for path in tmp_path.iterdir()] == ["dem.tif"]
-        left = tmp_path / f".{name}.importing"
+        left = tmp_path / f".{name}.building.partial"
         left.mkdir()
         (left / "test+real-00000000-00000008.h5").touch()
         list(import_dem(Rasters(dem=str(dem)), tmp_path / name, RECIPE, dataset_id="real-v1"))

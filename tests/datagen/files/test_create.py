@@ -59,7 +59,7 @@ def test_digest_does_not_depend_on_workers_or_blocks(tmp_path: Path) -> None:
 def test_an_existing_file_is_kept(tmp_path: Path) -> None:
     path = tiny_dataset(tmp_path / "d.h5")
     before = path.read_bytes()
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(ConfigError, match="exists"):
         tiny_dataset(path)
     assert path.read_bytes() == before
 
@@ -168,11 +168,11 @@ def test_a_file_that_another_run_finished_meanwhile_is_kept(tmp_path: Path) -> N
     late = create(tiny_recipe(), path, jobs=2)  # has asked nothing yet
     tiny_dataset(path, tiny_recipe(train=9))
     before = path.read_bytes()
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(ConfigError, match="exists"):
         next(late)
     assert path.read_bytes() == before
     assert [item.name for item in tmp_path.iterdir()] == ["d.h5"]
-    with pytest.raises(DatasetError, match="holds d"):
+    with pytest.raises(ConfigError, match="holds d"):
         next(create(tiny_recipe(), tmp_path, overwrite=True))
     assert path.exists()
 
@@ -234,10 +234,10 @@ def test_a_folder_that_holds_anything_else_is_left_alone(tmp_path: Path) -> None
     for how in ({}, {"overwrite": True}):
         other = replace(tiny_recipe(), seed=3)
         (folder / "notes.txt").write_text("mine")
-        with pytest.raises(DatasetError, match=r"holds notes\.txt"):
+        with pytest.raises(ConfigError, match=r"holds notes\.txt"):
             make(folder, other, **how)
         (folder / "notes.txt").unlink()
-    with pytest.raises(DatasetError, match="is another"):
+    with pytest.raises(ConfigError, match="is of another"):
         make(folder, replace(tiny_recipe(), seed=3))
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
     make(folder, replace(tiny_recipe(), seed=3), overwrite=True)
@@ -279,7 +279,7 @@ def test_a_finished_folder_is_there_until_what_replaces_it_is_whole(tmp_path: Pa
         pass
     assert digests(path) == digests(tiny_dataset(tmp_path / "o.h5", other)) != before
     assert sorted(item.name for item in tmp_path.iterdir()) == ["d", "o.h5"]
-    with pytest.raises(DatasetError, match="Remove it first"):
+    with pytest.raises(ConfigError, match="Remove it first"):
         make(path, shard=Shard(index=1, of=2), overwrite=True)
     assert find_faults(path) == []
 
@@ -291,7 +291,7 @@ def test_a_folder_with_a_file_of_a_user_is_never_replaced(tmp_path: Path, name: 
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / name).write_text("mine")
     for overwrite in (False, True):
-        with pytest.raises(DatasetError, match="holds"):
+        with pytest.raises(ConfigError, match="holds"):
             make(tmp_path / "d", overwrite=overwrite)
     assert (tmp_path / "d" / name).read_text() == "mine"
 
@@ -312,7 +312,7 @@ def finish(*making: Any) -> None:
 def test_unlike_shares_that_are_made_at_once_are_no_dataset(tmp_path: Path) -> None:
     path, recipe = tmp_path / "d", tiny_recipe()
     one, other = begun(path, recipe, 1), begun(path, replace(recipe, seed=3), 2)
-    with pytest.raises(DatasetError, match="is of another"):
+    with pytest.raises(ConfigError, match="is of another"):
         finish(one, other)
     assert not (path / "manifest.json").exists()
     finish(begun(path, recipe, 2, overwrite=True))
@@ -350,7 +350,7 @@ def test_a_kill_while_a_new_folder_takes_its_place_loses_neither(tmp_path: Path)
     path, dropped = make(tmp_path / "d"), tmp_path / ".d.dropped"
     before = digests(path)
     path.rename(dropped)
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(ConfigError, match="exists"):
         make(path)
     assert digests(path) == before
     dropped.mkdir()
@@ -374,7 +374,7 @@ def test_a_link_stays_a_link_to_the_disk_that_it_leads_to(tmp_path: Path) -> Non
 def test_a_folder_of_a_damaged_manifest_is_replaced(tmp_path: Path) -> None:
     path = make(tmp_path / "d")
     (path / "manifest.json").write_text("{broken")
-    with pytest.raises(DatasetError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="--overwrite"):
         make(path)
     make(path, overwrite=True)
     assert find_faults(path) == []
@@ -385,7 +385,7 @@ def test_a_refusal_keeps_what_was_made_so_far(tmp_path: Path) -> None:
     steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
     assert [next(steps)[0] for _ in range(3)] == [0, 3, 6]
     steps.close()
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(ConfigError, match="exists"):
         make(path, recipe=other)
     steps = create(other, path, overwrite=True, shard_cells=3 * CELLS)
     assert next(steps)[0] == 6
@@ -398,7 +398,7 @@ def test_what_is_put_into_a_folder_while_it_is_replaced_is_kept(tmp_path: Path) 
     steps = create(replace(tiny_recipe(), seed=3), path, overwrite=True, shard_cells=3 * CELLS)
     next(steps)
     (path / "notes.txt").write_text("mine")
-    with pytest.raises(DatasetError, match=r"holds notes\.txt"):
+    with pytest.raises(ConfigError, match=r"holds notes\.txt"):
         finish(steps)
     assert (path / "notes.txt").read_text() == "mine"
     assert digests(path) == before

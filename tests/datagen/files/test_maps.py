@@ -6,7 +6,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from benchnav.core.errors import DatasetError
-from benchnav.datagen.files import maps as maps_module
+from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset
@@ -39,9 +39,9 @@ def test_workers_read_what_this_process_reads(dataset_path: Path, context: str, 
 
 def test_another_process_opens_the_file_for_itself(dataset_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     maps = TerrainMaps(dataset_path, "train")
-    here = [maps._arrays(dataset_path)["rgb"] for _ in range(2)]
+    here = [maps.dataset._open(dataset_path)[0] for _ in range(2)]
     monkeypatch.setattr("os.getpid", lambda: -1)
-    assert here[0] is here[1] is not maps._arrays(dataset_path)["rgb"]
+    assert here[0] is here[1] is not maps.dataset._open(dataset_path)[0]
 
 
 def test_only_the_fields_asked_for_are_read(tmp_path: Path) -> None:
@@ -89,12 +89,12 @@ def test_a_missing_array_is_damage(tmp_path: Path) -> None:
 def test_maps_of_a_folder_are_those_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in create(tiny_recipe(), tmp_path / "d", shard_cells=3 * 32 * 32):
         pass
-    monkeypatch.setattr(maps_module, "_MOST_OPEN", 2)
+    monkeypatch.setattr(reader, "_MOST_OPEN", 2)
     whole = TerrainMaps(tiny_dataset(tmp_path / "d.h5"), "train")
     parts = TerrainMaps(tmp_path / "d", "train")
     for index in (7, 0, 3, 5, 2, 6, 1, 4):
         for name, values in parts[index].items():
             assert torch.equal(values, whole[index][name])
-    assert len(parts._opened[1]) == 2
+    assert len(parts.dataset._opened[1]) == 2
     loaded = torch.cat([batch["rgb"] for batch in DataLoader(parts, batch_size=3, num_workers=2)])
     assert torch.equal(loaded, torch.stack([whole[index]["rgb"] for index in range(8)]))

@@ -5,7 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
-from benchnav.core.errors import DatasetError
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.merge import merge
@@ -99,7 +99,7 @@ def test_a_damaged_source_is_refused_and_an_existing_target_kept(tmp_path: Path)
     with pytest.raises(DatasetError, match=r"'valid'.*do not match"):
         run([first, second], tmp_path / "m.h5")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "b.h5"]
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(ConfigError, match="exists"):
         run([first, second], first)
 
 
@@ -135,7 +135,7 @@ def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None
     out.mkdir()
     (out / "notes.txt").write_text("mine")
     for overwrite in (False, True):
-        with pytest.raises(DatasetError, match=r"holds notes\.txt"):
+        with pytest.raises(ConfigError, match=r"holds notes\.txt"):
             next(merge(parts, out, "both", overwrite))
     assert (out / "notes.txt").read_text() == "mine"
     (out / "notes.txt").unlink()
@@ -143,7 +143,7 @@ def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None
     assert both.digest == run(parts, tmp_path / "both.h5").digest
     # Its files have the names that they came with.
     assert sorted(item.name for item in out.iterdir()) == ["manifest.json", "train.h5", "valid.h5"]
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(ConfigError, match="exists"):
         run(parts, out)
     for _ in merge(parts[::-1], out, "again", True):
         pass

@@ -115,8 +115,8 @@ class Tight:
         return found
 
 
-@pytest.mark.parametrize("which", [slice(None), np.array([1, 4])])
-def test_want_of_memory_is_not_taken_for_damage(which: slice | np.ndarray) -> None:
+@pytest.mark.parametrize("which", [slice(0, 6), slice(1, 5)])
+def test_want_of_memory_is_not_taken_for_damage(which: slice) -> None:
     values = np.arange(6)
     np.testing.assert_array_equal(reader._values(Tight(values), which), values[which])
     with pytest.raises(OSError, match="no room"):

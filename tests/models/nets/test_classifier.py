@@ -12,8 +12,9 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import LabelledLoss, MeanIoU, TerrainClassifier
-from benchnav.models.training.classifiers import fit_classifier, measure_classifier
-from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.callbacks import KeepBest
+from benchnav.models.training.fit import FitOptions
+from benchnav.models.training.networks import fit_network, measure
 
 CPU = FitOptions(device="cpu", trainer={"precision": "32-true"})
 MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
@@ -189,9 +190,9 @@ def test_training_is_reproducible_and_learns(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     config = ClassifierConfig(max_epochs=4, batch_size=5)
-    first, metrics = fit_classifier(config, dataset, 3, CPU)
+    first, metrics = fit_network(config, dataset, 3, CPU)
     lines = capfd.readouterr().err.strip().splitlines()
-    second, _ = fit_classifier(config, dataset, 3, CPU)
+    second, _ = fit_network(config, dataset, 3, CPU)
     for name, value in first.state_dict().items():
         assert torch.equal(value, second.state_dict()[name]), name
     assert metrics["valid_accuracy"] > 0.15
@@ -215,7 +216,7 @@ def test_training_stops_when_validation_no_longer_gains(
     dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
     config = ClassifierConfig(max_epochs=30, batch_size=5, patience=1, learning_rate=0.3)
-    fit_classifier(config, dataset, 0, CPU)
+    fit_network(config, dataset, 0, CPU)
     assert len(capfd.readouterr().err.strip().splitlines()) < 20
 
 
@@ -328,7 +329,7 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
         def forward(self, seen: torch.Tensor) -> torch.Tensor:
             return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
 
-    found, wanted = (measure_classifier(Colour(), maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
+    found, wanted = (measure(Colour(), maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     assert 0 < found["valid_accuracy"] < 1
 
@@ -349,7 +350,7 @@ def test_losses_of_validation_are_weighed_by_labelled_cells() -> None:
         def chunks(self, device: torch.device) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
             return [([place], batch) for place, batch in enumerate(batches)]
 
-    found = measure_classifier(model, Maps())  # type: ignore[arg-type]
+    found = measure(model, Maps())  # type: ignore[arg-type]
     assert found["valid_loss"] == pytest.approx(float(wanted), rel=1e-5)
     trainer = lightning.Trainer(
         accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import torchmetrics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
@@ -28,12 +29,11 @@ from benchnav.models.nets.mdn import (
     censored_nll,
 )
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
-from benchnav.models.training import fit as fit_module
-from benchnav.models.training import mdn as mdn_training
+from benchnav.models.training import networks
 from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.mdn import fit_mdn, measure_network
+from benchnav.models.training.networks import fit_network, measure
 from tests.factories import normal
 from tests.models.support import make_terrain
 
@@ -329,14 +329,14 @@ class KillInTheThirdEpoch(KeepBest):
 def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, metrics = fit_mdn(SMALL, dataset, 3, FitOptions(device="cpu", trainer=EXACT))
+    whole, metrics = fit_network(SMALL, dataset, 3, FitOptions(device="cpu", trainer=EXACT))
     assert set(metrics) == {"train_loss", "valid_loss", "valid_rmse", "epoch"}
     with monkeypatch.context() as patch:
-        patch.setattr(fit_module, "KeepBest", KillInTheThirdEpoch)
+        patch.setattr(networks, "KeepBest", KillInTheThirdEpoch)
         with pytest.raises(Killed):
-            fit_mdn(SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, trainer=EXACT))
+            fit_network(SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, trainer=EXACT))
     torch.manual_seed(99)  # what the global generator holds must not matter
-    again, resumed = fit_mdn(
+    again, resumed = fit_network(
         SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT)
     )
     measured = ("valid_loss", "valid_rmse", "epoch")
@@ -344,7 +344,7 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     for name, value in whole.state_dict().items():
         assert torch.equal(value, again.state_dict()[name]), name
     with pytest.raises(CheckpointError, match="to resume it"):
-        fit_mdn(
+        fit_network(
             replace(SMALL, components=2),
             dataset,
             3,
@@ -353,16 +353,18 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
 
 
 def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: TerrainDataset) -> None:
-    network, metrics = fit_mdn(
+    network, metrics = fit_network(
         replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT), True
     )
-    whole, before = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT))
+    whole, before = fit_network(
+        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
+    )
     for name, value in as_stored(whole.state_dict(), True).items():
         assert torch.equal(value, network.state_dict()[name]), name
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
-    assert measure_network(network, valid).items() <= metrics.items()
+    assert measure(network, valid).items() <= metrics.items()
     # Measured in the same way as in training, of which the rounding is all that changes it.
-    for name, value in measure_network(whole, valid).items():
+    for name, value in measure(whole, valid).items():
         assert value == pytest.approx(before[name], rel=1e-4), name
         assert value != metrics[name]
 
@@ -377,8 +379,10 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
             super().__init__(*arguments, **named)
             jitters.append(self.jitter)
 
-    monkeypatch.setattr(mdn_training, "MapData", Watched)
-    network, _ = fit_mdn(replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT))
+    monkeypatch.setattr(networks, "MapData", Watched)
+    network, _ = fit_network(
+        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
+    )
     assert jitters == [SMALL.jitter]
     slopes = torch.from_numpy(dataset.read("train", fields=["slope_deg"])["slope_deg"])
     torch.testing.assert_close(network.slope_scale_deg, slopes.square().mean().sqrt())
@@ -388,16 +392,16 @@ def test_what_is_measured_in_validation_leaves_out_what_was_not_observed() -> No
     network, terrain = build(), make_terrain(size=32)
     observed = terrain.traversability.clone()
     observed[:, ::2] = float("nan")
-    logged: dict[str, object] = {}
-    network.log = lambda name, value, **_: logged.update({name: value})  # type: ignore[method-assign, assignment, misc]
+    logged: dict[str, torchmetrics.Metric] = {}
+    network.log_dict = lambda metrics, **_: logged.update(metrics)  # type: ignore[method-assign, assignment]
     batch = {"rgb": terrain.rgb, "slope_deg": terrain.slope_deg, "traversability": observed}
     with torch.no_grad():
         network.validation_step(batch, 0)
     mixture = MixtureDensityModel(network).predict(terrain.observe())
     error = (mixture.mean() - observed)[:, 1::2].square().mean().sqrt()
     nll = -mixture.log_prob(terrain.traversability)[:, 1::2].mean()
-    torch.testing.assert_close(network.rmse.compute(), error)
-    torch.testing.assert_close(logged["valid_loss"], nll)
+    torch.testing.assert_close(logged["valid_rmse"].compute(), error)
+    torch.testing.assert_close(logged["valid_loss"].compute(), nll)
 
 
 # --- checkpoints and the command -----------------------------------------------------------------
@@ -456,7 +460,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     where = ["mdn", "--data", dataset.path, "--out", "mine", *QUICK]
     assert call(monkeypatch, *where, "--trainer.max_epochs", 2, "--seed", 7, "--mdn.components", 2) == 0
     out, err = capfd.readouterr()
-    assert "validation NLL" in out
+    assert "validation RMSE" in out
     assert "wrote mine with mdn" in out
     assert [line.split(",")[0] for line in err.strip().splitlines()] == ["mdn: epoch 1/2", "mdn: epoch 2/2"]
     there = load_checkpoint("mine")
@@ -468,7 +472,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     # What it says of itself was measured on what is kept.
     kept = MixtureDensityNetwork.from_tensors(part.config, part.tensors)
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
-    assert measure_network(kept, valid).items() <= dict(part.metrics).items()
+    assert measure(kept, valid).items() <= dict(part.metrics).items()
 
     assert call(monkeypatch, "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0
     assert "test/std" in capfd.readouterr().out

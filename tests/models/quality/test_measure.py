@@ -16,7 +16,7 @@ from benchnav.models.predictor import Oracle
 from benchnav.models.quality.measure import choose_splits, evaluate, measure
 from benchnav.models.quality.scores import crps
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
-from benchnav.models.slope_gp.measure import measure_latent
+from benchnav.models.slope_gp.cells import measure_latent
 from benchnav.models.slope_gp.table import SoftModes
 from tests.factories import normal
 from tests.models.stub import ColourModel

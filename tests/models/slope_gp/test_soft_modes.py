@@ -6,9 +6,8 @@ import torch
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.slope_gp.cells import Cells
+from benchnav.models.slope_gp.cells import Cells, SlopeSums, sum_cells
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
-from benchnav.models.slope_gp.sums import SlopeSums, sum_cells
 from benchnav.models.slope_gp.table import SoftModes
 from benchnav.models.training.gps import fit_gps
 

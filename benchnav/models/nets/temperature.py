@@ -8,6 +8,7 @@ deep ensembles". Letters in shapes: B maps, H×W cells, C classes, N cells.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,6 @@ from benchnav.core import rng
 from benchnav.core.device import CPU, exact_convolutions
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.training.data import MapDataset
 
 _MOST_CELLS = 200_000
 _LARGEST = 20.0
@@ -42,13 +42,13 @@ def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
 
 
 def fit_pool_temperature(
-    members: Sequence[nn.Module], maps: MapDataset, seed: int = 0, device: torch.device = CPU
+    members: Sequence[nn.Module], maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> float:
     """Finds the temperature of the average of several classifiers' probabilities, for `probabilities.sharpen`.
 
     Args:
         members: each calibrated by itself, from uint8 images [B, 3, H, W] to logits [B, C, H, W].
-        maps: with `rgb` and `class_id`.
+        maps: a `models.training.data.MapDataset` with `rgb` and `class_id`.
         seed: root seed of the cells to fit to.
         device: where to compute, to which the classifiers are moved.
     """
@@ -60,13 +60,13 @@ def fit_pool_temperature(
 
 
 def sample_logits(
-    classifier: nn.Module, maps: MapDataset, seed: int = 0, device: torch.device = CPU
+    classifier: nn.Module, maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> tuple[Tensor, Tensor]:
     """Classifies maps and keeps at most 200 000 cells, the same share of every map.
 
     Args:
         classifier: from uint8 images [B, 3, H, W] to logits [B, C, H, W].
-        maps: with `rgb` and `class_id`.
+        maps: a `models.training.data.MapDataset` with `rgb` and `class_id`.
         seed: root seed of the draw.
         device: where to compute, to which the classifier is moved.
 
