@@ -24,8 +24,9 @@ from benchnav.eval.folder.folder import open_run, write_run
 from benchnav.eval.run import episode, recorder, runner
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite, run_unit
-from benchnav.models.predictor import Oracle, predict
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.models.base import TraversabilityModel, predict
+from benchnav.models.predictor import Oracle
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
@@ -138,7 +139,7 @@ def test_nothing_waits_for_a_device_at_every_step(
     assert counted[1] - counted[0] <= 16 / 8 + 1
 
 
-class Exhausted:
+class Exhausted(Planner[Problem]):
     """Finds no memory left on its GPU."""
 
     def __init__(self, at: str = "plan") -> None:
@@ -210,7 +211,7 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
 def test_a_gpu_convolves_as_the_cpu_does() -> None:
     seen = []
 
-    class Network:
+    class Network(TraversabilityModel):
         def predict(self, observation: Any) -> Any:
             cudnn = torch.backends.cudnn
             seen.append((cudnn.allow_tf32, cudnn.deterministic, cudnn.benchmark))
@@ -221,7 +222,7 @@ def test_a_gpu_convolves_as_the_cpu_does() -> None:
     assert seen == [(False, True, False)]
 
 
-class Late:
+class Late(Planner[Problem]):
     """Stands still; raises at a step when all episodes have ended and nobody has looked yet."""
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:

@@ -18,24 +18,11 @@ from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.run.check_world import check_budgets, check_draws, check_known_ground
+from benchnav.models.base import predict
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint, predict
+from benchnav.models.predictor import class_mismatch, find_checkpoint
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import pose_problem
-
-_MEMBERS = {
-    "planner": ("init", "plan"),
-    "robot": (
-        "dt_s",
-        "action_names",
-        "action_low",
-        "action_high",
-        "top_speed_mps",
-        "initial_state",
-        "__call__",
-    ),
-    "objective": ("stage", "terminal"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +68,6 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         )
     for condition in conditions:
         _check_split(condition, scenarios_of(condition.data), datasets[condition.data], suite.maps)
-    for condition in _distinct(conditions, ("planner", "robot", "objective")):
-        _check_members(condition)
     conditions, dropped = _steered(conditions)
     for condition in _distinct(conditions, ("planner", "robot", "objective")):
         _check_first_plan(condition)
@@ -98,7 +83,7 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
             other.data for other in conditions if other.model == condition.model and not other.blind
         }:
             warnings += filter(
-                None, [class_mismatch(model, datasets[data], f"model {condition.model.label}")]
+                None, [class_mismatch(model, datasets[data].recipe, f"model {condition.model.label}")]
             )
     warnings += [line for condition in conditions for line in _doubts(condition, datasets[condition.data])]
     wanted = {}
@@ -123,8 +108,9 @@ def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[st
     unfit: dict[str, dict[str, str]] = {}
     for condition in _distinct(conditions, ("planner", "robot")):
         planner, robot = condition.planner.label, condition.robot.label
+        made = condition.make_planner(), condition.make_task().robot
         try:
-            check_steers(condition.make_planner(), condition.make_task().robot, planner)
+            check_steers(*made, planner)
         except ConfigError as error:
             unfit[_pair(condition)] = {"planner": planner, "robot": robot, "reason": str(error)}
     left = [condition for condition in conditions if _pair(condition) not in unfit]
@@ -181,21 +167,9 @@ def _check_single_class(conditions: list[Condition], datasets: dict[str, Terrain
         condition.make_risk()(mixture)
 
 
-def _check_members(condition: Condition) -> None:
-    """Refuses a part that stands in the place of another kind."""
-    task = condition.make_task()
-    made = {"planner": condition.make_planner(), "robot": task.robot, "objective": task.objective}
-    for kind, names in _MEMBERS.items():
-        missing = [name for name in names if not hasattr(made[kind], name)]
-        if missing:
-            raise ConfigError(
-                f"Expected {kind} {getattr(condition, kind).part!r} with {', '.join(names)}, got "
-                f"{type(made[kind]).__name__} without {', '.join(missing)}."
-            )
-
-
 def _check_first_plan(condition: Condition) -> None:
-    """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
+    """Makes the parts, and lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
+    task, planner = condition.make_task(), condition.make_planner()
     if not registry.find("planner", condition.planner.part).shipped:
         return
     ground = torch.full((1, 4, 4), 0.9)
@@ -204,8 +178,8 @@ def _check_first_plan(condition: Condition) -> None:
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
     places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
     try:
-        problem = pose_problem(condition.make_task(), seen, mixture, ground, *places, 1.0)
-        condition.make_planner().init(problem, torch.Generator())
+        problem = pose_problem(task, seen, mixture, ground, *places, 1.0)
+        planner.init(problem, torch.Generator())
     except BenchnavError:
         raise
     except Exception as error:

@@ -24,9 +24,10 @@ from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
-from benchnav.models.predictor import Clairvoyant, predict
+from benchnav.models.base import predict
+from benchnav.models.predictor import Clairvoyant
 from benchnav.planning import risk
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
@@ -172,10 +173,10 @@ def simulate(
             planner = _Unmade(error)
         generator = planner_generator(unit)
         episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every, **options)
-    return episodes, bool(getattr(planner, "compiled", False))
+    return episodes, bool(planner.compiled)
 
 
-class _Unmade:
+class _Unmade(Planner[None]):
     """Stands for a planner that could not be made: it fails in each unit as one that raises."""
 
     def __init__(self, error: BaseException) -> None:

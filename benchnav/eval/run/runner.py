@@ -64,7 +64,6 @@ from benchnav.eval.run.episode import (
 from benchnav.eval.run.latency import measure_latencies
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
-from benchnav.planning.planners.planner import what_it_follows
 from benchnav.planning.world.outcome import Outcome
 
 Conditions = dict[str, tuple[Condition, Extent]]
@@ -427,9 +426,9 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
 def _notes(condition: Condition) -> dict[str, Any]:
     """What tables say of a condition's planner."""
     planner = condition.make_planner()
-    task, remarks = condition.make_task(), getattr(planner, "remarks", None)
+    task = condition.make_task()
     return {
-        "follows": what_it_follows(planner, task),
-        "remarks": list(remarks(task)) if remarks else [],
+        "follows": planner.follows(task),
+        "remarks": list(planner.remarks(task)),
         "changed": changed_options(condition.planner),
     }

@@ -19,6 +19,7 @@ from torchmetrics import MeanSquaredError
 from benchnav.core.errors import BenchnavError, CheckpointError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
+from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
 from benchnav.models.nets.classifier import TerrainClassifier
@@ -190,7 +191,7 @@ class MixtureDensityNetwork(lightning.LightningModule):
         return network.eval()
 
 
-class MixtureDensityModel:
+class MixtureDensityModel(ModelFamily):
     """A trained mixture-density network as a model.
 
     Args:

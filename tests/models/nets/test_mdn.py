@@ -17,6 +17,7 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.base import predict
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
@@ -27,7 +28,7 @@ from benchnav.models.nets.mdn import (
     MixtureDensityNetwork,
     censored_nll,
 )
-from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
+from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import mdn as mdn_training
 from benchnav.models.training.callbacks import KeepBest
