@@ -11,18 +11,25 @@ def face(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Gives a package its `__getattr__`, `__dir__` and `__all__` (PEP 562), so that importing it loads nothing else.
 
-    Editors and type checkers read the same names in the `__init__.pyi` beside it.
+    Editors and type checkers read the same names in the `__init__.pyi` beside it. A name may differ from that in its
+    module, `create as create_dataset`: the parser of the commands looks for its functions' names in the packages around
+    them, and would load what bears the name of a command.
 
     Args:
         package: its `__name__`.
         modules: for each module the names that users are to import from the package.
     """
-    places = {name: module for module, names in modules.items() for name in names}
+    places = {}
+    for module, names in modules.items():
+        for name in names:
+            own, _, public = name.partition(" as ")
+            places[public or own] = module, own
 
     def find(name: str) -> Any:
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(places[name]), name)
+        module, own = places[name]
+        value = getattr(import_module(module), own)
         setattr(sys.modules[package], name, value)  # found at once from now on
         return value
 

@@ -57,6 +57,7 @@ from benchnav.core.sources import (
     digest_of_target,
     distribution_of,
     load_file,
+    moved,
 )
 
 __all__ = [
@@ -379,7 +380,9 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{place}.".startswith(f"{error.name}."):
             file = Path(*place.split(".")).with_suffix(".py")
-            if file.is_file():
+            if remedy := moved(error):
+                remedy = remedy.removeprefix(".")
+            elif file.is_file():
                 remedy = f" Did you mean './{file}:{name}'?"
             else:
                 remedy = (
@@ -389,7 +392,7 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
                 f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or "
                 f"path/to/file.py:Name, got {place + ':' + name!r}, and there is no module {error.name!r}.{remedy}"
             ) from error
-        raise ConfigError(f"module {place} could not be imported: {one_line(error)}") from error
+        raise ConfigError(f"module {place} could not be imported: {one_line(error)}{moved(error)}") from error
     target = attribute(module, place, name)
     if place.partition(".")[0] == "benchnav":
         return Found(target=target, origin=f"benchnav {benchnav.__version__}", shipped=True)

@@ -5,7 +5,7 @@ from benchnav.core.face import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "benchnav.datagen.files.create": ("create",),
+        "benchnav.datagen.files.create": ("create as create_dataset",),
         "benchnav.datagen.files.maps": ("TerrainMaps",),
         "benchnav.datagen.files.reader": ("TerrainDataset", "find_dataset"),
         "benchnav.datagen.recipe.classes": ("TerrainClass",),

@@ -1,10 +1,19 @@
-from benchnav.datagen.files.create import create as create
-from benchnav.datagen.files.maps import TerrainMaps as TerrainMaps
-from benchnav.datagen.files.reader import TerrainDataset as TerrainDataset
-from benchnav.datagen.files.reader import find_dataset as find_dataset
-from benchnav.datagen.recipe.classes import TerrainClass as TerrainClass
-from benchnav.datagen.recipe.recipe import Recipe as Recipe
-from benchnav.datagen.recipe.recipe import load_recipe as load_recipe
-from benchnav.datagen.recipe.recipe import recipe_from_dict as recipe_from_dict
-from benchnav.datagen.recipe.recipe import shipped_recipes as shipped_recipes
-from benchnav.datagen.synth.generate import generate as generate
+from benchnav.datagen.files.create import create as create_dataset
+from benchnav.datagen.files.maps import TerrainMaps
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.synth.generate import generate
+
+__all__ = [
+    "Recipe",
+    "TerrainClass",
+    "TerrainDataset",
+    "TerrainMaps",
+    "create_dataset",
+    "find_dataset",
+    "generate",
+    "load_recipe",
+    "recipe_from_dict",
+    "shipped_recipes",
+]

@@ -1,2 +1,3 @@
-from benchnav.env.environment import OffRoadEnv as OffRoadEnv
-from benchnav.env.environment import OffRoadVectorEnv as OffRoadVectorEnv
+from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
+
+__all__ = ["OffRoadEnv", "OffRoadVectorEnv"]

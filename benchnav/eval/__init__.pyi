@@ -1,8 +1,18 @@
-from benchnav.eval.compare import compare_runs as compare_runs
-from benchnav.eval.experiment.condition import Condition as Condition
-from benchnav.eval.experiment.suite import Suite as Suite
-from benchnav.eval.folder.folder import open_run as open_run
-from benchnav.eval.folder.steps import read_steps as read_steps
-from benchnav.eval.report.write import read_report as read_report
-from benchnav.eval.report.write import write_report as write_report
-from benchnav.eval.run.runner import run_suite as run_suite
+from benchnav.eval.compare import compare_runs
+from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.steps import read_steps
+from benchnav.eval.report.write import read_report, write_report
+from benchnav.eval.run.runner import run_suite
+
+__all__ = [
+    "Condition",
+    "Suite",
+    "compare_runs",
+    "open_run",
+    "read_report",
+    "read_steps",
+    "run_suite",
+    "write_report",
+]

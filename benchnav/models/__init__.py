@@ -8,6 +8,6 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.models.base": ("ModelFamily", "TraversabilityModel", "predict"),
         "benchnav.models.checkpoint": ("Checkpoint", "Part", "load_checkpoint", "save_checkpoint"),
         "benchnav.models.predictor": ("find_checkpoint", "list_checkpoints", "load_model"),
-        "benchnav.models.quality.measure": ("evaluate",),
+        "benchnav.models.quality.measure": ("evaluate as evaluate_model",),
     },
 )

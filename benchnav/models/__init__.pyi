@@ -1,11 +1,18 @@
-from benchnav.models.base import ModelFamily as ModelFamily
-from benchnav.models.base import TraversabilityModel as TraversabilityModel
-from benchnav.models.base import predict as predict
-from benchnav.models.checkpoint import Checkpoint as Checkpoint
-from benchnav.models.checkpoint import Part as Part
-from benchnav.models.checkpoint import load_checkpoint as load_checkpoint
-from benchnav.models.checkpoint import save_checkpoint as save_checkpoint
-from benchnav.models.predictor import find_checkpoint as find_checkpoint
-from benchnav.models.predictor import list_checkpoints as list_checkpoints
-from benchnav.models.predictor import load_model as load_model
-from benchnav.models.quality.measure import evaluate as evaluate
+from benchnav.models.base import ModelFamily, TraversabilityModel, predict
+from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
+from benchnav.models.quality.measure import evaluate as evaluate_model
+
+__all__ = [
+    "Checkpoint",
+    "ModelFamily",
+    "Part",
+    "TraversabilityModel",
+    "evaluate_model",
+    "find_checkpoint",
+    "list_checkpoints",
+    "load_checkpoint",
+    "load_model",
+    "predict",
+    "save_checkpoint",
+]

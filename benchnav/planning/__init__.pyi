@@ -1,27 +1,40 @@
-from benchnav.planning.free_space import FreeSpace as FreeSpace
-from benchnav.planning.free_space import Rules as Rules
-from benchnav.planning.objective import GoalDistance as GoalDistance
-from benchnav.planning.objective import Objective as Objective
-from benchnav.planning.objective import TravelTime as TravelTime
-from benchnav.planning.objective import distance as distance
-from benchnav.planning.planners.astar.astar_dwa import AStarDWA as AStarDWA
-from benchnav.planning.planners.astar.astar_mppi import AStarMPPI as AStarMPPI
-from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT as CLRRT
-from benchnav.planning.planners.mppi import MPPI as MPPI
-from benchnav.planning.planners.mppi import MPPIConfig as MPPIConfig
-from benchnav.planning.planners.planner import LocalPlanner as LocalPlanner
-from benchnav.planning.planners.planner import Plan as Plan
-from benchnav.planning.planners.planner import Planner as Planner
-from benchnav.planning.planners.planner import PlanStatus as PlanStatus
-from benchnav.planning.planners.planner import Step as Step
-from benchnav.planning.planners.straight import Straight as Straight
-from benchnav.planning.problem import Problem as Problem
-from benchnav.planning.problem import Task as Task
-from benchnav.planning.problem import pose_problem as pose_problem
-from benchnav.planning.robots import SPEED as SPEED
-from benchnav.planning.robots import STEERING as STEERING
-from benchnav.planning.robots import TURN_RATE as TURN_RATE
-from benchnav.planning.robots import Bicycle as Bicycle
-from benchnav.planning.robots import DifferentialDrive as DifferentialDrive
-from benchnav.planning.robots import Robot as Robot
-from benchnav.planning.robots import Unicycle as Unicycle
+from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.objective import GoalDistance, Objective, TravelTime, distance
+from benchnav.planning.planners.astar.astar_dwa import AStarDWA
+from benchnav.planning.planners.astar.astar_mppi import AStarMPPI
+from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus, Step
+from benchnav.planning.planners.straight import Straight
+from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
+
+__all__ = [
+    "CLRRT",
+    "MPPI",
+    "SPEED",
+    "STEERING",
+    "TURN_RATE",
+    "AStarDWA",
+    "AStarMPPI",
+    "Bicycle",
+    "DifferentialDrive",
+    "FreeSpace",
+    "GoalDistance",
+    "LocalPlanner",
+    "MPPIConfig",
+    "Objective",
+    "Plan",
+    "PlanStatus",
+    "Planner",
+    "Problem",
+    "Robot",
+    "Rules",
+    "Step",
+    "Straight",
+    "Task",
+    "TravelTime",
+    "Unicycle",
+    "distance",
+    "pose_problem",
+]

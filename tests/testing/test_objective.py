@@ -53,7 +53,7 @@ BAD: dict[str, tuple[Any, str]] = {
             ("no number", lambda cost, *_: cost * torch.nan, "Expected finite what `{}` gives"),
             ("a cost of the batch", lambda cost, *_: cost + cost.mean(), "the same from `{}` for an episode alone"),
             ("PyTorch's generator", lambda cost, *_: cost + 0 * torch.rand(1).to(cost), "PyTorch's global generator"),
-            ("writes into λ̂", lambda cost, *g: cost if [v.mul_(0.5) for v in g] else cost, "got another"),
+            ("writes into λ̂", lambda cost, *g: [v.mul_(0.5) for v in g] and cost, "got another"),
         )
     },
 }  # fmt: skip

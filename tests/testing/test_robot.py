@@ -25,7 +25,7 @@ def moving(change: Callable[[Tensor, Tensor, Tensor, Tensor], Any]) -> Unicycle:
 
 
 def meddling(act: Callable[[Tensor, Tensor, Tensor], object]) -> Unicycle:
-    return moving(lambda moved, *given: moved if act(*given) is None else moved)
+    return moving(lambda moved, *given: [act(*given)] and moved)
 
 
 def standing(change: Callable[[Tensor], Any]) -> Unicycle:
