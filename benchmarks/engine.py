@@ -26,7 +26,8 @@ from torch import Tensor
 
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.models.predictor import load_model, predict
+from benchnav.models.base import predict
+from benchnav.models.predictor import load_model
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.mppi import MPPI

@@ -14,7 +14,8 @@ from rich.table import Table
 
 from benchnav.core import cvar
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.models.predictor import load_model, predict
+from benchnav.models.base import predict
+from benchnav.models.predictor import load_model
 
 LEVEL = 0.9
 

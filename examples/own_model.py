@@ -1,6 +1,6 @@
 """A traversability model of one's own: train it, keep it, check it, and measure it beside the oracle.
 
-The contract of a model is one method, `predict(observation) -> TraversabilityMixture`: from colour,
+A model is a `TraversabilityModel` with one method, `predict(observation) -> TraversabilityMixture`: from colour,
 elevation and slope of B maps to a Gaussian mixture of traversability λ in every cell, clipped to
 [0, 1]. The model here is a toy: a perceptron that looks at one cell at a time and gives one Gaussian.
 
@@ -21,21 +21,24 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.registry import register
-from benchnav.core.terrain import Observation
-from benchnav.datagen.files.create import create
-from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import load_recipe
-from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
-from benchnav.models.predictor import load_model
-from benchnav.models.quality.measure import evaluate
-from benchnav.testing.model import check_model
+from benchnav import Observation, TraversabilityMixture, register
+from benchnav.datagen import TerrainDataset, create_dataset, load_recipe
+from benchnav.models import (
+    Checkpoint,
+    ModelFamily,
+    Part,
+    TraversabilityModel,
+    evaluate_model,
+    load_checkpoint,
+    load_model,
+    save_checkpoint,
+)
+from benchnav.testing import check_model
 
 SEED, STEPS, BATCH, HIDDEN = 0, 400, 4096, 32
 
 
-class ConstantModel:
+class ConstantModel(TraversabilityModel):
     """The least that is a model: the same Gaussian everywhere. Any other should do better."""
 
     def __init__(self, mean: float = 0.6, std: float = 0.2) -> None:
@@ -46,7 +49,7 @@ class ConstantModel:
         return TraversabilityMixture(ones, self.mean * ones, self.std * ones)
 
 
-class PixelModel:
+class PixelModel(ModelFamily):
     """Mean and standard deviation of λ from the colour and slope of the cell alone."""
 
     def __init__(self, network: nn.Module) -> None:
@@ -60,7 +63,7 @@ class PixelModel:
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "PixelModel":
-        """With this a class is a family, whose models `load_model` reads from checkpoints that name it."""
+        """With this a class is a family: `load_model` reads its models from checkpoints that name it."""
         part = checkpoint.part("pixel")
         network = build_network(part.config["hidden"])
         network.load_state_dict(part.tensors)
@@ -107,7 +110,7 @@ def train(dataset: TerrainDataset) -> nn.Module:
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for _ in create(load_recipe("tiny-v1"), folder / "tiny.h5"):
+        for _ in create_dataset(load_recipe("tiny-v1"), folder / "tiny.h5"):
             pass
         dataset = TerrainDataset(folder / "tiny.h5")
 
@@ -133,7 +136,7 @@ def main() -> None:
         constant = ConstantModel(float(observed.mean()), float(observed.std()))
         print(f"{'model':<10}{'split':<10}{'RMSE E[λ]':>10}{'NLL':>10}{'CRPS':>10}")
         for label, model in (("constant", constant), ("own", own), ("oracle", load_model("oracle"))):
-            for split, quality in evaluate(model, dataset):
+            for split, quality in evaluate_model(model, dataset):
                 found = quality.traversability
                 print(f"{label:<10}{split:<10}{found.rmse_expected:10.4f}{found.nll:10.4f}{found.crps:10.4f}")
 

@@ -4,16 +4,15 @@
 
 It is found by its file; its constructor's parameters are its options, as in
 `{part: examples/own_planner.py:Fan, label: wide fan, options: {arcs: 31}}`. Its tests need one line,
-`check_planner("examples/own_planner.py:Fan")` of `benchnav.testing.planner`.
+`check_planner("examples/own_planner.py:Fan")` of `benchnav.testing`.
 """
 
 import torch
 
-from benchnav.planning.planners.planner import Plan, Step
-from benchnav.planning.problem import Problem
+from benchnav.planning import Plan, Planner, Problem, Step
 
 
-class Fan:
+class Fan(Planner[Problem]):
     """Rolls every arc out through F under λ̂ and takes the one of least cost."""
 
     steers = (("speed_mps", "turn_rate_radps"), ("speed_mps", "steering_rad"))

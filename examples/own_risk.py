@@ -2,11 +2,13 @@
 
 benchnav-eval run --planners '[straight,astar_dwa]' --risks '[mean,examples/own_risk.py:worst,
   {part: examples/own_risk.py:cautious, label: mean - 2 std, options: {deviations: 2.0}}]' --out runs/risks
+
+Its tests need one line, `check_risk("examples/own_risk.py:worst")` of `benchnav.testing`.
 """
 
 import torch
 
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav import TraversabilityMixture
 
 
 def worst(mixture: TraversabilityMixture, share: float = 0.05) -> torch.Tensor:

@@ -2,12 +2,13 @@
 
 benchnav-eval run --robots '[examples/own_robot.py:Tracked]' --objectives '[examples/own_robot.py:Energy]' \
   --planners '[straight,astar_dwa,mppi]' --risks '[mean]' --out runs/tracked
+
+Their tests need a line each: `check_robot` and `check_objective` of `benchnav.testing`.
 """
 
 from dataclasses import dataclass
 
-from benchnav.planning.objective import distance
-from benchnav.planning.robots import Unicycle
+from benchnav.planning import Objective, Unicycle, distance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +25,7 @@ class Tracked(Unicycle):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Energy:
+class Energy(Objective):
     """Distance to the goal, and what the tracks waste where they slip; A* minimises its `path_cost`."""
 
     waste: float = 2.0

@@ -14,7 +14,7 @@ SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
 # Whatever is known of models beside their training and their quality.
 MODELS = tuple(
     f"models.{name}"
-    for name in ("slope_gp", "nets", "checkpoint", "config", "fused", "predictor", "probabilities")
+    for name in ("base", "slope_gp", "nets", "checkpoint", "config", "fused", "predictor", "probabilities")
 )
 # Of reports, how an episode is recorded and the map that a figure shows is kept.
 RECORDED = ("eval.report.recorded", "eval.report.playback.files", "eval.report.charts.driven")
@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "datagen/dem": ("datagen.dem", "datagen.files", *SYNTHESIS),
     "models": ("models", "datagen"),
     "models/slope_gp": ("models.slope_gp", "models.config", "datagen"),
-    "models/nets": ("models.nets", "models.checkpoint", "models.config", "datagen"),
+    "models/nets": ("models.nets", "models.base", "models.checkpoint", "models.config", "datagen"),
     "models/training": ("models.training", *MODELS, "datagen"),
     "models/quality": ("models.quality", *MODELS, "datagen"),
     "planning": PLANNING,
@@ -75,7 +75,7 @@ def may_import(place: Path, name: str) -> bool:
         return False
     return (
         not inner
-        or (is_core and place != Path("__init__.py"))
+        or is_core
         or any(f"{inner}.".startswith(f"{known}.") for known in MAY_IMPORT[drawer(place)])
     )
 

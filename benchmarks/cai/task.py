@@ -49,7 +49,7 @@ ROVER = Rover()
 
 
 @dataclass(frozen=True)
-class TimeAndDistance:
+class TimeAndDistance(Objective):
     """Their cost: dt + distance at each step until arrival, and the time for what is left at a crawl.
 
     They count a step by the state after it. Here the state before it is counted, and the last one at the

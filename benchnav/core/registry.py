@@ -57,6 +57,7 @@ from benchnav.core.sources import (
     digest_of_target,
     distribution_of,
     load_file,
+    moved,
 )
 
 __all__ = [
@@ -65,6 +66,7 @@ __all__ = [
     "Found",
     "Option",
     "Part",
+    "check_base",
     "complete",
     "find",
     "hint",
@@ -74,10 +76,19 @@ __all__ = [
     "options_of",
     "read_part",
     "register",
+    "take",
     "type_name",
 ]
 
 KINDS = ("planner", "model", "risk", "robot", "objective")
+
+# What a part of each kind is a subclass of, and where users import that from. A risk measure is any function.
+_BASES = {
+    "planner": ("benchnav.planning", "Planner"),
+    "model": ("benchnav.models", "TraversabilityModel"),
+    "robot": ("benchnav.planning", "Robot"),
+    "objective": ("benchnav.planning", "Objective"),
+}
 
 # Parameters that the program gives, so no options.
 _GIVEN: Mapping[str, tuple[str, ...]] = {"objective": ("robot", "goal_radius_m")}
@@ -222,7 +233,7 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
         The object; of a risk measure a function of the mixture alone.
 
     Raises:
-        ConfigError: there is no such part or option, or it refuses its options.
+        ConfigError: there is no such part or option, it refuses its options, or it is of no such kind.
     """
     part = read_part(kind, part)
     owner = f"{kind} {part.part!r}"
@@ -235,7 +246,42 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     arguments |= {name: value for name, value in given.items() if name in parameters(target)}
     if kind == "risk" and not inspect.isclass(target):
         return partial(target, **arguments)
-    return call(owner, target, arguments)
+    made = call(owner, target, arguments)
+    check_base(kind, made, owner)
+    return made
+
+
+def take(kind: str, part: Any, **given: Any) -> Any:
+    """Makes a part that is named, as `make` does, or takes the object itself.
+
+    Raises:
+        ConfigError: as of `make`.
+    """
+    if isinstance(part, str | Mapping | Part):
+        return make(kind, part, **given)
+    check_base(kind, part, f"the {kind}")
+    return part
+
+
+def check_base(kind: str, made: Any, owner: str) -> None:
+    """Refuses an object that is no subclass of what its kind has to be.
+
+    Args:
+        kind: one of `KINDS`.
+        made: the object.
+        owner: what the message calls it.
+
+    Raises:
+        ConfigError: it is not; the line names the base class and where to import it from.
+    """
+    if kind not in _BASES:
+        return
+    place, base = _BASES[kind]
+    if not isinstance(made, getattr(importlib.import_module(place), base)):
+        name = type(made).__name__
+        raise ConfigError(
+            f"Expected {owner} to be a subclass of {place}.{base}, got {name}. Write class {name}({base})."
+        )
 
 
 def find(kind: str, source: str) -> Found:
@@ -334,7 +380,9 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{place}.".startswith(f"{error.name}."):
             file = Path(*place.split(".")).with_suffix(".py")
-            if file.is_file():
+            if remedy := moved(error):
+                remedy = remedy.removeprefix(".")
+            elif file.is_file():
                 remedy = f" Did you mean './{file}:{name}'?"
             else:
                 remedy = (
@@ -344,7 +392,7 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
                 f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or "
                 f"path/to/file.py:Name, got {place + ':' + name!r}, and there is no module {error.name!r}.{remedy}"
             ) from error
-        raise ConfigError(f"module {place} could not be imported: {one_line(error)}") from error
+        raise ConfigError(f"module {place} could not be imported: {one_line(error)}{moved(error)}") from error
     target = attribute(module, place, name)
     if place.partition(".")[0] == "benchnav":
         return Found(target=target, origin=f"benchnav {benchnav.__version__}", shipped=True)

@@ -5,6 +5,7 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import re
 import site
 import sys
 import sysconfig
@@ -20,6 +21,40 @@ from typing import Any
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.options import hint, one_line
 from benchnav.core.shipped import PACKAGE
+
+# Modules and names of earlier versions, with what users import from today.
+_MOVED = {
+    **dict.fromkeys(("errors", "grid", "mixture", "registry", "terrain"), "benchnav"),
+    "files": "benchnav.core.store",
+    **{name: f"benchnav.core.{name}" for name in ("copula", "cvar", "device", "drawing", "gridgraph", "rng")},
+    **{f"datagen.{name}": "benchnav.datagen" for name in ("create", "generate", "maps", "scenario", "store")},
+    "datagen.latent": "benchnav.datagen.recipe.latent",
+    **{f"models.predictor.{name}": "benchnav.models" for name in ("Model", "ModelFamily", "predict")},
+    "models.predictor.Model": "benchnav.models, as TraversabilityModel,",
+    "models.contract": "benchnav.testing",
+    **{f"models.{name}": f"benchnav.models.nets.{name}" for name in ("classifier", "mdn", "network")},
+    **{f"models.{name}": "benchnav.models.quality.measure" for name in ("calibration", "evaluate")},
+    "models.scores": "benchnav.models.quality.scores",
+    "planning.env": "benchnav.env",
+    "planning.env_batch": "benchnav.env.batch",
+    **{f"planning.planners.{name}": "benchnav.testing" for name in ("check", "contract")},
+    **{f"planning.planners.{name}": "benchnav.planning" for name in ("astar_dwa", "astar_mppi")},
+    **{f"planning.planners.{name}": f"benchnav.planning.planners.astar.{name}" for name in ("dwa", "guided")},
+    "planning.mppi": "benchnav.planning",
+    "planning.pure_pursuit": "benchnav.planning.planners.cl_rrt.pursuit",
+    "testing.side_effects": "benchnav.testing.breaches",
+    **{f"eval.{name}": "benchnav.eval" for name in ("condition", "runner", "suite", "trial")},
+    "eval.run.steps": "benchnav.eval",
+}
+
+
+def moved(error: BaseException) -> str:
+    """Where that is now what an import of an earlier version's name did not find; empty where nothing is known."""
+    if not isinstance(error, ImportError) or not error.name:
+        return ""
+    name = re.search(r"cannot import name '(\w+)'", str(error))
+    place = (f"{error.name}.{name[1]}" if name else error.name).removeprefix("benchnav.")
+    return f". Import from {_MOVED[place]} what was in benchnav.{place}." if place in _MOVED else ""
 
 
 def attribute(module: ModuleType, place: str, name: str) -> Any:
@@ -80,8 +115,8 @@ def load_file(path: Path, content: bytes) -> ModuleType:
             raise
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(path)]
         at = f" (line {lines[-1]})" if lines else ""
-        remedy = ""
-        if isinstance(error, ModuleNotFoundError):
+        remedy = moved(error)
+        if not remedy and isinstance(error, ModuleNotFoundError):
             remedy = ". A file stands alone: install what it imports, or write it into the file."
         raise ConfigError(f"{path} could not be imported: {one_line(error)}{at}{remedy}") from error
     return module

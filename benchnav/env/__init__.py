@@ -1,1 +1,10 @@
 """The Gymnasium environments."""
+
+from benchnav.core.face import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "benchnav.env.environment": ("OffRoadEnv", "OffRoadVectorEnv"),
+    },
+)

@@ -63,10 +63,10 @@ class EnvBatch:
     ) -> None:
         """Loads the maps of the split."""
         self._world = world if isinstance(world, World) else read_world(world)[0]
-        made: Any = _part("robot", robot)
+        made: Any = registry.take("robot", robot)
         rules = Rules(goal_radius_m=goal_radius_m)
         made_for = {"robot": made, "goal_radius_m": goal_radius_m}
-        self._objective: Any = _part("objective", objective, **made_for) if objective else None
+        self._objective: Any = registry.take("objective", objective, **made_for) if objective else None
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
         dataset = TerrainDataset(find_dataset(data))
         split = split or _default_split(dataset)
@@ -247,11 +247,6 @@ def _beside(which: Tensor, value: Tensor) -> Tensor:
 def _lost(outcome: Tensor) -> Tensor:
     """Off the map, or held by the ground for good: no later step could mend it."""
     return (outcome == Outcome.OUT_OF_BOUNDS) | (outcome == Outcome.IMMOBILISED)
-
-
-def _part(kind: str, given: Any, **made_for: Any) -> Any:
-    is_named = isinstance(given, str | Mapping | registry.Part)
-    return registry.make(kind, given, **made_for) if is_named else given
 
 
 def _default_split(dataset: TerrainDataset) -> str:

@@ -1,1 +1,16 @@
-"""Evaluation suites: rollouts, metrics, reports and playback (paper, IV)."""
+"""Evaluation: experiments, running them, statistics and reports."""
+
+from benchnav.core.face import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "benchnav.eval.compare": ("compare_runs",),
+        "benchnav.eval.experiment.condition": ("Condition",),
+        "benchnav.eval.experiment.suite": ("Suite",),
+        "benchnav.eval.folder.folder": ("open_run",),
+        "benchnav.eval.folder.steps": ("read_steps",),
+        "benchnav.eval.report.write": ("read_report", "write_report"),
+        "benchnav.eval.run.runner": ("run_suite",),
+    },
+)

@@ -114,9 +114,11 @@ def make_table(kind: str) -> "Table":
 
 def _describe(kind: str, name: str) -> Entry:
     """Describes a part; one that cannot be imported is told as such, and hides no other."""
+    from benchnav.models.base import is_family
+
     try:
         target = registry.find(kind, name).target
-        if hasattr(target, "from_checkpoint"):
+        if kind == "model" and is_family(target):
             return Entry(name=name, purpose=f"{_purpose(target)} A family: name a checkpoint of it.")
         options = tuple(_option_lines(registry.options_of(kind, target)))
         return Entry(name=name, purpose=_purpose(target), options=options)

@@ -1,1 +1,13 @@
-"""Traversability models: classifier, class-wise Gaussian processes, fusion (paper, III-B)."""
+"""Models that predict traversability: their base classes, checkpoints, training and quality."""
+
+from benchnav.core.face import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "benchnav.models.base": ("ModelFamily", "TraversabilityModel", "predict"),
+        "benchnav.models.checkpoint": ("Checkpoint", "Part", "load_checkpoint", "save_checkpoint"),
+        "benchnav.models.predictor": ("find_checkpoint", "list_checkpoints", "load_model"),
+        "benchnav.models.quality.measure": ("evaluate as evaluate_model",),
+    },
+)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
+from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import GP, Checkpoint, member_names, refitting
 from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_gp.table import SlopeTable
@@ -20,7 +21,7 @@ from benchnav.models.slope_gp.table import SlopeTable
 CHUNK_CELLS = 2**17
 
 
-class FusedModel:
+class FusedModel(ModelFamily):
     """P(λ) = Σ_c P(c)·P_c(λ | ψ), equation (1), with one component a class, and two where it has soft spots.
 
     P(c) is the average of the members' probabilities, calibrated as a whole. The paper's `single-class`

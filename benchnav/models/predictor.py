@@ -1,26 +1,24 @@
-"""What a model is, and how it is found by name or by checkpoint.
+"""How a model is found, by name or by checkpoint, and the privileged ones, which are given the truth.
 
-A model sees an `Observation` and gives a `TraversabilityMixture`; `oracle`, `ideal` and `clairvoyant`
-alone are given the Terrain. Models are parts of the registry (`benchnav.core.registry`, kind `model`): what
+Models are parts of the registry (`benchnav.core.registry`, kind `model`): what
 stands at a name is either called with its options and makes a model, or is a family, with
 `from_checkpoint`, for checkpoints that bear its name. The package's own models are in the same registry.
-Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes, K components.
+Letters in shapes: K components.
 """
 
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from benchnav.core import registry
-from benchnav.core.device import exact_convolutions
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped import shipped_folder
-from benchnav.core.terrain import Observation, Terrain
+from benchnav.core.terrain import Terrain
+from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     CONFIG,
@@ -32,67 +30,10 @@ from benchnav.models.checkpoint import (
 )
 
 if TYPE_CHECKING:
-    from benchnav.datagen.files.reader import TerrainDataset
     from benchnav.datagen.recipe.recipe import Recipe
 
 
-class Model(Protocol):
-    """The contract of a traversability model, which `benchnav.testing.model.check_model` tries."""
-
-    def predict(self, observation: Observation) -> TraversabilityMixture:
-        """Predicts the distribution of traversability in every cell.
-
-        Args:
-            observation: B maps of any size; nothing else is to be known of them.
-
-        Returns:
-            Mixture with parameters of shape [B, K, H, W], on the observation's device.
-        """
-        ...
-
-
-@runtime_checkable
-class ClassModel(Model, Protocol):
-    """A model that knows terrain classes: its weights, summed by `group`, are class probabilities.
-
-    Args:
-        class_names: names of the classes, in the order of their ids.
-    """
-
-    class_names: tuple[str, ...]
-
-
-@runtime_checkable
-class EnsembleModel(ClassModel, Protocol):
-    """A model whose class probabilities are the average of its members', calibrated as a whole."""
-
-    def member_probabilities(self, observation: Observation) -> Tensor:
-        """Class probabilities of each member, shape [M, B, C, H, W]; M = 1 for a single classifier."""
-        ...
-
-
-@runtime_checkable
-class ModelFamily(Protocol):
-    """Models of one make that are kept in checkpoints under its name."""
-
-    def from_checkpoint(self, checkpoint: Checkpoint) -> Model:
-        """Rebuilds a model.
-
-        Raises:
-            CheckpointError: a part is missing, or its tensors do not fit its settings.
-        """
-        ...
-
-
-class Privileged(Protocol):
-    """A built-in model that is given the Terrain, to tell apart what a planner's failures come from."""
-
-    def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
-        """As `Model.predict`, from the truth."""
-        ...
-
-
-class Oracle:
+class Oracle(PrivilegedModel):
     """Knows the true distribution of each cell's own class; what is left is noise."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
@@ -100,7 +41,7 @@ class Oracle:
         return terrain.truth
 
 
-class Ideal:
+class Ideal(PrivilegedModel):
     """Knows all that colours can tell: of look-alikes, the mixture of their true distributions.
 
     What a model falls short of it is the model's error; what it falls short of the oracle cannot be seen. Its
@@ -114,7 +55,7 @@ class Ideal:
         return terrain.look_alikes(terrain.class_id, terrain.slope_deg)
 
 
-class Clairvoyant:
+class Clairvoyant(PrivilegedModel):
     """Knows the λ that a robot will meet; what is left is planning."""
 
     def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
@@ -123,13 +64,11 @@ class Clairvoyant:
         return TraversabilityMixture(torch.ones_like(means), means, torch.zeros_like(means), (0,))
 
 
-AnyModel = Model | Privileged
-PRIVILEGED = (Oracle, Ideal, Clairvoyant)
 Source = str | Path | Mapping[str, Any] | registry.Part
 
 
 @torch.inference_mode(False)  # so that it is the same model wherever it is loaded
-def load_model(source: Source) -> AnyModel:
+def load_model(source: Source) -> TraversabilityModel:
     """Finds a model by checkpoint or as a part of the registry; it predicts on the observation's device.
 
     Args:
@@ -147,20 +86,15 @@ def load_model(source: Source) -> AnyModel:
         if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
             refuse_unfinished(part, checkpoint.parts)
         return open_checkpoint(checkpoint)
-    if isinstance(registry.find("model", part.part).target, ModelFamily):
+    if is_family(registry.find("model", part.part).target):
         raise ConfigError(
             f"Expected a model, got {part.part!r}, which is a family of models. "
             "Name a checkpoint of it, by its path if it bears the same name."
         )
-    model = registry.make("model", part)
-    if not isinstance(model, PRIVILEGED) and not callable(getattr(model, "predict", None)):
-        raise ConfigError(
-            f"Expected model {part.part!r} to have `predict(observation)`, got {type(model).__name__} without it."
-        )
-    return model
+    return registry.make("model", part)
 
 
-def open_checkpoint(checkpoint: Checkpoint) -> Model:
+def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
     """Rebuilds the model of a checkpoint through the family that it names.
 
     Names alone are looked up, never a module or file: what a checkpoint says runs no code of its choice.
@@ -170,7 +104,7 @@ def open_checkpoint(checkpoint: Checkpoint) -> Model:
     """
     known = registry.names("model")
     family = registry.find("model", checkpoint.model).target if checkpoint.model in known else None
-    if not isinstance(family, ModelFamily):
+    if not is_family(family):
         raise CheckpointError(
             f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
             f"{checkpoint.model!r}. Install the package that registers it."
@@ -256,60 +190,24 @@ def trained_on(source: Source) -> dict[str, str]:
     return found
 
 
-def class_mismatch(
-    model: AnyModel | Checkpoint, data: "TerrainDataset | Recipe", name: str = "the model"
-) -> str:
+def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: "Recipe", name: str = "the model") -> str:
     """Tells in one line when a model knows another class table than that of the data.
 
     Args:
         model: a model, or a checkpoint, which has a class table even where its model tells no classes.
-        data: a dataset or its recipe.
+        recipe: of the data.
         name: what the line calls the model.
 
     Returns:
         Empty where the tables are the same, or the model has none.
     """
-    own = tuple(getattr(model, "class_names", ()))
-    recipe: Any = getattr(data, "recipe", data)
     names = tuple(item.name for item in recipe.classes)
-    if not own or own == names:
+    if model.class_names in ((), names):
         return ""
     return (
-        f"{name} was trained on another class table than that of {getattr(data, 'id', 'the data')}: on "
-        f"{', '.join(own)}; the maps have {', '.join(names)}"
+        f"{name} was trained on another class table than that of {recipe.id}: on "
+        f"{', '.join(model.class_names)}; the maps have {', '.join(names)}"
     )
-
-
-def predict(model: AnyModel, terrain: Terrain) -> TraversabilityMixture:
-    """Lets a model predict: the privileged ones from the Terrain, every other from its Observation alone.
-
-    Args:
-        model: any model.
-        terrain: B maps.
-
-    Returns:
-        Mixture with parameters of shape [B, K, H, W].
-
-    Raises:
-        ConfigError: the model's answer does not fit the maps.
-    """
-    if isinstance(model, PRIVILEGED):
-        return model.predict_terrain(terrain)
-    own: Any = model
-    with exact_convolutions():
-        mixture: Any = own.predict(terrain.observe())
-    shape = (len(terrain), *terrain.grid.shape)
-    if not isinstance(mixture, TraversabilityMixture) or _cell_shape(mixture.weights) != shape:
-        got = (
-            list(mixture.weights.shape)
-            if isinstance(mixture, TraversabilityMixture)
-            else type(mixture).__name__
-        )
-        raise ConfigError(
-            "Expected the model to give a TraversabilityMixture of shape "
-            f"[{shape[0]}, K, {shape[1]}, {shape[2]}], got {got}."
-        )
-    return mixture
 
 
 def _as_part(source: Source) -> registry.Part | Path:
@@ -336,7 +234,3 @@ def _near_path(path: Path) -> str:
     siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
     near = registry.hint(path.name, siblings, f"{path.parent}/")
     return near or registry.hint(path.name, (found.name for found in list_checkpoints()))
-
-
-def _cell_shape(weights: Tensor) -> tuple[int, ...]:
-    return (*weights.shape[:-3], *weights.shape[-2:])

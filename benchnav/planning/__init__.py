@@ -1,1 +1,27 @@
-"""Problems, planners and the simulation they are tested in (paper, III-C and IV-A)."""
+"""Planning under predicted traversability: problems, planners, robots, objectives, risk and worlds."""
+
+from benchnav.core.face import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "benchnav.planning.free_space": ("FreeSpace", "Rules"),
+        "benchnav.planning.objective": ("GoalDistance", "Objective", "TravelTime", "distance"),
+        "benchnav.planning.planners.astar.astar_dwa": ("AStarDWA",),
+        "benchnav.planning.planners.astar.astar_mppi": ("AStarMPPI",),
+        "benchnav.planning.planners.cl_rrt.cl_rrt": ("CLRRT",),
+        "benchnav.planning.planners.mppi": ("MPPI", "MPPIConfig"),
+        "benchnav.planning.planners.planner": ("LocalPlanner", "Plan", "PlanStatus", "Planner", "Step"),
+        "benchnav.planning.planners.straight": ("Straight",),
+        "benchnav.planning.problem": ("Problem", "Task", "pose_problem"),
+        "benchnav.planning.robots": (
+            "SPEED",
+            "STEERING",
+            "TURN_RATE",
+            "Bicycle",
+            "DifferentialDrive",
+            "Robot",
+            "Unicycle",
+        ),
+    },
+)

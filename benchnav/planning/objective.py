@@ -1,6 +1,6 @@
 """Objectives J: what a planner minimises.
 
-An objective is any object with `stage` and `terminal`; with `path_cost` it also tells what a metre of a
+An objective is an `Objective`, with `stage` and `terminal`; with `path_cost` it also tells what a metre of a
 path costs, which planners that search paths minimise. `target` is the goal, or a local planner's way-point;
 traversability is read at the state before the move, as the risk setting gives it: the least λ̂ that motion
 is given does not bound it. In the Gymnasium environment J is given the λ that the robot met.
@@ -9,9 +9,9 @@ has a parameter `robot` or `goal_radius_m` is given the task's. Source: paper II
 shapes: *B any leading dimensions, S state and A action dimensions.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,21 +19,16 @@ from torch import Tensor
 from benchnav.core.errors import ConfigError
 from benchnav.planning.robots import Robot
 
-# Cost of a metre of path from λ̂ and grade, see `Objective`.
-PathCost = Callable[[Tensor, Tensor], Tensor]
-
 _WAYPOINT_M = 0.2  # a robot this near to a way-point has reached it
 
 
-class Objective(Protocol):
-    """The contract of a cost J, summed over a trajectory. Shapes broadcast over *B.
+class Objective(ABC):
+    """The base class of costs J, summed over a trajectory. Shapes broadcast over *B.
 
-    It may also have `path_cost(traversability, grade)`: what a horizontal metre of a path costs, from the λ̂
-    that motion is planned with, and from the grade, the rise of that metre, negative downhill; each of
-    shape [*B], as the cost, which is finite and above 0. A path's cost is the sum over its pieces. An
-    objective without it has that of `path_length`.
+    `benchnav.testing.check_objective` tries whether one keeps its contract.
     """
 
+    @abstractmethod
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step.
 
@@ -46,14 +41,25 @@ class Objective(Protocol):
         Returns:
             Shape [*B].
         """
-        ...
 
+    @abstractmethod
     def terminal(self, state: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of the last state, shape [*B]; arguments as for `stage`."""
-        ...
+
+    def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
+        """What a horizontal metre of a path costs; by default its length in 3D. A path's cost sums its pieces'.
+
+        Args:
+            traversability: the λ̂ that motion is planned with, shape [*B].
+            grade: rise of that metre, negative downhill, shape [*B].
+
+        Returns:
+            Finite and above 0, shape [*B].
+        """
+        return torch.sqrt(1 + grade * grade)
 
 
-class GoalDistance:
+class GoalDistance(Objective):
     """The paper's: distance to the target in metres, at each step. Source: paper IV-A."""
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
@@ -66,11 +72,11 @@ class GoalDistance:
 
     def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
         """Metres in 3D, which the paper's A* minimises; see `Objective`. Source: paper IV-A1."""
-        return path_length(traversability, grade)
+        return super().path_cost(traversability, grade)
 
 
 @dataclass(frozen=True)
-class TravelTime:
+class TravelTime(Objective):
     """Seconds until the target: those of the steps before arrival, and at top speed for what is left.
 
     Args:
@@ -112,14 +118,9 @@ def toward_waypoints(objective: Objective) -> Objective:
     return replace(objective, goal_radius_m=min(objective.goal_radius_m, _WAYPOINT_M))
 
 
-def path_cost_of(objective: Objective) -> PathCost:
-    """What a metre of path costs under an objective: its `path_cost`, else `path_length`."""
-    return getattr(objective, "path_cost", path_length)
-
-
-def path_length(traversability: Tensor, grade: Tensor) -> Tensor:
-    """Length in 3D of a horizontal metre, from grades [*B], shape [*B]; λ̂ changes nothing."""
-    return torch.sqrt(1 + grade * grade)
+def has_path_cost(objective: Objective) -> bool:
+    """Whether an objective says itself what a metre of path costs."""
+    return type(objective).path_cost is not Objective.path_cost
 
 
 def distance(state: Tensor, target: Tensor) -> Tensor:

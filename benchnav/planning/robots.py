@@ -1,6 +1,6 @@
 """Robots: state transitions F, what an action does on ground of some traversability.
 
-A robot is any object with the members of `Robot` and
+A robot is a `Robot`, with the members listed there and
 
     F(state [*B, S], action [*B, A], traversability [*B]) -> state [*B, S]
 
@@ -11,8 +11,8 @@ action dimensions.
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,38 +23,47 @@ from benchnav.core.errors import ConfigError
 SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"
 
 
-class Robot(Protocol):
-    """The contract of a robot."""
+class Robot(ABC):
+    """The base class of robots; `benchnav.testing.check_robot` tries whether one keeps its contract.
+
+    What is listed as a property may also be a class attribute, or the field of a dataclass that has a default.
+    """
 
     @property
+    @abstractmethod
     def dt_s(self) -> float:
         """Time step in seconds."""
-        ...
 
     @property
+    @abstractmethod
     def action_names(self) -> tuple[str, ...]:
         """What each of the A actions is, with its unit; planners that steer go by these names."""
-        ...
 
     @property
+    @abstractmethod
     def action_low(self) -> tuple[float, ...]:
         """Least value of each action."""
-        ...
 
     @property
+    @abstractmethod
     def action_high(self) -> tuple[float, ...]:
         """Greatest value of each action."""
-        ...
 
     @property
+    @abstractmethod
     def top_speed_mps(self) -> float:
         """Greatest speed over ground of λ = 1."""
-        ...
 
+    @property
+    def action_rates(self) -> tuple[float, ...] | None:
+        """Greatest change of each action in a second; None where an action is followed at once."""
+        return None
+
+    @abstractmethod
     def initial_state(self, pose: Tensor) -> Tensor:
         """State of a robot that stands at a pose (x, y, θ): shape [B, S] from [B, 3]."""
-        ...
 
+    @abstractmethod
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Advances one time step.
 
@@ -66,16 +75,10 @@ class Robot(Protocol):
         Returns:
             The next state, shape [*B, S]; no argument is changed.
         """
-        ...
-
-
-def action_limits(robot: Robot) -> tuple[float, ...] | None:
-    """Greatest change of each action in a second, where the robot has an `action_rates`; else None."""
-    return getattr(robot, "action_rates", None)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unicycle:
+class Unicycle(Robot):
     """The paper's unicycle: traversability scales both the linear and the angular velocity.
 
     State (x, y, θ), action (v, ω). Source: paper IV-A.
@@ -168,7 +171,7 @@ class DifferentialDrive(Unicycle):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bicycle:
+class Bicycle(Robot):
     """A kinematic bicycle, referred to the rear axle: it turns only while it drives.
 
     State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase; traversability scales v, and with it the

@@ -1,29 +1,26 @@
 """The contract of planners, tried on small maps made on the spot.
 
-`check_planner` is for the tests of whoever writes a planner, as `check_model` is for those of a model: a
-planner that passes can be evaluated like any other, and its rows do not hang on the batch, the order or
-what is drawn. Letters in shapes: B episodes, H×W cells, S state and A action dimensions.
+Letters in shapes: B episodes, H×W cells, S state and A action dimensions.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchnav.core import registry
-from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
-from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem, Task, pose_problem
-from benchnav.planning.robots import Robot
-from benchnav.testing.side_effects import NOTHING, same, watch
+from benchnav.testing.breaches import NOTHING, Breaches, same
 
 SHAPES = ((24, 24), (20, 33))
 TOLERANCE = 1e-3
@@ -31,8 +28,6 @@ TOLERANCE = 1e-3
 _RESOLUTION_M = 0.5
 _STEPS = 3
 _SEED = 20240229
-
-Breaches = Iterator[str]
 
 
 def check_planner(
@@ -44,6 +39,9 @@ def check_planner(
     tolerance: float = TOLERANCE,
 ) -> None:
     """Tries whether a planner keeps the contract, by letting it plan a few steps on four maps.
+
+    For the tests of whoever writes a planner, as Gymnasium's `check_env` is for those of an environment: one that
+    passes can be evaluated like any other, and its rows do not hang on the batch, the order or what is drawn.
 
     The maps: free ground, a closed wall, a start on ground predicted to immobilise the robot, a wall with a gap.
     The contract: finite actions within the robot's bounds, of shape [B, A], in the states' dtype and on
@@ -66,222 +64,156 @@ def check_planner(
     Raises:
         ConfigError: the planner breaks the contract; every breach is named.
     """
-    made = _part("planner", planner)
-    found: dict[str, list[str]] = {}
-    for breach in _unsound_attributes(made):
-        found.setdefault(breach, [])
-    steered = 0
+    made = registry.take("planner", planner)
+    breaches = Breaches("planner", type(made).__name__)
+    named = made.steers is None or (isinstance(made.steers, tuple) and all(map(_are_texts, made.steers)))
+    breaches.expect(named, f"Expected `steers` as tuples of action names, got {made.steers!r}.")
+    breaches.expect(isinstance(made.blind, bool), f"Expected `blind` of type bool, got {made.blind!r}.")
+    breaches.refuse()
+    steered, rules = 0, Rules()
     for given in registry.names("robot") if robots is None else robots:
-        robot = _part("robot", given)
-        if not _steers(made, robot):
+        robot = registry.take("robot", given)
+        if made.steers is not None and tuple(robot.action_names) not in made.steers:
             continue
         steered += 1
         name = given if isinstance(given, str) else type(robot).__name__
-        rules = Rules()
         made_for = {"robot": robot, "goal_radius_m": rules.goal_radius_m}
-        goal = _part("objective", objective or GoalDistance(), **made_for)
-        task = Task(robot=robot, objective=goal, rules=rules)
+        goal = registry.take("objective", objective or GoalDistance(), **made_for)
         for height, width in shapes:
-            problem = _make_problem(task, height, width, torch.device(device))
-            for breach in dict.fromkeys(_breaches(made, problem, tolerance)):
-                found.setdefault(breach, []).append(f"{name} on {height}×{width}")
-    if not steered:
-        found.setdefault("Expected a robot among those tried that it steers, got none.", [])
-    if found:
-        where = {breach: f" [{', '.join(places)}]" if places else "" for breach, places in found.items()}
-        listed = " ".join(
-            f"({i}) {breach}{place}" for i, (breach, place) in enumerate(where.items(), start=1)
-        )
-        raise ConfigError(
-            "Expected a planner that keeps the contract of "
-            f"`benchnav.testing.planner.check_planner`, got {type(made).__name__}, "
-            f"which breaks it: {listed}"
-        )
+            breaches.place = f"{name} on {height}×{width}"
+            task = Task(robot=robot, objective=goal, rules=rules)
+            _Trial(made, _make_problem(task, height, width, torch.device(device)), tolerance, breaches).run()
+    breaches.expect(steered > 0, "Expected a robot among those tried that it steers, got none.")
+    breaches.refuse()
 
 
-def _part(kind: str, given: Any, **made_for: Any) -> Any:
-    is_named = isinstance(given, str | Mapping | registry.Part)
-    return registry.make(kind, given, **made_for) if is_named else given
+def _are_texts(values: Any) -> bool:
+    return isinstance(values, tuple) and all(isinstance(value, str) for value in values)
 
 
-def _steers(planner: Any, robot: Robot) -> bool:
-    known = getattr(planner, "steers", None)
-    return known is None or tuple(robot.action_names) in {tuple(names) for names in known}
+@dataclass(frozen=True)
+class _Trial:
+    """A planner on one batch, and where its breaches are noted."""
 
+    planner: Planner[Any]
+    problem: Problem
+    tolerance: float
+    breaches: Breaches
 
-def _unsound_attributes(planner: Any) -> Breaches:
-    """Tells which of the attributes that tables and refusals read mean nothing."""
-    known = getattr(planner, "steers", None)
-    if known is not None and not (
-        isinstance(known, tuple)
-        and all(isinstance(n, tuple) and all(isinstance(a, str) for a in n) for n in known)
-    ):
-        yield f"Expected `steers` as tuples of action names, got {known!r}."
-    if not isinstance(getattr(planner, "blind", False), bool):
-        yield f"Expected `blind` of type bool, got {planner.blind!r}."
-
-
-def _breaches(planner: Any, problem: Problem, tolerance: float) -> Breaches:
-    """Tells what a planner breaks on one batch; stops at what makes the rest meaningless."""
-    yield from _unsound_remarks(planner, problem.task)
-    plan_state, found = _begin(planner, problem)
-    yield from found
-    if plan_state is NOTHING:
-        return
-    first_state, steps, actions = plan_state, [], []
-    step = Step(
-        state=problem.start, traversability=torch.full_like(problem.start[:, 0], torch.nan), time_s=0.0
-    )
-    for number in range(_STEPS + 1):
-        is_last = number == _STEPS
-        ended = _some_ended(problem) if is_last else torch.zeros_like(step.traversability, dtype=torch.bool)
-        step = _step(problem, step, ended, number)
-        said, found = _ask(planner, step, plan_state, problem)
-        yield from found
-        if said is NOTHING:
-            return
-        action, following, plan = said
-        yield from _unsound(action, plan, problem, ~ended)
-        yield from _compare_again(planner, step, plan_state, problem, action)
-        steps.append(step)
-        actions.append(action)
-        plan_state = following
-        met = problem.traversability_at(step.state)
-        moved = problem.robot(step.state, action.clamp(*problem.action_bounds), met)
-        step = replace(step, state=moved, traversability=met)
-    yield from _compare_seed(planner, problem, steps[0], actions[0])
-    yield from _compare_alone(planner, problem, steps[:_STEPS], actions, tolerance)
-    yield from _compare_selected(planner, problem, steps[:_STEPS], actions, tolerance)
-    yield from _compare_later(planner, problem, steps[0], first_state, actions[0])
-    yield from _compare_blind(planner, problem, steps[0], actions[0])
-
-
-def _unsound_remarks(planner: Any, task: Task) -> Breaches:
-    if hasattr(planner, "follows"):
-        follows, found = watch("follows", lambda: planner.follows(task))
-        yield from found
-        if follows is not NOTHING and not (isinstance(follows, str) and "\n" not in follows):
-            yield "Expected `follows` to give a single line, got something else."
-    if not hasattr(planner, "remarks"):
-        return
-    remarks, found = watch("remarks", lambda: planner.remarks(task))
-    yield from found
-    if remarks is not NOTHING and not (
-        isinstance(remarks, tuple) and all(isinstance(line, str) and "\n" not in line for line in remarks)
-    ):
-        yield "Expected `remarks` to give a tuple of single lines, got something else."
-
-
-def _unsound(action: Tensor, plan: Plan, problem: Problem, running: Tensor) -> Breaches:
-    """Tells what is wrong with an answer of the right form; ended episodes may get any action."""
-    action = action[running]
-    if not bool(action.isfinite().all()):
-        yield NOT_FINITE
-    low, high = problem.action_bounds
-    slack = 1e-5 * (high - low)
-    if bool(((action < low - slack) | (action > high + slack)).any()):
-        yield "Expected actions within the robot's bounds, got some beyond them."
-    if not bool(((plan.status >= min(PlanStatus)) & (plan.status <= max(PlanStatus))).all()):
-        yield f"Expected `Plan.status` in 0–{int(max(PlanStatus))}, got other numbers."
-    yield from find_layer_faults(plan, problem)
-
-
-def _compare_again(planner: Any, step: Step, plan_state: Any, problem: Problem, action: Tensor) -> Breaches:
-    """Asks again with drawing switched, which is to change nothing."""
-    said, found = _ask(planner, replace(step, draw=not step.draw), plan_state, problem)
-    yield from found
-    if said is NOTHING:
-        return
-    yield from find_layer_faults(said[2], problem)
-    if same(said[0], action):
-        return
-    said, _ = _ask(planner, step, plan_state, problem)
-    if said is not NOTHING and same(said[0], action):
-        yield "Expected the same action whether it is drawn or not, got another."
-    else:
-        yield "Expected the same action for the same step and plan state, got another when asked again."
-
-
-def _compare_seed(planner: Any, problem: Problem, step: Step, action: Tensor) -> Breaches:
-    plan_state, found = _begin(planner, problem)
-    yield from found
-    said, found = _ask(planner, step, plan_state, problem)
-    yield from found
-    if said is not NOTHING and not same(said[0], action):
-        yield "Expected the same action from a generator of the same seed, got another."
-
-
-def _compare_alone(
-    planner: Any, problem: Problem, steps: Sequence[Step], actions: Sequence[Tensor], tolerance: float
-) -> Breaches:
-    """Plans for the last episode by itself, from the same generator."""
-    alone = problem.select(torch.tensor([len(problem) - 1], device=problem.start.device))
-    plan_state, found = _begin(planner, alone)
-    yield from found
-    low, high = problem.action_bounds
-    for step, action in zip(steps, actions, strict=False):
-        said, found = _ask(
-            planner,
-            replace(step, state=step.state[-1:], traversability=step.traversability[-1:]),
-            plan_state,
-            alone,
-        )
-        yield from found
-        if said is NOTHING:
-            return
-        if not bool(((said[0] - action[-1:]).abs() <= tolerance * (high - low)).all()):
-            yield "Expected for an episode alone the action that it got in a batch, got another."
-            return
-        plan_state = said[1]
-
-
-def _compare_selected(
-    planner: Any, problem: Problem, steps: Sequence[Step], actions: Sequence[Tensor], tolerance: float
-) -> Breaches:
-    """Plans the first step for all, and the second for two of them that are kept, out of their order."""
-    if not hasattr(planner, "select") or len(steps) < 2:
-        return
-    members = torch.tensor([len(problem) - 1, len(problem) - 2], device=problem.start.device)
-    plan_state, _ = _begin(planner, problem)
-    said, _ = _ask(planner, steps[0], plan_state, problem)
-    if said is NOTHING:
-        return
-    kept, found = watch("select", lambda: planner.select(said[1], members), plan_state=said[1])
-    yield from found
-    if kept is NOTHING:
-        return
-    step = replace(steps[1], state=steps[1].state[members], traversability=steps[1].traversability[members])
-    said, found = _ask(planner, step, kept, problem.select(members))
-    yield from found
-    low, high = problem.action_bounds
-    if said is not NOTHING and not bool(
-        ((said[0] - actions[1][members]).abs() <= tolerance * (high - low)).all()
-    ):
-        yield "Expected of episodes that `select` keeps the actions that they got among all, got others."
-
-
-def _compare_later(planner: Any, problem: Problem, step: Step, plan_state: Any, action: Tensor) -> Breaches:
-    """Goes back to the first step, after others were planned and another problem was begun."""
-    _, found = _begin(planner, _with_other_prediction(problem.select(torch.arange(len(problem) - 1))))
-    yield from found
-    said, found = _ask(planner, step, plan_state, problem)
-    yield from found
-    if said is NOTHING or not same(said[0], action):
-        yield (
+    def run(self) -> None:
+        """Plans some steps, then anew under what should change nothing; stops at what makes the rest meaningless."""
+        problem, start = self.problem, self.problem.start
+        self.check_words()
+        first = plan_state = self.begin(problem)
+        step = Step(state=start, traversability=torch.full_like(start[:, 0], torch.nan), time_s=0.0)
+        tried: list[tuple[Step, Tensor]] = []
+        last = torch.tensor([len(problem) - 1], device=start.device)
+        two = torch.cat((last, last - 1))
+        for number in range(_STEPS + 1):
+            running = torch.arange(len(problem), device=start.device) >= (number == _STEPS) * two[1]
+            step = _step(problem, step, ~running, number)
+            answer = self.ask(step, plan_state, problem)
+            if answer is NOTHING:
+                return
+            action, following, plan = answer
+            self.check_answer(action[running], plan)
+            self.ask_again(step, plan_state, action)
+            tried.append((step, action))
+            plan_state, observed = following, problem.traversability_at(step.state)
+            moved = problem.robot(step.state, action.clamp(*problem.action_bounds), observed)
+            step = replace(step, state=moved, traversability=observed)
+        again = "Expected the same action from a generator of the same seed, got another."
+        following = self.expect_action(again, *tried[0], self.begin(problem), problem)
+        alone, plan_state = problem.select(last), self.begin(problem.select(last))
+        for step, action in tried[:_STEPS]:
+            breach = "Expected for an episode alone the action that it got in a batch, got another."
+            plan_state = self.expect_action(breach, _of(step, last), action[last], plan_state, alone, False)
+        act = partial(self.planner.select, following, two)
+        kept = NOTHING if following is NOTHING else self.breaches.watch("select", act, plan_state=following)
+        if kept is not NotImplemented:
+            breach = (
+                "Expected of episodes that `select` keeps the actions that they got among all, got others."
+            )
+            step, action = tried[1]
+            self.expect_action(breach, _of(step, two), action[two], kept, problem.select(two), False)
+        self.begin(_with_other_prediction(problem.select(two)))
+        self.expect_action(
             "Expected the first step's action to be the same after other steps and problems, got another. "
-            "Keep what evolves in the plan state, not on the planner."
+            "Keep what evolves in the plan state, not on the planner.",
+            *(*tried[0], first, problem),
         )
+        if self.planner.blind:
+            breach = "Expected of a `blind` planner the same action whatever is predicted, got another."
+            other = _with_other_prediction(problem)
+            self.expect_action(breach, *tried[0], self.begin(other), other)
+
+    def begin(self, problem: Problem) -> Any:
+        generator = torch.Generator().manual_seed(_SEED)
+        return self.breaches.watch("init", lambda: self.planner.init(problem, generator), problem=problem)
+
+    def ask(self, step: Step, plan_state: Any, problem: Problem) -> Any:
+        """Asks for an action; `NOTHING` where what came is of no use."""
+        if plan_state is NOTHING:
+            return NOTHING
+        act = partial(self.planner.plan, step, plan_state)
+        answer = self.breaches.watch("plan", act, problem=problem, step=step, plan_state=plan_state)
+        fault = "" if answer is NOTHING else find_fault(answer, problem)
+        return answer if self.breaches.expect(not fault, fault) else NOTHING
+
+    def expect_action(
+        self, breach: str, step: Step, action: Tensor, plan_state: Any, problem: Problem, exact: bool = True
+    ) -> Any:
+        """Expects an action, exactly or nearly; gives the next plan state, if any."""
+        answer = self.ask(step, plan_state, problem)
+        if answer is NOTHING:
+            self.breaches.expect(plan_state is NOTHING, breach)
+            return NOTHING
+        low, high = problem.action_bounds
+        near = (answer[0] - action).abs() <= self.tolerance * (high - low)
+        self.breaches.expect(same(answer[0], action) or (not exact and bool(near.all())), breach)
+        return answer[1]
+
+    def ask_again(self, step: Step, plan_state: Any, action: Tensor) -> None:
+        """Asks again with drawing switched, which is to change nothing."""
+        answer = self.ask(replace(step, draw=not step.draw), plan_state, self.problem)
+        if answer is NOTHING:
+            return
+        self.check_layers(answer[2])
+        if not same(answer[0], action):
+            again = "Expected the same action for the same step and plan state, got another when asked again."
+            answer = self.ask(step, plan_state, self.problem)
+            if self.breaches.expect(answer is not NOTHING and same(answer[0], action), again):
+                self.breaches.expect(
+                    False, "Expected the same action whether it is drawn or not, got another."
+                )
+
+    def check_words(self) -> None:
+        watch, expect, task = self.breaches.watch, self.breaches.expect, self.problem.task
+        follows = watch("follows", lambda: self.planner.follows(task))
+        remarks = watch("remarks", lambda: self.planner.remarks(task))
+        is_line = follows is NOTHING or (isinstance(follows, str) and "\n" not in follows)
+        expect(is_line, "Expected `follows` to give a single line, got something else.")
+        are_lines = remarks is NOTHING or (_are_texts(remarks) and "\n" not in "".join(remarks))
+        expect(are_lines, "Expected `remarks` to give a tuple of single lines, got something else.")
+
+    def check_answer(self, action: Tensor, plan: Plan) -> None:
+        """Tells what is wrong with an answer of the right form; ended episodes may get any action."""
+        expect, (low, high) = self.breaches.expect, self.problem.action_bounds
+        slack = 1e-5 * (high - low)
+        expect(bool(action.isfinite().all()), NOT_FINITE)
+        beyond = (action < low - slack) | (action > high + slack)
+        expect(not bool(beyond.any()), "Expected actions within the robot's bounds, got some beyond them.")
+        known = (plan.status >= min(PlanStatus)) & (plan.status <= max(PlanStatus))
+        expect(bool(known.all()), f"Expected `Plan.status` in 0–{int(max(PlanStatus))}, got other numbers.")
+        self.check_layers(plan)
+
+    def check_layers(self, plan: Plan) -> None:
+        for fault in find_layer_faults(plan, self.problem):
+            self.breaches.expect(False, fault)
 
 
-def _compare_blind(planner: Any, problem: Problem, step: Step, action: Tensor) -> Breaches:
-    """Shows a planner that calls itself blind other predictions, which is to change nothing."""
-    if not getattr(planner, "blind", False):
-        return
-    other = _with_other_prediction(problem)
-    plan_state, _ = _begin(planner, other)
-    said, _ = _ask(planner, step, plan_state, other)
-    if said is NOTHING or not same(said[0], action):
-        yield "Expected of a `blind` planner the same action whatever is predicted, got another."
+def _of(step: Step, members: Tensor) -> Step:
+    return replace(step, state=step.state[members], traversability=step.traversability[members])
 
 
 def _with_other_prediction(problem: Problem) -> Problem:
@@ -292,28 +224,6 @@ def _with_other_prediction(problem: Problem) -> Problem:
         risk_map=1 - problem.risk_map,
         free=~problem.free,
     )
-
-
-def _begin(planner: Any, problem: Problem) -> tuple[Any, list[str]]:
-    generator = torch.Generator().manual_seed(_SEED)
-    return watch("init", lambda: planner.init(problem, generator), problem=problem)
-
-
-def _ask(planner: Any, step: Step, plan_state: Any, problem: Problem) -> tuple[Any, list[str]]:
-    """Asks for an action; `NOTHING` where what came is of no use."""
-    if plan_state is NOTHING:
-        return NOTHING, []
-    said, found = watch(
-        "plan", lambda: planner.plan(step, plan_state), problem=problem, step=step, plan_state=plan_state
-    )
-    if said is not NOTHING and (fault := find_fault(said, problem)):
-        return NOTHING, [*found, fault]
-    return said, found
-
-
-def _some_ended(problem: Problem) -> Tensor:
-    """The episodes that have ended by the last step tried: all but the last two, bool [B]."""
-    return torch.arange(len(problem), device=problem.start.device) < len(problem) - 2
 
 
 def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
@@ -332,16 +242,16 @@ def _make_problem(task: Task, height: int, width: int, device: torch.device) -> 
     # Waves, so that no two cells are quite alike.
     ground = (0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)).repeat(4, 1, 1)
     wall = (rows == height // 2) | (rows == height // 2 + 1)
-    ground[1] = torch.where(wall, 0.1, ground[1])
-    ground[2] = torch.where((rows < 5) & (columns < 5), 0.0, ground[2])
-    ground[3] = torch.where(wall & ((columns < width - 7) | (columns > width - 4)), 0.0, ground[3])
+    gap = (columns >= width - 7) & (columns <= width - 4)
+    ground[1].masked_fill_(wall, 0.1)
+    ground[2, :5, :5] = 0
+    ground[3].masked_fill_(wall & ~gap, 0)
     elevation = (0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)).repeat(4, 1, 1)
-    slope = (10 * elevation.abs()).clone()
     rgb = (255 * ground).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
-    spread = torch.tensor([-0.05, 0.05], device=device)[:, None, None]
-    means = ground[:, None] + spread
+    means = torch.stack((ground - 0.05, ground + 0.05), dim=1)
     mixture = TraversabilityMixture(torch.full_like(means, 0.5), means, torch.full_like(means, 0.1))
-    here = ground.new_tensor([[1.2, 1.3]]).repeat(4, 1)
-    goal = ground.new_tensor([[width * _RESOLUTION_M - 1.7, height * _RESOLUTION_M - 1.4]]).repeat(4, 1)
-    seen = Observation(rgb, elevation, slope, Grid(height, width, _RESOLUTION_M))
-    return pose_problem(task, seen, mixture, ground, here, goal, 60.0)
+    grid = Grid(height, width, _RESOLUTION_M)
+    seen = Observation(rgb, elevation, 10 * elevation.abs(), grid)
+    start = ground.new_tensor([1.2, 1.3]).repeat(4, 1)
+    goal = (ground.new_tensor(grid.extent_m) - ground.new_tensor([1.7, 1.4])).repeat(4, 1)
+    return pose_problem(task, seen, mixture, ground, start, goal, 60.0)

@@ -1,14 +1,12 @@
 """The shipped model with another weight of soft spots, for docs/risk.md."""
 
 from dataclasses import replace
-from typing import Any
 
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.terrain import Observation
-from benchnav.models.predictor import load_model
+from benchnav import Observation, TraversabilityMixture
+from benchnav.models import TraversabilityModel, load_model
 
 
-class OffBy:
+class OffBy(TraversabilityModel):
     """Takes soft spots for more or less of the ground than the shipped model does.
 
     Args:
@@ -17,12 +15,12 @@ class OffBy:
 
     def __init__(self, factor: float = 1.0) -> None:
         """Loads the shipped model."""
-        self.model: Any = load_model("stakes-v1")
+        self.model = load_model("stakes-v1")
         self.factor = factor
 
     def predict(self, observation: Observation) -> TraversabilityMixture:
         """As the shipped model, with other weights."""
-        mixture: TraversabilityMixture = self.model.predict(observation)
+        mixture = self.model.predict(observation)
         assert mixture.group is not None
         classes = len(self.model.class_names)
         weights = mixture.weights.clone()

@@ -13,7 +13,9 @@ from joblib import Parallel, delayed
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.core.registry import Part, complete, find, make, names, options_of, read_part, register
+from benchnav.core.registry import Part, complete, find, make, names, options_of, read_part, register, take
+from benchnav.planning.planners.mppi import MPPI
+from benchnav.planning.robots import Unicycle
 
 SOURCE = """
 from __future__ import annotations
@@ -21,8 +23,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+from benchnav import planning
+
 if TYPE_CHECKING:
     from nowhere import Robot
+
+
+class _Planner(planning.Planner):
+    init = plan = None
+
+
+class _Robot(planning.Robot):
+    dt_s = action_names = action_low = action_high = top_speed_mps = initial_state = __call__ = None
+
+
+class _Objective(planning.Objective):
+    stage = terminal = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,12 +59,12 @@ class Config:
             raise ValueError("reach is\\nnot positive")
 
 
-class Planner:
+class Planner(_Planner):
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
 
 
-class Plain:
+class Plain(_Planner):
     def __init__(
         self, count: int, mode: Literal["a", "b"] = "a", name: str = "x", limit: float | None = None,
         fast: bool = False, anything=None,
@@ -56,27 +72,27 @@ class Plain:
         self.given = (count, mode, name, limit, fast, anything)
 
 
-class NeedsRobot:
+class NeedsRobot(_Objective):
     def __init__(self, robot: Robot, margin_m: float = 0.5) -> None:
         self.robot, self.margin_m = robot, margin_m
 
 
 @dataclass(frozen=True)
-class Bare:
+class Bare(_Objective):
     size: int = 4
     names: list[str] = field(default_factory=lambda: ["u"])
 
 
-class NoOptions:
+class NoOptions(_Planner):
     pass
 
 
 class Holder:
-    class Inner:
+    class Inner(_Robot):
         pass
 
 
-class Odd:
+class Odd(_Planner):
     def __init__(self, act=print) -> None:
         pass
 
@@ -86,7 +102,13 @@ def worst(mixture, share: float = 0.25, floor: float = 0.0):
 
 
 def robot():
-    return "robot"
+    return Holder.Inner()
+
+
+class Duck:
+    def init(self, problem, generator): ...
+
+    def plan(self, step, plan_state): ...
 
 
 thing = Bare()
@@ -201,7 +223,7 @@ def test_a_part_of_a_file_is_found(file: str) -> None:
 
 
 def test_what_is_registered_is_known_in_this_process_alone() -> None:
-    class Mine:
+    class Mine(MPPI):
         def __init__(self, speed: float = 1.0) -> None:
             self.speed = speed
 
@@ -275,7 +297,32 @@ def test_a_part_is_made_with_its_options(file: str) -> None:
     assert isinstance(config.widths, tuple)
     plain = {"count": 1, "mode": "b", "name": "y", "limit": 0.5, "fast": True, "anything": [1]}
     assert make("planner", {"part": f"{file}:Plain", "options": plain}).given == tuple(plain.values())
-    assert make("robot", f"{file}:robot") == "robot"
+    assert type(make("robot", f"{file}:robot")).__name__ == "Inner"
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "base"),
+    [
+        ("planner", "planning", "Planner"),
+        ("robot", "planning", "Robot"),
+        ("objective", "planning", "Objective"),
+        ("model", "models", "TraversabilityModel"),
+    ],
+)
+def test_what_is_no_subclass_is_refused_with_the_base_class_and_where_it_is(
+    file: str, kind: str, place: str, base: str
+) -> None:
+    rest = f"to be a subclass of benchnav.{place}.{base}, got Duck. Write class Duck({base})."
+    assert refusal(lambda: make(kind, f"{file}:Duck")) == f"Expected {kind} './mine.py:Duck' {rest}"
+    duck = find("planner", f"{file}:Duck").target()
+    assert refusal(lambda: take(kind, duck)) == f"Expected the {kind} {rest}"
+
+
+def test_a_part_is_taken_as_it_is_or_made_by_its_name() -> None:
+    robot = Unicycle()
+    assert take("robot", robot) is robot
+    assert take("robot", {"part": "unicycle", "options": {"dt_s": 0.2}}).dt_s == 0.2
+    assert take("objective", "travel_time", robot=robot, goal_radius_m=1.0).robot is robot
 
 
 @pytest.mark.parametrize(

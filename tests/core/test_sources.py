@@ -1,6 +1,6 @@
 """What identifies a part: its source and what that imports, the files that it lists, and those that options name."""
 
-import importlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from benchnav.core import sources
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part, find, option_files
 from benchnav.core.sources import imported_sources
@@ -204,3 +205,40 @@ def test_a_folder_that_holds_the_working_folder_is_refused(part: Path, folder: s
     assert f"got {folder!r}, which holds the working folder" in refusal(
         lambda: option_files("planner", asked)
     )
+
+
+MOVED = {
+    "from benchnav.mixture import TraversabilityMixture": "Import from benchnav what was in benchnav.mixture.",
+    "import benchnav.rng": "Import from benchnav.core.rng what was in benchnav.rng.",
+    "from benchnav.files import replacing": "Import from benchnav.core.store what was in benchnav.files.",
+    "from benchnav.planning.env import OffRoadEnv": "Import from benchnav.env what was in benchnav.planning.env.",
+    "from benchnav.models.contract import check_model": "Import from benchnav.testing what was in",
+    "from benchnav.planning.planners.check.contract import check_planner": "Import from benchnav.testing what was in",
+    "from benchnav.models.predictor import Model": "Import from benchnav.models, as TraversabilityModel, what was in",
+}
+
+
+@pytest.mark.parametrize(("line", "remedy"), MOVED.items())
+def test_a_name_of_an_earlier_version_is_answered_with_that_of_today(
+    line: str, remedy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "old_part.py").write_text(f"import math\n{line}\n\n\nclass Mine:\n    pass\n")
+    for source in (f"{tmp_path / 'old_part.py'}:Mine", "old_part:Mine"):
+        with pytest.raises(ConfigError) as caught:
+            find("planner", source)
+        assert remedy in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert "old_part.py could not be imported" in str(caught.value) or "module old_part" in str(caught.value)
+
+
+def test_a_part_that_is_named_by_a_module_of_an_earlier_version_is_answered_too() -> None:
+    with pytest.raises(
+        ConfigError, match=r"no module 'benchnav.planning.env'. Import from benchnav.env what was"
+    ):
+        find("planner", "benchnav.planning.env:OffRoadEnv")
+
+
+def test_what_is_moved_is_where_the_table_says() -> None:
+    for old, place in sources._MOVED.items():
+        assert importlib.util.find_spec(place.partition(",")[0]), old

@@ -25,8 +25,9 @@ from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, run_unit
-from benchnav.models.predictor import Oracle, predict
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.models.base import TraversabilityModel, predict
+from benchnav.models.predictor import Oracle
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
@@ -145,7 +146,7 @@ def test_nothing_waits_for_a_device_at_every_step(
     assert counted[1] - counted[0] <= 16 / 8 + 1
 
 
-class Exhausted:
+class Exhausted(Planner[Problem]):
     """Finds no memory left on its GPU."""
 
     def __init__(self, at: str = "plan") -> None:
@@ -217,7 +218,7 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
 def test_a_gpu_convolves_as_the_cpu_does() -> None:
     seen = []
 
-    class Network:
+    class Network(TraversabilityModel):
         def predict(self, observation: Any) -> Any:
             cudnn = torch.backends.cudnn
             seen.append((cudnn.allow_tf32, cudnn.deterministic, cudnn.benchmark))
@@ -228,7 +229,7 @@ def test_a_gpu_convolves_as_the_cpu_does() -> None:
     assert seen == [(False, True, False)]
 
 
-class Late:
+class Late(Planner[Problem]):
     """Stands still; raises at a step when all episodes have ended and nobody has looked yet."""
 
     def init(self, problem: Problem, generator: torch.Generator) -> Problem:

@@ -6,16 +6,18 @@ import signal
 import time
 import uuid
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.models.base import TraversabilityModel
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 
 
-class Spy:
+class Spy(Planner[Any]):
     """Stands still, and writes down what it is given."""
 
     steers = (("speed_mps", "turn_rate_radps"),)
@@ -49,7 +51,7 @@ class Spy:
         return torch.zeros(len(step.state), 2), (note, observed), Plan.empty(len(step.state))
 
 
-class TwoModes:
+class TwoModes(TraversabilityModel):
     """A model whose two components are no classes."""
 
     def predict(self, observation):  # type: ignore[no-untyped-def]
@@ -57,7 +59,7 @@ class TwoModes:
         return TraversabilityMixture(half, half + torch.tensor([0.4, 0.1]).view(2, 1, 1), 0.1 * half)
 
 
-class Faulty:
+class Faulty(Planner[Problem]):
     """Drives straight on until `after_s`, then does something wrong for the episode nearest to its goal."""
 
     def __init__(self, fault: str = "none", after_s: float = 1.0) -> None:
@@ -165,7 +167,7 @@ class Rusty(Unicycle):
         raise ValueError("seized")
 
 
-class Gaussian:
+class Gaussian(TraversabilityModel):
     """The same Gaussian everywhere."""
 
     def __init__(self, mean: float = 0.77, std: float = 0.01) -> None:
@@ -176,7 +178,7 @@ class Gaussian:
         return TraversabilityMixture(ones, self.mean * ones, self.std * ones)
 
 
-class Broken:
+class Broken(TraversabilityModel):
     """A model that raises."""
 
     def predict(self, observation):  # type: ignore[no-untyped-def]
@@ -188,7 +190,7 @@ def least(mixture: TraversabilityMixture, factor: float = 1.0) -> torch.Tensor:
     return (mixture.means.amin(dim=1) * factor).clamp(0, 1)
 
 
-class Asleep:
+class Asleep(Planner[Problem]):
     """Writes down which process began it, and does not wake."""
 
     writes = ("folder",)

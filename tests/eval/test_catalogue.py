@@ -14,6 +14,7 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.eval import catalogue
 from benchnav.eval.catalogue import Entry, list_entries, make_table, plain_lines, print_catalogue
+from benchnav.models.base import is_family
 
 CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
 
@@ -72,7 +73,7 @@ def test_every_known_part_is_listed_with_a_purpose_and_all_its_options(kind: str
         assert entries[name].purpose
         assert "cannot be used" not in entries[name].purpose
         target = registry.find(kind, name).target
-        if hasattr(target, "from_checkpoint"):
+        if is_family(target):
             assert "A family" in entries[name].purpose
             continue
         options = " ".join(entries[name].options)

@@ -15,7 +15,8 @@ from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.run.runner import run_suite
-from benchnav.models.predictor import find_checkpoint, load_model, predict
+from benchnav.models.base import predict
+from benchnav.models.predictor import find_checkpoint, load_model
 from benchnav.models.quality.measure import evaluate
 
 FEW_SAMPLES = {"mppi": {"samples": 1024}, "astar_mppi": {"mppi": {"samples": 1024}}}

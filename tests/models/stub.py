@@ -7,6 +7,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.models.base import TraversabilityModel
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 
 
@@ -19,7 +20,7 @@ def true_table(classes: tuple[TerrainClass, ...], latent_std: float = 0.03) -> S
     return SlopeTable(mean=mean, std=std.contiguous(), noise_std=noise)
 
 
-class ColourModel:
+class ColourModel(TraversabilityModel):
     """Weighs classes by the distance of their colours, softly, one member a given softness."""
 
     def __init__(self, softness: tuple[float, ...] = (30.0, 90.0)) -> None:

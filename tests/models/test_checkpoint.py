@@ -17,12 +17,13 @@ from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models import checkpoint as module
+from benchnav.models.base import predict
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.predictor import find_checkpoint, load_model, predict
+from benchnav.models.predictor import find_checkpoint, load_model
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
 from benchnav.testing.model import check_model
 from tests.models.stub import true_table

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 from benchnav.core.errors import ConfigError
 from benchnav.models import fused
 from benchnav.models.fused import FusedModel
-from benchnav.models.predictor import EnsembleModel
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.slope_gp.table import SoftModes
 from tests.models.support import NAMES, linear_table, make_terrain
@@ -40,7 +39,6 @@ def test_probabilities_of_members_are_averaged() -> None:
     )
     torch.testing.assert_close(ensemble.predict(observation).weights, alone.mean(0))
     assert torch.equal(ensemble.member_probabilities(observation), alone)
-    assert isinstance(ensemble, EnsembleModel)
 
 
 def test_the_average_is_calibrated_as_a_whole_and_the_members_are_not() -> None:

@@ -284,8 +284,10 @@ def test_a_model_is_measured_by_its_file_and_a_folder_without_rights_is_named(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(
-        "import torch\n\nfrom benchnav.core.mixture import TraversabilityMixture\n\n\n"
-        "class Mine:\n    def __init__(self, mean: float = 0.5) -> None:\n        self.mean = mean\n\n"
+        "import torch\n\nfrom benchnav.core.mixture import TraversabilityMixture\n"
+        "from benchnav.models import TraversabilityModel\n\n\n"
+        "class Mine(TraversabilityModel):\n"
+        "    def __init__(self, mean: float = 0.5) -> None:\n        self.mean = mean\n\n"
         "    def predict(self, observation):\n        ones = torch.ones_like(observation.slope_deg)[:, None]\n"
         "        return TraversabilityMixture(ones, self.mean * ones, 0.2 * ones)\n"
     )

@@ -4,7 +4,6 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,6 +15,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models import fused
+from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
 from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
@@ -26,7 +26,6 @@ from benchnav.models.predictor import (
     load_model,
     model_identity,
     open_checkpoint,
-    predict,
 )
 from tests.models.support import NAMES, linear_table, make_terrain
 
@@ -42,7 +41,7 @@ class Fixed(nn.Module):
         return self.logits.expand(len(rgb), -1, *rgb.shape[-2:])
 
 
-class Spy:
+class Spy(TraversabilityModel):
     """A user's own model; remembers what it was given."""
 
     def __init__(self) -> None:
@@ -52,6 +51,14 @@ class Spy:
         self.given.append(observation)
         ones = torch.ones(len(observation.rgb), 1, *observation.grid.shape)
         return TraversabilityMixture(ones, 0.5 * ones, 0.1 * ones)
+
+
+class Measured(Spy):
+    """A model with an option."""
+
+    def __init__(self, mean: float) -> None:
+        super().__init__()
+        self.mean = mean
 
 
 def test_one_hot_probabilities_give_the_gp_of_that_class() -> None:
@@ -132,9 +139,10 @@ def test_a_prediction_that_does_not_fit_the_maps_is_refused() -> None:
 MINE = """
 import torch
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.models import ModelFamily, TraversabilityModel
 
 
-class Constant:
+class Constant(TraversabilityModel):
     def __init__(self, mean: float = 0.5, std: float = 0.1) -> None:
         self.mean, self.std = mean, std
 
@@ -143,7 +151,7 @@ class Constant:
         return TraversabilityMixture(ones, self.mean * ones, self.std * ones)
 
 
-class Family:
+class Family(ModelFamily):
     @classmethod
     def from_checkpoint(cls, checkpoint):
         raise RuntimeError("ran what a checkpoint names")
@@ -165,10 +173,8 @@ def test_a_registered_model_is_found_by_name(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(registry, "_REGISTERED", {})
     registry.register("model", "mine", Spy)
     assert isinstance(load_model("mine"), Spy)
-    registry.register(
-        "model", "oracle-like", lambda mean=0.5: SimpleNamespace(mean=mean, predict=Spy().predict)
-    )
-    assert load_model("oracle-like:0.25").mean == 0.25  # type: ignore[union-attr]
+    registry.register("model", "made", lambda mean=0.5: Measured(mean))
+    assert load_model("made:0.25").mean == 0.25  # type: ignore[attr-defined]
 
 
 @pytest.mark.usefixtures("_own_file")
@@ -219,7 +225,10 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
         ("./mine_of_tests.py:Constnat", "Did you mean 'Constant'?"),
         ("./mine_of_tests.py:Constant:much", "as float such as 0.5, got 'much'"),
         ("./mine_of_tests.py:Family", "which is a family of models"),
-        ("./mine_of_tests.py:Nothing", "to have `predict(observation)`, got Nothing without it"),
+        (
+            "./mine_of_tests.py:Nothing",
+            "to be a subclass of benchnav.models.TraversabilityModel, got Nothing. Write class Nothing(Tr",
+        ),
         ("./mine_of_tests.py", "Say which class or function of it"),
         ("oracle:3", "it has no options"),
         ("checkpoints/papr-v1", "Did you mean 'paper-v1'?"),
@@ -279,8 +288,8 @@ def test_the_identity_of_a_model_changes_with_its_files(checkpoint_path: Path) -
 
 def test_another_class_table_is_told_in_one_line(checkpoint_path: Path, dataset: TerrainDataset) -> None:
     model = load_model(checkpoint_path)
-    assert class_mismatch(model, dataset) == class_mismatch(model, dataset.recipe) == ""
-    assert class_mismatch(Spy(), dataset) == class_mismatch(Oracle(), dataset) == ""
+    assert class_mismatch(model, dataset.recipe) == ""
+    assert class_mismatch(Spy(), dataset.recipe) == class_mismatch(Oracle(), dataset.recipe) == ""
     classes = dataset.recipe.classes
     other = replace(dataset.recipe, classes=(replace(classes[0], name="lava"), *classes[1:]))
     for asked in (model, load_checkpoint(checkpoint_path)):

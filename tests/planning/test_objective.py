@@ -3,7 +3,14 @@ import torch
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.planning.objective import GoalDistance, TravelTime, distance, path_cost_of, toward_waypoints
+from benchnav.planning.objective import (
+    GoalDistance,
+    Objective,
+    TravelTime,
+    distance,
+    has_path_cost,
+    toward_waypoints,
+)
 from benchnav.planning.robots import Bicycle, Unicycle
 
 STATE = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 1.0], [0.0, 0.5, 2.0]])
@@ -72,9 +79,31 @@ def test_a_metre_of_path_costs_its_time_or_its_length() -> None:
     robot = Unicycle(speed_mps=(0.0, 2.0))
     seconds, metres = [0.5, 1.0, 10.0], [1.0, 1.25, 1.25]
     assert TravelTime(robot, 1.0).path_cost(ground, grade).tolist() == pytest.approx(seconds)
-    for objective in (GoalDistance(), object()):
-        assert path_cost_of(objective)(ground, grade).tolist() == pytest.approx(metres)
-    assert path_cost_of(TravelTime(robot, 1.0))(ground, grade).tolist() == pytest.approx(seconds)
+    assert GoalDistance().path_cost(ground, grade).tolist() == pytest.approx(metres)
+    assert has_path_cost(TravelTime(robot, 1.0))
+    assert has_path_cost(GoalDistance())
+
+
+def test_an_objective_that_says_nothing_of_paths_has_their_length() -> None:
+    class Own(Objective):
+        def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+            return traversability
+
+        def terminal(self, state, traversability, target):  # type: ignore[no-untyped-def]
+            return traversability
+
+    grade = torch.tensor([0.0, 0.75, -0.75])
+    assert not has_path_cost(Own())
+    assert Own().path_cost(torch.rand(3), grade).tolist() == pytest.approx([1.0, 1.25, 1.25])
+
+
+def test_what_lacks_a_member_cannot_be_made() -> None:
+    class Half(Objective):
+        def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]
+            return traversability
+
+    with pytest.raises(TypeError, match="terminal"):
+        Half()  # type: ignore[abstract]
 
 
 def test_distances_broadcast_and_agree_with_the_norm() -> None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle, action_limits
+from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
 
 SHIPPED = [registry.make("robot", name) for name in registry.names("robot")]
 EACH = pytest.mark.parametrize("robot", SHIPPED, ids=lambda robot: type(robot).__name__)
@@ -162,9 +162,9 @@ def test_bounds_names_and_rates_say_what_was_set() -> None:
     assert bicycle.top_speed_mps == 1.5
     assert bicycle.action_names == ("speed_mps", "steering_rad")
     drive = DifferentialDrive(acceleration_mps2=0.3, turn_acceleration_radps2=0.6)
-    assert action_limits(drive) == (0.3, 0.6)
-    assert action_limits(unicycle) is None
-    assert action_limits(bicycle) is None
+    assert drive.action_rates == (0.3, 0.6)
+    assert unicycle.action_rates is None
+    assert bicycle.action_rates is None
 
 
 @pytest.mark.parametrize("dt_s", [0.05, 0.2])

@@ -12,16 +12,17 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
+from benchnav.models.base import TraversabilityModel, is_family
 from benchnav.models.checkpoint import load_checkpoint, member_name
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
-from benchnav.models.predictor import ModelFamily, load_model, open_checkpoint
-from benchnav.testing.model import check_model
+from benchnav.models.predictor import load_model, open_checkpoint
+from benchnav.testing import check_model
 
 NAMES = ("soft", "firm")
 
 
-class Good:
+class Good(TraversabilityModel):
     """Two components whose parameters hang on what the cell shows."""
 
     class_names = NAMES
@@ -114,7 +115,7 @@ class Needy(Good):
 
 
 class Nameless(Good):
-    class_names = None  # type: ignore[assignment]
+    class_names = ()
 
 
 class Misnamed(Good):
@@ -146,8 +147,8 @@ def elsewhere(mixture: TraversabilityMixture, _: Observation) -> TraversabilityM
 
 
 BAD = {
-    "no predict": (object(), "AttributeError"),
-    "an error": (Needy(), "ValueError: sides differ [maps of 20×37]"),
+    "no predict": (object(), "Expected the model to be a subclass of benchnav.models.TraversabilityModel, got object"),
+    "an error": (Needy(), "ValueError: sides differ [20×37]"),
     "no mixture": (
         changed(lambda mixture, _: mixture.weights),
         "TraversabilityMixture of shape [3, K, 32, 32], got Tensor",
@@ -170,8 +171,8 @@ BAD = {
         "`weights` ≥ 0",
     ),
     "weights of another sum": (poked("weights", 0.0), "sum to 1"),
-    "an observation brightened": (meddling(lambda seen: seen.rgb.add_(1)), "got another rgb"),
-    "an observation flattened": (meddling(lambda seen: seen.slope_deg.zero_()), "got another slope_deg"),
+    "an observation brightened": (meddling(lambda seen: seen.rgb.add_(1)), "got another observation.rgb"),
+    "an observation flattened": (meddling(lambda seen: seen.slope_deg.zero_()), "got another observation.slope_deg"),
     "PyTorch's generator": (meddling(lambda _: torch.rand(1)), "PyTorch's global generator"),
     "PyTorch's seed": (meddling(lambda _: torch.manual_seed(54321)), "PyTorch's global generator"),
     "NumPy's generator": (meddling(lambda _: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
@@ -183,7 +184,7 @@ BAD = {
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),
     "too few maps of members": (with_members(lambda weights: weights[None, :1]), "got [1, 1, 2, 32, 32]"),
     "no members": (with_members(lambda weights: weights[None][:0]), "got [0, 3, 2, 32, 32]"),
-    "members that are none": (with_members(lambda weights: None), "got NoneType"),
+    "members that are no tensor": (with_members(lambda weights: [weights]), "got list"),
     "members of another average": (
         with_members(lambda weights: weights.flip(1)[None]),
         "order of the average of `member_probabilities`",
@@ -222,7 +223,7 @@ def test_every_breach_is_named_once_with_the_maps_it_was_found_on() -> None:
         check_model(model, shapes=((9, 9), (12, 7)))
     message = str(caught.value)
     assert message.count("`stds` ≥ 0") == message.count("each of 2 components") == 1
-    assert message.count("[maps of 9×9, 12×7]") == 2
+    assert message.count("[9×9, 12×7]") == 2
     assert "(1) " in message
     assert "(2) " in message
 
@@ -266,18 +267,19 @@ def test_a_good_model_keeps_the_contract_and_is_tried_on_maps_of_many_colours_an
     assert not torch.equal(first, second)
 
 
-def is_family(name: str) -> bool:
-    return isinstance(registry.find("model", name).target, ModelFamily)
+def family(name: str) -> bool:
+    return is_family(registry.find("model", name).target)
 
 
-@pytest.mark.parametrize("name", [name for name in registry.names("model") if not is_family(name)])
+@pytest.mark.parametrize("name", [name for name in registry.names("model") if not family(name)])
 def test_every_registered_model_keeps_the_contract(name: str) -> None:
     check_model(load_model(name))
+    check_model(name, shapes=((9, 9),))
 
 
 def test_the_families_whose_checkpoints_are_tried_here_are_all_that_the_package_has() -> None:
     own = {name for name in registry.names("model") if registry.find("model", name).shipped}
-    assert {name for name in own if is_family(name)} == {"fused", "mdn"}
+    assert {name for name in own if family(name)} == {"fused", "mdn"}
 
 
 @pytest.mark.parametrize("members", [1, 2])

@@ -270,11 +270,12 @@ def read_model(given: Any) -> Part:
     Raises:
         ConfigError: there is no such model, or it is refused its options.
     """
+    from benchnav.models.base import is_family
     from benchnav.models.predictor import find_checkpoint, load_model
 
     part = registry.read_part("model", given)
     if part.part in registry.names("model") or ":" in part.part:
-        if hasattr(registry.find("model", part.part).target, "from_checkpoint"):
+        if is_family(registry.find("model", part.part).target):
             load_model(part)  # says what to name in place of a family
         return registry.complete("model", part)
     find_checkpoint(part.part)
@@ -317,7 +318,7 @@ def _as_run_once(condition: Condition) -> Condition:
     What a blind planner is given is not looked at; and of λ that is known every measure of risk is λ itself.
     """
     any_risk = Part(part="mean", label=NOT_USED)
-    if getattr(registry.find("planner", condition.planner.part).target, "blind", False):
+    if condition.make_planner().blind:
         return replace(condition, model=Part(part="oracle", label=NOT_USED), risk=any_risk, blind=True)
     if condition.model.part != "clairvoyant":
         return condition

@@ -20,7 +20,6 @@ from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import EPISODES, FORMAT, FORMAT_VERSION, RUN, Run, open_run, write_run
 from benchnav.eval.run.check import Say
 from benchnav.eval.run.unit import Settings
-from benchnav.planning.planners.planner import what_it_follows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,10 +146,10 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
 def _notes(condition: Condition) -> dict[str, Any]:
     """What tables say of a condition's planner."""
     planner = condition.make_planner()
-    task, remarks = condition.make_task(), getattr(planner, "remarks", None)
+    task = condition.make_task()
     return {
-        "follows": what_it_follows(planner, task),
-        "remarks": list(remarks(task)) if remarks else [],
+        "follows": planner.follows(task),
+        "remarks": list(planner.remarks(task)),
         "changed": changed_options(condition.planner),
     }
 

@@ -22,28 +22,15 @@ from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Extent
 from benchnav.eval.run.unit import noise_key, read_maps
+from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import PRIVILEGED, class_mismatch, find_checkpoint
+from benchnav.models.predictor import class_mismatch, find_checkpoint
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Task, pose_problem
 from benchnav.planning.world.realisation import check_known
 from benchnav.planning.world.simulation import Simulation
 
 Say = Callable[[str], None]
-
-_MEMBERS = {
-    "planner": ("init", "plan"),
-    "robot": (
-        "dt_s",
-        "action_names",
-        "action_low",
-        "action_high",
-        "top_speed_mps",
-        "initial_state",
-        "__call__",
-    ),
-    "objective": ("stage", "terminal"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +179,6 @@ def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[st
     for pair, condition in pairs.items():
         planner, robot = condition.planner.label, condition.robot.label
         task, made = condition.make_task(), condition.make_planner()
-        _check_members(condition, made, task)
         try:
             check_steers(made, task.robot, planner)
         except ConfigError as error:
@@ -201,18 +187,6 @@ def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[st
     if not left:
         raise ConfigError(next(iter(unfit.values()))["reason"])
     return left, list(unfit.values())
-
-
-def _check_members(condition: Condition, planner: Any, task: Task) -> None:
-    """Refuses a part that stands in the place of another kind."""
-    made = {"planner": planner, "robot": task.robot, "objective": task.objective}
-    for kind, names in _MEMBERS.items():
-        missing = [name for name in names if not hasattr(made[kind], name)]
-        if missing:
-            raise ConfigError(
-                f"Expected {kind} {getattr(condition, kind).part!r} with {', '.join(names)}, got "
-                f"{type(made[kind]).__name__} without {', '.join(missing)}."
-            )
 
 
 def _check_planner(condition: Condition, task: Task) -> None:
@@ -265,7 +239,7 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
 def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     """Loads the model, which may refuse; tells of another class table, and refuses single-class where it has none."""
     part, model = condition.model.part, condition.make_model()
-    knows_classes = bool(getattr(model, "class_names", ())) or isinstance(model, PRIVILEGED)
+    knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
     if condition.risk.part == "single-class" and not knows_classes:
         raise ConfigError(
             f"Expected a model that tells classes for the risk setting 'single-class', got {condition.model.label!r}, "
@@ -273,7 +247,7 @@ def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
         )
     if ":" not in part and part not in registry.names("model"):
         model = load_checkpoint(find_checkpoint(part))  # which has a class table in any case
-    line = class_mismatch(model, dataset, f"model {condition.model.label}")
+    line = class_mismatch(model, dataset.recipe, f"model {condition.model.label}")
     return [line] if line else []
 
 

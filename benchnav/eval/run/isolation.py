@@ -14,7 +14,7 @@ import torch
 from benchnav.core.device import GPU_FAULTS, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import Condition
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem
 
 # Starting a process, importing PyTorch and compiling are not the planner's time.
@@ -25,7 +25,7 @@ class TimeLimitError(BenchnavError):
     """A planner did not answer in time, or its process ended."""
 
 
-class IsolatedPlanner:
+class IsolatedPlanner(Planner[int]):
     """A condition's planner, run in a child process; a planner like any other.
 
     Args:
@@ -33,10 +33,11 @@ class IsolatedPlanner:
         limit_s: time limit of each call; `init` and the first `plan` have two minutes more, to compile.
     """
 
+    compiled: bool | None = None
+
     def __init__(self, condition: Condition, limit_s: float) -> None:
         """Starts the child."""
         self.limit_s = limit_s
-        self.compiled: bool | None = None
         context = multiprocessing.get_context("spawn")
         self._here, there = context.Pipe()
         self._child = context.Process(target=_serve, args=(there, condition), daemon=True)
@@ -126,7 +127,7 @@ def _serve(connection: Connection, condition: Condition) -> None:
                 answer: Any = None
             else:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
-                answer = action, plan, getattr(planner, "compiled", None)
+                answer = action, plan, planner.compiled
             text = pickle.dumps(("answer", answer))
         except GPU_FAULTS as error:
             text = pickle.dumps(("lost", str(error)))

@@ -210,11 +210,13 @@ class _Batch:
             running: which episodes go on, bool on the CPU, shape [B].
         """
         left = running[self.members].nonzero()[:, 0]
-        if len(left) > _FULL * len(self.members) or not hasattr(self._planner, "select"):
+        if len(left) > _FULL * len(self.members):
             return
-        self.members = self.members[left]
+        state = self._planner.select(self._state, left.to(self._index.device))
+        if state is NotImplemented:
+            return
+        self._state, self.members = state, self.members[left]
         self._index = self.members.to(self._index.device)
-        self._state = self._planner.select(self._state, left.to(self._index.device))
         self._part = self._whole.select(self._index)
 
     def act(self, step: Step) -> Answer:

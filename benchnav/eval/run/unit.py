@@ -32,9 +32,10 @@ from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
-from benchnav.models.predictor import Clairvoyant, load_model, predict
+from benchnav.models.base import predict
+from benchnav.models.predictor import Clairvoyant, load_model
 from benchnav.planning import risk
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
@@ -249,10 +250,10 @@ def simulate(
             planner = _Unmade(error)
         generator = planner_generator(unit)
         episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every, **options)
-    return episodes, bool(getattr(planner, "compiled", False))
+    return episodes, bool(planner.compiled)
 
 
-class _Unmade:
+class _Unmade(Planner[None]):
     """Stands for a planner that could not be made: it fails in each unit as one that raises."""
 
     def __init__(self, error: BaseException) -> None:

@@ -16,6 +16,7 @@ from torchmetrics import MeanSquaredError, Metric
 
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
+from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import Checkpoint, refitting
 from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
 from benchnav.models.nets.classifier import TerrainClassifier
@@ -189,7 +190,7 @@ class MixtureDensityNetwork(TrainableNetwork):
         return network.eval()
 
 
-class MixtureDensityModel:
+class MixtureDensityModel(ModelFamily):
     """A trained mixture-density network as a model.
 
     Args:

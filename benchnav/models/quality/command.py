@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from benchnav.datagen.files.reader import TerrainDataset
-    from benchnav.models.predictor import AnyModel
+    from benchnav.models.base import TraversabilityModel
     from benchnav.models.quality.measure import Quality
     from benchnav.models.slope_gp.table import SlopeTable
 
@@ -184,7 +184,9 @@ def _seen(dataset: "TerrainDataset", splits: "Sequence[str]", known: "Mapping[st
     ]
 
 
-def _without_truth(model: "AnyModel", dataset: "TerrainDataset", splits: "Sequence[str]") -> list[str]:
+def _without_truth(
+    model: "TraversabilityModel", dataset: "TerrainDataset", splits: "Sequence[str]"
+) -> list[str]:
     """Says what cannot be measured where the truth is unknown, and what is measured in its place."""
     from benchnav.models.predictor import Ideal, Oracle
 
@@ -208,7 +210,7 @@ def _without_truth(model: "AnyModel", dataset: "TerrainDataset", splits: "Sequen
     return lines
 
 
-def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
+def _absent(model: "TraversabilityModel", qualities: "Mapping[str, Quality]") -> list[str]:
     """Says which figures do not apply, and why."""
     from benchnav.models.quality.series import find_series
 
@@ -224,7 +226,7 @@ def _absent(model: "AnyModel", qualities: "Mapping[str, Quality]") -> list[str]:
 
 def _save_figures(
     title: str,
-    model: "AnyModel",
+    model: "TraversabilityModel",
     dataset: "TerrainDataset",
     qualities: "Mapping[str, Quality]",
     maps: int,
@@ -248,7 +250,11 @@ def _save_figures(
 
 
 def _figures(
-    title: str, model: "AnyModel", dataset: "TerrainDataset", qualities: "Mapping[str, Quality]", maps: int
+    title: str,
+    model: "TraversabilityModel",
+    dataset: "TerrainDataset",
+    qualities: "Mapping[str, Quality]",
+    maps: int,
 ) -> "Iterator[tuple[str, Callable[[], Figure]]]":
     """Names the figures that apply, each with what draws it."""
     from functools import partial
@@ -284,7 +290,7 @@ def _figures(
             yield sheet_name(sheet.split), draw
 
 
-def _slope_table(model: "AnyModel") -> "SlopeTable | None":
+def _slope_table(model: "TraversabilityModel") -> "SlopeTable | None":
     """The GPs of a model that has them as `table`."""
     from benchnav.models.slope_gp.table import SlopeTable
 

@@ -19,7 +19,8 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import LACKING, class_colours, class_shades
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
+from benchnav.models.base import TraversabilityModel, predict
+from benchnav.models.predictor import Oracle
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
 
@@ -71,7 +72,9 @@ class MapSheet:
     layers: dict[str, np.ndarray]
 
 
-def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Sequence[int]) -> MapSheet:
+def read_sheet(
+    model: TraversabilityModel, dataset: TerrainDataset, split: str, indices: Sequence[int]
+) -> MapSheet:
     """Predicts some maps of a split.
 
     Args:
@@ -89,7 +92,7 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
         known = dataset.truth_of(split) == "generated"
         true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
-        if isinstance(model, ClassModel):
+        if model.class_names:
             classes = class_probabilities(mixture, len(model.class_names))
             layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
         layers |= {
@@ -98,10 +101,10 @@ def read_sheet(model: AnyModel, dataset: TerrainDataset, split: str, indices: Se
             "error" if known else "error_observed": mixture.mean() - true,
             "width": mixture.var(0.05) - mixture.var(0.95),
         }
-        if isinstance(model, ClassModel):
+        if model.class_names:
             layers["entropy"] = predictive_entropy(classes)
-        if isinstance(model, EnsembleModel):
-            members = model.member_probabilities(terrain.observe())
+        members = model.member_probabilities(terrain.observe())
+        if members is not None:
             layers |= {"information": mutual_information(members)} if len(members) > 1 else {}
     return MapSheet(
         split=split,

@@ -26,9 +26,9 @@ from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import MeanIoU
-from benchnav.models.predictor import PRIVILEGED, AnyModel, ClassModel, EnsembleModel, predict
 from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.look_alikes import LookAlikeQuality, LookAlikeTally
 from benchnav.models.quality.scores import (
@@ -138,7 +138,9 @@ class Quality:
     classes: tuple[ClassQuality, ...]
 
 
-def choose_splits(model: AnyModel, dataset: TerrainDataset, splits: Iterable[str] = ()) -> list[str]:
+def choose_splits(
+    model: TraversabilityModel, dataset: TerrainDataset, splits: Iterable[str] = ()
+) -> list[str]:
     """Tells which splits are to be measured, and refuses what cannot be.
 
     Args:
@@ -158,7 +160,7 @@ def choose_splits(model: AnyModel, dataset: TerrainDataset, splits: Iterable[str
     for split in chosen:
         dataset.map_count(split)
     names = tuple(item.name for item in dataset.recipe.classes)
-    if isinstance(model, ClassModel) and model.class_names != names:
+    if model.class_names not in ((), names):
         raise CheckpointError(
             f"Expected a model of the classes {', '.join(names)}, got one of {', '.join(model.class_names)}. "
             "Train it on a dataset with this class table."
@@ -167,7 +169,7 @@ def choose_splits(model: AnyModel, dataset: TerrainDataset, splits: Iterable[str
 
 
 def evaluate(
-    model: AnyModel,
+    model: TraversabilityModel,
     dataset: TerrainDataset,
     splits: Iterable[str] = (),
     seed: int = 0,
@@ -198,7 +200,7 @@ def evaluate(
 
 
 def measure(
-    model: AnyModel,
+    model: TraversabilityModel,
     chunks: Iterable[Terrain],
     generator: torch.Generator,
     alike: Sequence[tuple[int, ...]] = (),
@@ -218,11 +220,11 @@ def measure(
     classes: list[_ClassTally] = []
     for terrain in chunks:
         mixture, members = _predict(model, terrain)
-        scores, transformed = _score_cells(mixture, terrain, generator, isinstance(model, PRIVILEGED))
+        scores, transformed = _score_cells(mixture, terrain, generator, isinstance(model, PrivilegedModel))
         sums += scores.cpu()
         histogram += pit_counts(transformed)
         maps, cells = maps + len(terrain), cells + transformed.numel()
-        if isinstance(model, ClassModel):
+        if model.class_names:
             classes = classes or [
                 _ClassTally(len(model.class_names), terrain.rgb.device, len(members) > 1, alike)
             ]
@@ -247,7 +249,7 @@ def measure(
     )
 
 
-def _predict(model: AnyModel, terrain: Terrain) -> tuple[TraversabilityMixture, Tensor]:
+def _predict(model: TraversabilityModel, terrain: Terrain) -> tuple[TraversabilityMixture, Tensor]:
     """The prediction, and the class probabilities of M members, shape [M, B, C, H, W], M = 0 where there are none."""
     if isinstance(model, FusedModel):
         observation = terrain.observe()
@@ -255,11 +257,9 @@ def _predict(model: AnyModel, terrain: Terrain) -> tuple[TraversabilityMixture, 
             members = model.member_probabilities(observation)
         return model.fuse(members, observation), members
     mixture = predict(model, terrain)
-    members = torch.zeros(0)
-    if isinstance(model, EnsembleModel):
-        with exact_convolutions():
-            members = model.member_probabilities(terrain.observe())
-    return mixture, members
+    with exact_convolutions():
+        found = model.member_probabilities(terrain.observe())
+    return mixture, torch.zeros(0) if found is None else found
 
 
 class _ClassTally:

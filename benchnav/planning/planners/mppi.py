@@ -32,7 +32,7 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise
 
@@ -110,7 +110,7 @@ class MPPIState:
     step: int
 
 
-class MPPI:
+class MPPI(Planner[MPPIState], LocalPlanner[MPPIState]):
     """Model predictive path integral control: sampled action sequences, weighed by their cost.
 
     Args:
@@ -173,10 +173,6 @@ class MPPI:
         if step.draw:
             plan = _drawn(problem, step.state, updated, mean, noise, weights)
         return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
-
-    def commit_action(self, plan_state: MPPIState, action: Tensor) -> MPPIState:
-        """Plans on as before; see `LocalPlanner`."""
-        return plan_state
 
     def select(self, plan_state: MPPIState, members: Tensor) -> MPPIState:
         """Keeps some episodes; see `Planner`."""

@@ -1,13 +1,14 @@
-"""What a planner is and what it returns.
+"""What a planner is and what it returns, and what a local planner is.
 
 A planner is stateless: `init` makes a plan state, `plan` takes one and returns the next. Both are
 pure: the same arguments give the same result. Letters in shapes: B episodes, N points, M samples, E edges,
 S state and A action dimensions.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -83,23 +84,25 @@ class Plan:
 State = TypeVar("State")
 
 
-class Planner(Protocol[State]):
-    """The contract of a planner, which `benchnav.testing.planner.check_planner` tries.
+class Planner(ABC, Generic[State]):
+    """The base class of planners; `benchnav.testing.check_planner` tries whether one keeps its contract.
 
-    It may also have these attributes:
-
-    - `steers`: tuples of action names; a robot of other actions is refused before anything runs. Without
-      it any robot is accepted.
-    - `follows(task)`: a line on what it minimises, for tables, where that is not the task's J alone; empty where it
-      is.
-    - `blind`: on the class, true where it is blind, so that one run stands for every
-      model and risk setting.
-    - `remarks(task)`: a tuple of one-line notes that tables show, such as limits that are not the robot's.
-    - `compiled`: whether it runs compiled; None before its first plan.
-    - `select(plan_state, members)`: the plan state of some of the episodes, int64 [M], which then are planned
-      for alone. With it episodes leave the batch when they have ended, and cost no more.
+    `init` and `plan` are to be written, all else has a default. A planner holds its settings alone: whatever
+    evolves is in the plan state, so that one planner serves any batch in any order.
     """
 
+    steers: tuple[tuple[str, ...], ...] | None = None
+    """Action names of the robots that it steers; a robot of other actions is refused. None: any robot."""
+
+    blind: bool = False
+    """On the class: it uses no map, so that one run stands for every model and risk setting."""
+
+    @property
+    def compiled(self) -> bool | None:
+        """Whether it runs compiled; None before its first plan, and where nothing is ever compiled."""
+        return None
+
+    @abstractmethod
     def init(self, problem: Problem, generator: torch.Generator) -> State:
         """Prepares to plan.
 
@@ -110,8 +113,8 @@ class Planner(Protocol[State]):
         Returns:
             The first plan state.
         """
-        ...
 
+    @abstractmethod
     def plan(self, step: Step, plan_state: State) -> tuple[Tensor, State, Plan]:
         """Chooses the next action of every episode.
 
@@ -122,27 +125,57 @@ class Planner(Protocol[State]):
         Returns:
             Actions within the bounds, shape [B, A]; the next plan state; what was planned.
         """
-        ...
 
+    def select(self, plan_state: State, members: Tensor) -> State:
+        """Keeps some episodes, which then are planned for alone, so that those that have ended cost no more.
 
-def what_it_follows(planner: Any, task: Task) -> str:
-    """What a planner minimises in place of the task's J, in words; empty where it minimises J alone.
+        Args:
+            plan_state: of all episodes; not changed.
+            members: which are kept, int64, shape [M].
 
-    Raises:
-        ConfigError: its `follows` is no function, as it was in earlier versions.
-    """
-    follows = getattr(planner, "follows", None)
-    if follows is None:
+        Returns:
+            Their plan state; `NotImplemented`, the default, where ended episodes have to stay in the batch.
+        """
+        return NotImplemented
+
+    def follows(self, task: Task) -> str:
+        """What it minimises in place of the task's J, in one line for tables; empty where that is J alone."""
         return ""
-    if not callable(follows):
-        raise ConfigError(
-            f"Expected `follows` of planner {type(planner).__name__} as a function of the task, got {follows!r}. "
-            "Write `def follows(self, task)`."
-        )
-    return str(follows(task))
+
+    def remarks(self, task: Task) -> tuple[str, ...]:
+        """Notes that tables show, a line each, such as limits that are not the robot's."""
+        return ()
 
 
-def check_steers(planner: Any, robot: Robot, name: str) -> None:
+class LocalPlanner(ABC, Generic[State]):
+    """The base class of local planners: planners that are told where to go at each step."""
+
+    name: str
+    """What tables call it."""
+
+    @property
+    def compiled(self) -> bool | None:
+        """See `Planner`."""
+        return None
+
+    @abstractmethod
+    def init(self, problem: Problem, generator: torch.Generator) -> State:
+        """Prepares to plan; see `Planner`."""
+
+    @abstractmethod
+    def plan_toward(self, step: Step, plan_state: State, target_m: Tensor) -> tuple[Tensor, State, Plan]:
+        """Chooses actions toward a target (x, y), shape [B, 2]; else as `Planner.plan`."""
+
+    def commit_action(self, plan_state: State, action: Tensor) -> State:
+        """Notes the actions that are taken, which may be others than it chose, shape [B, A]."""
+        return plan_state
+
+    @abstractmethod
+    def select(self, plan_state: State, members: Tensor) -> State:
+        """Keeps some episodes; see `Planner`."""
+
+
+def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
     """Refuses a robot that a planner cannot steer.
 
     Args:
@@ -153,9 +186,8 @@ def check_steers(planner: Any, robot: Robot, name: str) -> None:
     Raises:
         ConfigError: the names of the robot's actions are none that the planner knows.
     """
-    known = getattr(planner, "steers", None)
-    if known is not None and tuple(robot.action_names) not in known:
-        actions = " or ".join(f"({', '.join(names)})" for names in known)
+    if planner.steers is not None and tuple(robot.action_names) not in planner.steers:
+        actions = " or ".join(f"({', '.join(names)})" for names in planner.steers)
         raise ConfigError(
             f"Expected a robot with actions {actions} for planner {name!r}, got {type(robot).__name__} with "
             f"({', '.join(robot.action_names)}). Take a planner that samples actions, such as mppi."

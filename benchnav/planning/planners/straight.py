@@ -1,4 +1,4 @@
-"""Driving straight at the goal: the floor that a planner has to beat.
+"""Driving straight at the goal: the baseline that a planner has to beat.
 
 `Straight` is blind: it uses the goal alone. Planners with a global path recover by the same control law.
 Letters in shapes: B episodes, S state and A action dimensions.
@@ -9,9 +9,9 @@ import math
 import torch
 from torch import Tensor
 
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem, Task
-from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot, action_limits
+from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Robot
 
 # Turn commanded for a radian of heading error: rad/s of turn rate, or rad of steering.
 _TURN_GAIN = 4.0
@@ -39,9 +39,9 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     offset = target_m - state[:, :2]
     missing = torch.atan2(offset[:, 1], offset[:, 0]) - state[:, 2]
     missing = torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
-    low, high, limits = robot.action_low, robot.action_high, action_limits(robot)
+    low, high, rates = robot.action_low, robot.action_high, robot.action_rates
     # A robot of limited acceleration has to be able to end its turn in time.
-    gain = _TURN_GAIN if limits is None else min(_TURN_GAIN, 2 * limits[1] / high[1])
+    gain = _TURN_GAIN if rates is None else min(_TURN_GAIN, 2 * rates[1] / high[1])
     least = 0.0 if TURN_RATE in robot.action_names else _CREEP
     aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
     speed = torch.minimum(aligned, _APPROACH * torch.linalg.vector_norm(offset, dim=1))
@@ -49,7 +49,7 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     return torch.stack([action.clamp(least, most) for action, least, most in actions], dim=1)
 
 
-class Straight:
+class Straight(Planner[Problem]):
     """The blind baseline: full speed straight at the goal, whatever the ground is."""
 
     steers = STEERS

@@ -9,13 +9,13 @@ from benchmarks.cai.drive import drive, has_arrived, move, traction_at
 from benchmarks.cai.task import STEPS, Setup, pose
 from benchmarks.cai.world import GRID, draw_vegetation
 from benchnav.core import rng
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem
 
 DT_S = 0.1
 
 
-class Blind:
+class Blind(Planner[int]):
     """Commands one action for ever."""
 
     def __init__(self, speed_mps: float, turn_rate_radps: float = 0.0) -> None:

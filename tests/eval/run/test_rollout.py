@@ -7,7 +7,7 @@ import torch
 
 from benchnav.eval.run import clock as clock_module
 from benchnav.eval.run import rollout
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
@@ -29,7 +29,7 @@ class Clock:
         return self.now
 
 
-class Slow:
+class Slow(Planner[int]):
     """Stands still; takes 5 s to begin, and 1 s for its first step, 2 s for its second and so on."""
 
     def __init__(self, clock: Clock, raises_at: int = 99) -> None:
@@ -72,7 +72,7 @@ def test_a_plan_that_was_never_made_has_no_time(monkeypatch: pytest.MonkeyPatch)
     assert episodes.errors == ("RuntimeError: enough",) * BATCH
 
 
-class Watch:
+class Watch(Planner[None]):
     """Stands still and notes what time it is told."""
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ def test_a_planner_is_told_the_time_by_the_steps_of_its_robot(dt_s: float) -> No
     assert planner.told == pytest.approx([dt_s * step for step in range(round(1 / dt_s))])
 
 
-class Homing:
+class Homing(Planner[Problem]):
     """Drives at the goal by what it kept of the problem; notes for which goals it was asked."""
 
     def __init__(self) -> None:

@@ -529,9 +529,15 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
-        ({"robots": ("tests.eval.parts:Faulty",)}, "without dt_s"),
-        ({"planners": ("benchnav.planning.robots:Unicycle",)}, "without init"),
-        ({"objectives": ("benchnav.planning.robots:Unicycle",)}, "without stage"),
+        ({"robots": ("tests.eval.parts:Faulty",)}, "a subclass of benchnav.planning.Robot, got Faulty"),
+        (
+            {"planners": ("benchnav.planning.robots:Unicycle",)},
+            r"a subclass of benchnav.planning.Planner, got Unicycle\. Write class Unicycle\(Planner\)",
+        ),
+        (
+            {"objectives": ("benchnav.planning.robots:Unicycle",)},
+            "a subclass of benchnav.planning.Objective, got Unicycle",
+        ),
         ({"conditions": ({"task": 3},)}, "mapping"),
         ({"conditions": ({"planners": []},)}, "at least one condition"),
         (

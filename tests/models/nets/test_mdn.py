@@ -18,6 +18,7 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.base import predict
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
@@ -28,7 +29,7 @@ from benchnav.models.nets.mdn import (
     MixtureDensityNetwork,
     censored_nll,
 )
-from benchnav.models.predictor import Oracle, load_model, open_checkpoint, predict
+from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import networks
 from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData

@@ -11,6 +11,7 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.models.base import TraversabilityModel
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.measure import choose_splits, evaluate, measure
@@ -49,7 +50,7 @@ def test_the_oracle_is_calibrated_and_has_no_class_metrics() -> None:
 
 
 def test_a_model_off_by_a_constant_is_off_by_it_in_truth() -> None:
-    class Shifted:
+    class Shifted(TraversabilityModel):
         """Says N(0.4, 0.01) of ground that is N(0.5, 0.01)."""
 
         def predict(self, observation: Observation) -> TraversabilityMixture:
@@ -67,7 +68,7 @@ def test_a_model_off_by_a_constant_is_off_by_it_in_truth() -> None:
 
 
 def test_class_metrics_are_those_counted_by_hand() -> None:
-    class Half:
+    class Half(TraversabilityModel):
         """Says class 0 with certainty 0.8 everywhere; classes are 0 in the left half, else 1."""
 
         class_names = ("a", "b", "c")
@@ -104,7 +105,7 @@ def test_class_metrics_are_those_counted_by_hand() -> None:
 def test_a_class_that_is_only_predicted_counts_in_the_measure_named_for_it_alone() -> None:
     """Colour 0 is of class a, 100 of b and 200 of c, which no cell is; two cells of a look like c."""
 
-    class Colours:
+    class Colours(TraversabilityModel):
         class_names = ("a", "b", "c")
 
         def predict(self, observation: Observation) -> TraversabilityMixture:

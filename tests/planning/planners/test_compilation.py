@@ -10,6 +10,7 @@ import torch
 import torch._dynamo.config
 import torch._inductor.config
 
+from benchnav.planning.objective import Objective
 from benchnav.planning.planners import compilation
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA, AStarDWAConfig
 from benchnav.planning.planners.astar.dwa import DWAConfig
@@ -163,7 +164,7 @@ def test_no_setting_of_pytorch_is_left_changed() -> None:
 SMALL = MPPIConfig(samples=64, horizon_s=0.4)
 
 
-class Doubtful:
+class Doubtful(Objective):
     """An objective that looks at a number, which nothing compiled can do."""
 
     def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]

@@ -6,7 +6,7 @@ import torch
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.planning.objective import GoalDistance
+from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.planners import mppi
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
 from benchnav.planning.planners.noise import NoiseBank
@@ -202,7 +202,7 @@ def test_a_horizon_in_steps_is_answered_with_its_new_name() -> None:
         registry.make("planner", {"part": "mppi", "options": {"horizon": 50}})
 
 
-class Free:
+class Free(Objective):
     """Costs nothing, wherever it leads."""
 
     def stage(self, state, action, traversability, target):  # type: ignore[no-untyped-def]

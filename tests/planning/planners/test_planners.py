@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
-from benchnav.planning.planners.planner import PlanStatus, check_steers
+from benchnav.planning.planners.planner import Planner, PlanStatus, check_steers
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
@@ -26,7 +26,7 @@ def make(planner: str) -> Any:
 
 
 def steers(planner: str, robot: str) -> bool:
-    known = getattr(make(planner), "steers", None)
+    known = make(planner).steers
     return known is None or registry.make("robot", robot).action_names in known
 
 
@@ -35,7 +35,7 @@ EACH = pytest.mark.parametrize(("planner", "robot"), STEERED)
 EACH_GLOBAL = pytest.mark.parametrize(("planner", "robot"), [pair for pair in STEERED if pair[0] in GLOBAL])
 
 
-class Watched:
+class Watched(Planner[Any]):
     """A planner whose statuses are kept."""
 
     def __init__(self, planner: Any) -> None:

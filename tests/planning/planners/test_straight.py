@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.planners.planner import check_steers, what_it_follows
+from benchnav.planning.planners.planner import Plan, Planner, Step, check_steers
 from benchnav.planning.planners.straight import Straight, steer_toward
+from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
@@ -115,7 +116,27 @@ def test_it_refuses_robots_of_other_actions() -> None:
 
 
 def test_what_a_planner_minimises_is_asked_of_the_task() -> None:
-    assert "straight" in what_it_follows(Straight(), factories.task())
-    assert what_it_follows(object(), factories.task()) == ""
-    with pytest.raises(ConfigError, match="def follows"):
-        what_it_follows(type("Old", (), {"follows": "travel time"})(), factories.task())
+    assert "straight" in Straight().follows(factories.task())
+
+
+def test_what_a_planner_does_not_say_has_a_default() -> None:
+    class Least(Planner[None]):
+        def init(self, problem: Problem, generator: torch.Generator) -> None:
+            return None
+
+        def plan(self, step: Step, plan_state: None) -> tuple[torch.Tensor, None, Plan]:
+            return torch.zeros(len(step.state), 2), None, Plan.empty(len(step.state))
+
+    planner, task = Least(), factories.task()
+    assert (planner.follows(task), planner.remarks(task), planner.compiled) == ("", (), None)
+    assert (planner.steers, planner.blind) == (None, False)
+    assert planner.select(None, torch.tensor([0])) is NotImplemented
+    check_steers(planner, BICYCLE, "least")
+
+
+def test_a_planner_that_cannot_plan_cannot_be_made() -> None:
+    class Half(Straight):
+        plan = Planner.plan  # type: ignore[assignment]
+
+    with pytest.raises(TypeError, match="plan"):
+        Half()

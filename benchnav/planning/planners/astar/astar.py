@@ -17,7 +17,7 @@ from torch import Tensor
 from benchnav.core import gridgraph
 from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.objective import distance, path_cost_of
+from benchnav.planning.objective import distance
 from benchnav.planning.problem import Problem
 
 
@@ -55,7 +55,7 @@ def edge_costs(problem: Problem) -> Tensor:
     )
     length_m = cells * problem.grid.resolution_m
     grade = (elevation[:, target] - elevation[:, source]) / length_m
-    metre = path_cost_of(problem.objective)
+    metre = problem.objective.path_cost
     at_source, at_target = metre(traversability[:, source], grade), metre(traversability[:, target], grade)
     for found in (at_source, at_target):
         if not isinstance(found, Tensor) or found.shape != grade.shape:

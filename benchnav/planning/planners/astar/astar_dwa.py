@@ -33,10 +33,4 @@ class AStarDWA(Guided[DWAState]):
     def __init__(self, config: AStarDWAConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or AStarDWAConfig()
-        self._dwa = DWA(self.config.dwa)
-        super().__init__(self.config, self._dwa)
-
-    @property
-    def compiled(self) -> bool | None:
-        """Whether rollouts are compiled; None before the first."""
-        return self._dwa.compiled
+        super().__init__(self.config, DWA(self.config.dwa))

@@ -33,10 +33,4 @@ class AStarMPPI(Guided[MPPIState]):
     def __init__(self, config: AStarMPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
         self.config = config or AStarMPPIConfig()
-        self._mppi = MPPI(self.config.mppi)
-        super().__init__(self.config, self._mppi)
-
-    @property
-    def compiled(self) -> bool | None:
-        """Whether rollouts are compiled; None before the first."""
-        return self._mppi.compiled
+        super().__init__(self.config, MPPI(self.config.mppi))

@@ -22,7 +22,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Step
 from benchnav.planning.problem import (
     Problem,
     motion_traversability,
@@ -30,7 +30,7 @@ from benchnav.planning.problem import (
     stage_cost,
     with_tensors,
 )
-from benchnav.planning.robots import Robot, action_limits, component_wise
+from benchnav.planning.robots import Robot, component_wise
 
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10
@@ -95,7 +95,7 @@ class DWAState:
     velocity: Tensor
 
 
-class DWA:
+class DWA(LocalPlanner[DWAState]):
     """DWA as a local planner, for robots with actions (v, ω).
 
     Args:
@@ -156,7 +156,7 @@ def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         Two of shape [B, 2].
     """
-    rates, bounds = action_limits(problem.robot), problem.action_bounds
+    rates, bounds = problem.robot.action_rates, problem.action_bounds
     if rates is None:
         return bounds[0].expand_as(velocity), bounds[1].expand_as(velocity)
     # Numbers, for a tensor made of them would be sent to the device at every step.

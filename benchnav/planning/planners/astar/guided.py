@@ -6,47 +6,22 @@ robot that its local planner holds in place is steered along the path. Source: p
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.objective import GoalDistance, path_cost_of, path_length, toward_waypoints
+from benchnav.planning.objective import GoalDistance, has_path_cost, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem, Task, with_tensors
 
 Local = TypeVar("Local")
 T = TypeVar("T")
-
-
-class LocalPlanner(Protocol[Local]):
-    """The contract of a local planner: a planner that is told where to go at each step."""
-
-    @property
-    def name(self) -> str:
-        """What tables call it."""
-        ...
-
-    def init(self, problem: Problem, generator: torch.Generator) -> Local:
-        """Prepares to plan; see `Planner`."""
-        ...
-
-    def plan_toward(self, step: Step, plan_state: Local, target_m: Tensor) -> tuple[Tensor, Local, Plan]:
-        """Chooses actions toward a target (x, y), shape [B, 2]; else as `Planner.plan`."""
-        ...
-
-    def commit_action(self, plan_state: Local, action: Tensor) -> Local:
-        """Notes the actions that are taken, which may be others than it chose, shape [B, A]."""
-        ...
-
-    def select(self, plan_state: Local, members: Tensor) -> Local:
-        """Keeps some episodes; see `Planner`."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +61,7 @@ class GuidedState(Generic[Local]):
     recovery: Recovery
 
 
-class Guided(Generic[Local]):
+class Guided(Planner[GuidedState[Local]], Generic[Local]):
     """A local planner guided by A*, as a planner.
 
     Args:
@@ -98,18 +73,24 @@ class Guided(Generic[Local]):
         """Keeps the settings; all else is in the plan state."""
         self.guide, self.local = guide, local
 
+    @property
+    def compiled(self) -> bool | None:
+        """Whether the local planner runs compiled; see `Planner`."""
+        return self.local.compiled
+
     def follows(self, task: Task) -> str:
         """What A* minimises where that is the length of the path and not J; see `Planner`."""
-        if isinstance(task.objective, GoalDistance) or path_cost_of(task.objective) is path_length:
+        if isinstance(task.objective, GoalDistance) or not has_path_cost(task.objective):
             return f"3D path length (A*), J ({self.local.name})"
         return ""
 
     def remarks(self, task: Task) -> tuple[str, ...]:
         """Says what a path costs where J does not, and where no risk setting moves the path; see `Planner`."""
-        found, metre = [], path_cost_of(task.objective)
-        if metre is path_length:
-            found.append(f"A* takes the shortest path: {type(task.objective).__name__} has no `path_cost`")
-        slow, fast = metre(torch.tensor([task.rules.min_traversability, 1.0]), torch.zeros(2)).tolist()
+        found, objective = [], task.objective
+        if not has_path_cost(objective):
+            found.append(f"A* takes the shortest path: {type(objective).__name__} has no `path_cost`")
+        ends = torch.tensor([task.rules.min_traversability, 1.0])
+        slow, fast = objective.path_cost(ends, torch.zeros(2)).tolist()
         if slow == fast and task.rules.free_space.by == "mean":
             found.append(
                 "ground is free by the mean, and λ̂ is no part of what A* minimises: its path is the same under "

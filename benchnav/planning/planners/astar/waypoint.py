@@ -6,6 +6,7 @@ corner between two sampled points is missed. Letters in shapes: B episodes, J li
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +14,6 @@ from torch import Tensor
 
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
-from benchnav.planning.objective import PathCost, path_cost_of
 from benchnav.planning.problem import Problem
 
 # A straight line may cost this much more than the path that it shortens.
@@ -35,7 +35,7 @@ class GroundCosts:
     """
 
     grid: Grid
-    path_cost: PathCost
+    path_cost: Callable[[Tensor, Tensor], Tensor]
     traversability: Tensor
     penalty_per_m: Tensor
     gradient: tuple[Tensor, Tensor]
@@ -47,7 +47,7 @@ def ground_costs(problem: Problem) -> GroundCosts:
     along_y, along_x = torch.gradient(problem.elevation_m, spacing=grid.resolution_m, dim=(1, 2))
     return GroundCosts(
         grid,
-        path_cost_of(problem.objective),
+        problem.objective.path_cost,
         grid.pad(problem.traversability, outside=1.0),
         grid.pad(PENALTY * (~problem.free).to(problem.risk_map), outside=PENALTY),
         (grid.pad(along_x, outside=0.0), grid.pad(along_y, outside=0.0)),

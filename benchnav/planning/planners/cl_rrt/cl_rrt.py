@@ -47,7 +47,7 @@ from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt.edges import SPACING_M, ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
 from benchnav.planning.planners.cl_rrt.tree import Route, map_tensors, no_route, search
-from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE
 
@@ -132,7 +132,7 @@ class CLRRTState:
     step: int
 
 
-class CLRRT:
+class CLRRT(Planner[CLRRTState]):
     """A tree of closed-loop simulations, and the controller on its quickest branch.
 
     Args:

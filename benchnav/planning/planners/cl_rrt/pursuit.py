@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.robots import SPEED, TURN_RATE, Robot, action_limits
+from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
 _LEAST_CURVATURE = 1e-6
 _LEAST_SQUARE_M2 = 1e-6
@@ -149,8 +149,8 @@ class PathFollower:
         self.speed_mps = low[0], high[0]
         self.wanted_mps = high[0] if config.speed_mps is None else min(config.speed_mps, high[0])
         self.turn_rate_radps = min(-low[1], high[1])
-        limits = action_limits(robot)
-        build_up_s = self.turn_rate_radps / limits[1] if limits else 0.0
+        rates = robot.action_rates
+        build_up_s = self.turn_rate_radps / rates[1] if rates else 0.0
         self.lookahead_m = max(config.lookahead_m, max(config.lookahead_s, build_up_s) * self.wanted_mps)
 
     def advance(self, reference: Reference, state: Tensor, progress_m: Tensor) -> Tensor:

@@ -168,7 +168,7 @@ class Own(GoalDistance):
         return 2 * traversability**-self.power
 
 
-class Bare:
+class Bare(Objective):
     """An objective without a path cost."""
 
     stage, terminal = GoalDistance.stage, GoalDistance.terminal

@@ -211,7 +211,7 @@ def test_the_horizon_is_in_seconds_and_has_a_step_at_least(horizon_s: float, dt_
     assert far.item() == pytest.approx(summed, rel=1e-5)
 
 
-class Scaled:
+class Scaled(Objective):
     """An objective in other units: so many times another."""
 
     def __init__(self, other: Objective, scale: float) -> None:

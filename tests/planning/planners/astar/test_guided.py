@@ -11,7 +11,7 @@ from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
 from benchnav.planning.planners.astar.waypoint import choose_waypoint, ground_costs
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, Unicycle
 from benchnav.planning.world.outcome import Outcome
@@ -20,7 +20,7 @@ from tests.planning.planners.driving import drive, fake_cuda, first, generator, 
 
 
 @dataclass
-class Constant:
+class Constant(LocalPlanner[tuple[Tensor, ...]]):
     """Commands the same whatever it is told; keeps what it was told."""
 
     action: tuple[float, float]
@@ -39,6 +39,9 @@ class Constant:
 
     def commit_action(self, plan_state: tuple[Tensor, ...], action: Tensor) -> tuple[Tensor, ...]:
         return (*plan_state, action)
+
+    def select(self, plan_state: tuple[Tensor, ...], members: Tensor) -> tuple[Tensor, ...]:
+        raise AssertionError("nobody leaves")
 
 
 def test_under_travel_time_a_way_point_within_the_goals_radius_still_draws_the_local_planner() -> None:
@@ -188,8 +191,10 @@ def test_the_whole_reference_is_drawn_only_when_asked_for() -> None:
 
 
 def test_it_says_where_the_path_is_the_shortest_and_not_the_cheapest_by_the_objective() -> None:
-    class Own:
+    class Own(Objective):
         """A J that says nothing of paths."""
+
+        stage, terminal = GoalDistance.stage, GoalDistance.terminal
 
     class OwnPath(Own):
         def path_cost(self, traversability: Tensor, grade: Tensor) -> Tensor:
@@ -197,10 +202,10 @@ def test_it_says_where_the_path_is_the_shortest_and_not_the_cheapest_by_the_obje
 
     planner = Guided(GuideConfig(), Constant((0, 0)))
     for objective in (GoalDistance(), Own()):
-        follows = planner.follows(factories.task(objective=objective))  # type: ignore[arg-type]
+        follows = planner.follows(factories.task(objective=objective))
         assert follows == "3D path length (A*), J (constant)"
     for objective in (TravelTime(Unicycle(), 1.0), OwnPath()):
-        assert planner.follows(factories.task(objective=objective)) == ""  # type: ignore[arg-type]
+        assert planner.follows(factories.task(objective=objective)) == ""
 
 
 def test_a_look_ahead_that_looks_nowhere_is_refused() -> None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from benchnav.planning.planners.boundary import NOT_FINITE, Answer, act, begin, find_layer_faults
-from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
 from tests import factories
@@ -14,7 +14,7 @@ from tests import factories
 BATCH = 3
 
 
-class Says:
+class Says(Planner[str]):
     """A planner that answers what it is told to."""
 
     def __init__(self, *answer: Any) -> None:
@@ -56,7 +56,7 @@ def test_a_sound_answer_passes_as_it_is() -> None:
 
 
 def test_what_a_planner_does_to_its_arguments_reaches_nobody() -> None:
-    class Vandal:
+    class Vandal(Planner[Problem]):
         def init(self, problem: Problem, generator: torch.Generator) -> Problem:
             for tensor in tensors(problem):
                 tensor.zero_()

@@ -11,11 +11,11 @@ from torch import Tensor
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
-from benchnav.testing.planner import check_planner
+from benchnav.testing import check_planner
 
 FEW = {"samples": 128, "horizon_s": 2.0}
 SMALL = {"mppi": FEW, "astar_mppi": {"mppi": FEW}, "cl_rrt": {"expansions": 50}}
@@ -31,7 +31,7 @@ class Carried:
     count: int = 0
 
 
-class Good:
+class Good(Planner[Any]):
     """Turns by what is predicted, by its noise and by what it did last; draws a line when asked to."""
 
     steers = (("speed_mps", "turn_rate_radps"),)
@@ -168,7 +168,7 @@ class Draws(Good):
 
 
 BAD: dict[str, tuple[Any, str]] = {
-    "no planner": (object(), "Expected an answer from `init`, got AttributeError"),
+    "no planner": (object(), "Expected the planner to be a subclass of benchnav.planning.Planner, got object"),
     "writes into the states": (acting(lambda step, _: step.state.zero_()), "got another step.state."),
     "writes into what was observed": (
         acting(lambda step, _: step.traversability.zero_()),
@@ -244,7 +244,7 @@ def test_a_good_planner_passes_on_maps_worth_trying() -> None:
 
     check_planner(Spy())
     tried = {(len(one), *one.grid.shape) for one in problems}
-    assert tried == {(batch, *shape) for batch in (4, 3, 1) for shape in ((24, 24), (20, 33))}
+    assert tried == {(batch, *shape) for batch in (4, 2, 1) for shape in ((24, 24), (20, 33))}
     # The robot stands on ground predicted 0 in one of them, and a wall is closed in another.
     assert (problems[0].risk_map.amin(dim=(1, 2)) == 0).tolist() == [False, False, True, True]
     starts = [one.grid.lookup(one.grid.pad(one.risk_map, 0.0), *one.start.T[:2]) for one in problems[:1]]
@@ -316,8 +316,7 @@ def test_a_blind_planner_may_be_right_about_itself() -> None:
 @pytest.mark.parametrize("planner", registry.names("planner"))
 def test_every_registered_planner_keeps_the_contract(planner: str, robot: str) -> None:
     made = registry.make("planner", {"part": planner, "options": SMALL.get(planner, {})})
-    known = getattr(made, "steers", None)
-    if known is not None and registry.make("robot", robot).action_names not in known:
+    if made.steers is not None and registry.make("robot", robot).action_names not in made.steers:
         pytest.skip("it does not steer this robot")
     check_planner(made, robots=[robot])
 

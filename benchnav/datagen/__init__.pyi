@@ -1,0 +1,19 @@
+from benchnav.datagen.files.create import create as create_dataset
+from benchnav.datagen.files.maps import TerrainMaps
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
+from benchnav.datagen.recipe.classes import TerrainClass
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.synth.generate import generate
+
+__all__ = [
+    "Recipe",
+    "TerrainClass",
+    "TerrainDataset",
+    "TerrainMaps",
+    "create_dataset",
+    "find_dataset",
+    "generate",
+    "load_recipe",
+    "recipe_from_dict",
+    "shipped_recipes",
+]

@@ -1,0 +1,3 @@
+from benchnav.env.environment import OffRoadEnv, OffRoadVectorEnv
+
+__all__ = ["OffRoadEnv", "OffRoadVectorEnv"]

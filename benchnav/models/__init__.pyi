@@ -1,0 +1,18 @@
+from benchnav.models.base import ModelFamily, TraversabilityModel, predict
+from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
+from benchnav.models.quality.measure import evaluate as evaluate_model
+
+__all__ = [
+    "Checkpoint",
+    "ModelFamily",
+    "Part",
+    "TraversabilityModel",
+    "evaluate_model",
+    "find_checkpoint",
+    "list_checkpoints",
+    "load_checkpoint",
+    "load_model",
+    "predict",
+    "save_checkpoint",
+]

@@ -1,0 +1,175 @@
+"""What all checks share: watching calls, comparing answers, and telling every breach of a contract at once."""
+
+import pickle
+import random
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchnav.core.errors import BenchnavError, ConfigError
+
+TOLERANCE = 1e-5  # between an answer for one alone and in a batch
+NOTHING = object()  # what a call that raised has answered
+
+
+class Breaches:
+    """Collects what breaks a contract: each breach once, with the places where it was found.
+
+    Args:
+        kind: of the part, as in `check_<kind>`.
+        name: of the part, for people.
+    """
+
+    def __init__(self, kind: str, name: str) -> None:
+        """Begins without a breach, and at no place."""
+        self._kind, self._name, self.place = kind, name, ""
+        self._found: dict[str, list[str]] = {}
+
+    def expect(self, kept: bool, breach: str) -> bool:
+        """Notes a breach at `place`, unless that part of the contract was kept; gives whether it was."""
+        if not kept:
+            places = self._found.setdefault(breach, [])
+            if self.place and self.place not in places:
+                places.append(self.place)
+        return kept
+
+    def expect_tensor(self, what: str, values: Any, like: Tensor, shape: tuple[int, ...]) -> bool:
+        """Expects finite numbers of a shape, in the dtype and on the device of another tensor."""
+        wanted, got = f"{like.dtype} of shape {list(shape)} on {like.device}", type(values).__name__
+        if isinstance(values, Tensor):
+            got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
+        fits = self.expect(got == wanted, f"Expected {what} as {wanted}, got {got}.")
+        return fits and self.expect(bool(values.isfinite().all()), f"Expected finite {what}, got others.")
+
+    def try_function(
+        self, what: str, act: Callable[..., Any], given: Mapping[str, Tensor], shape: tuple[int, ...]
+    ) -> Any:
+        """Tries a pure function of a batch: twice, and for the last of the batch alone.
+
+        Args:
+            what: its name, for people.
+            act: the function.
+            given: its arguments by name, the batch first, of one dtype and device, which the answer is to have too.
+            shape: of the answer.
+
+        Returns:
+            The answer; `NOTHING` where it is of no use.
+        """
+        answer = self.watch(what, partial(act, **given), **given)
+        like = next(iter(given.values()))
+        if answer is NOTHING or not self.expect_tensor(f"what `{what}` gives", answer, like, shape):
+            return NOTHING
+        self.expect(
+            same(act(**given), answer), f"Expected the same from `{what}` when asked again, got another."
+        )
+        alone = self.watch(what, lambda: act(**{name: value[-1:] for name, value in given.items()}))
+        told = f"Expected the same from `{what}` for an episode alone and in a batch, got another."
+        self.expect(close(alone, answer[-1:], TOLERANCE), told)
+        return answer
+
+    def watch(self, what: str, act: Callable[[], Any], **given: Any) -> Any:
+        """Calls, and notes what the call did that it should not.
+
+        Args:
+            what: its name, for people.
+            act: the call.
+            given: its arguments by name; tensors, arrays, generators and numbers in them are compared before
+                and after, however deep they lie.
+
+        Returns:
+            The answer; `NOTHING` where it raised.
+        """
+        before, states, answer = dict(_leaves(given)), _generators(), NOTHING
+        try:
+            answer = act()
+        except Exception as error:
+            text = " ".join(str(error).split())
+            named = text if isinstance(error, BenchnavError) else f"{type(error).__name__}: {text}"
+            self.expect(False, f"Expected an answer from `{what}`, got {named}")
+        after = dict(_leaves(given))
+        changed = [name for name, leaf in before.items() if not same(leaf, after.get(name))]
+        listed = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")
+        self.expect(
+            not changed, f"Expected `{what}` to leave its arguments as they were, got another {listed}."
+        )
+        for whose, state in _generators().items():
+            self.expect(
+                states.get(whose, state) == state,
+                f"Expected {whose} global generator to be left alone, got it changed. Draw from one of your "
+                "own, or from the one that is given.",
+            )
+        return answer
+
+    def refuse(self) -> None:
+        """Raises one error that names every breach; does nothing where there is none.
+
+        Raises:
+            ConfigError: there are breaches.
+        """
+        if not self._found:
+            return
+        lines = [f"{breach} [{', '.join(at)}]" if at else breach for breach, at in self._found.items()]
+        listed = " ".join(f"({number}) {line}" for number, line in enumerate(lines, start=1))
+        raise ConfigError(
+            f"Expected a {self._kind} that keeps the contract of `benchnav.testing.check_{self._kind}`, got "
+            f"{self._name}, which breaks it: {listed}"
+        )
+
+
+def same(first: Any, second: Any) -> bool:
+    """Tells whether two values are the same, tensors by what they hold: NaN equals NaN."""
+    if not isinstance(first, Tensor) or not isinstance(second, Tensor):
+        return type(first) is type(second) and bool(first == second)
+    if first.shape != second.shape or first.dtype != second.dtype:
+        return False
+    return bool(((first == second) | (first.isnan() & second.isnan())).all())
+
+
+def close(values: Any, expected: Tensor, tolerance: float) -> bool:
+    """Tells whether something is a tensor near another of any dtype: NaN equals NaN."""
+    if not isinstance(values, Tensor) or values.shape != expected.shape:
+        return False
+    return torch.allclose(values.double(), expected.double(), tolerance, tolerance, equal_nan=True)
+
+
+def _leaves(value: Any, name: str = "", seen: set[int] | None = None) -> Iterator[tuple[str, Any]]:
+    """Lists copies of all tensors, arrays, generators and numbers within a value, by where they are."""
+    seen = set() if seen is None else seen
+    if isinstance(value, bool | int | float | str | None):
+        yield name, repr(value)
+        return
+    if id(value) in seen or isinstance(value, type):
+        return
+    seen.add(id(value))
+    if isinstance(value, Tensor):
+        yield name, value.detach().clone()
+    elif isinstance(value, np.ndarray):
+        yield name, value.tobytes()
+    elif isinstance(value, torch.Generator):
+        yield name, value.get_state()
+    elif isinstance(value, np.random.Generator):
+        yield name, str(value.bit_generator.state)
+    else:
+        parts: Mapping[Any, Any] = getattr(value, "__dict__", {})
+        if isinstance(value, Mapping):
+            parts = value
+        elif isinstance(value, list | tuple):
+            parts = dict(enumerate(value))
+        for key, part in list(parts.items()):
+            yield from _leaves(part, f"{name}.{key}".lstrip("."), seen)
+
+
+def _generators() -> dict[str, bytes]:
+    """States of the global generators, in a form that `==` compares."""
+    states = {
+        "Python's": pickle.dumps(random.getstate()),
+        "NumPy's": pickle.dumps(np.random.get_state()),  # noqa: NPY002
+        "PyTorch's": bytes(torch.random.get_rng_state().numpy()),
+    }
+    if torch.cuda.is_available() and torch.cuda.is_initialized():
+        states["CUDA's"] = bytes(torch.cuda.get_rng_state().numpy())
+    return states

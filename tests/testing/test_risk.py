@@ -1,0 +1,76 @@
+import random
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from benchnav import ConfigError, TraversabilityMixture
+from benchnav.core import registry
+from benchnav.planning import risk
+from benchnav.testing import check_risk
+
+
+def changed(change: Callable[[Tensor, TraversabilityMixture], Any]) -> Callable[[TraversabilityMixture], Any]:
+    """The mean, but for what comes of it."""
+    return lambda mixture: change(risk.mean(mixture), mixture)
+
+
+class Forgetful:
+    """Gives another λ̂ each time."""
+
+    asked = 0
+
+    def __call__(self, mixture: TraversabilityMixture) -> Tensor:
+        self.asked += 1
+        return risk.mean(mixture) / (1 + 0.01 * self.asked)
+
+
+BAD: dict[str, tuple[Any, str]] = {
+    "no function": (3, "got TypeError"),
+    "raises": (changed(lambda mean, _: mean[99]), "Expected an answer from `risk`, got IndexError"),
+    "a number for all": (changed(lambda mean, _: mean.mean()), "λ̂ of shape [3, 8, 11], got []"),
+    "a map for each component": (changed(lambda mean, m: m.means), "λ̂ of shape [3, 8, 11], got [3, 1, 8, 11]"),
+    "no tensor": (changed(lambda mean, _: mean.tolist()), "got list"),
+    "integers": (changed(lambda mean, _: mean.round().long()), "floating-point numbers, got torch.int64"),
+    "above 1": (changed(lambda mean, _: mean + 1), "λ̂ in [0, 1]"),
+    "below 0": (changed(lambda mean, _: -mean - 0.1), "λ̂ in [0, 1]"),
+    "no number": (changed(lambda mean, _: mean * torch.nan), "λ̂ in [0, 1]"),
+    "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
+    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "Expected of a map alone the λ̂"),
+    "another λ̂": (Forgetful(), "Expected the same λ̂ when asked again"),
+    "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another mixture"),
+    "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
+    "NumPy's generator": (changed(lambda mean, _: mean + 0 * np.random.rand()), "NumPy's global"),  # noqa: NPY002
+    "knows one component alone": (changed(lambda mean, m: mean + 2 * (m.means.shape[1] - 1)), "[K = 3]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("measure", "expected"), BAD.values(), ids=BAD.keys())
+def test_a_breach_is_caught_and_named(measure: Any, expected: str) -> None:
+    states = torch.random.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    try:
+        with pytest.raises(ConfigError) as caught:
+            check_risk(measure)
+    finally:
+        torch.random.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", registry.names("risk"))
+def test_every_registered_measure_keeps_the_contract(name: str) -> None:
+    check_risk(name)
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [risk.mean, partial(risk.cvar, level=0.5), {"part": "var", "options": {"level": 0.1}}, "cvar:0.99"],
+)
+def test_a_measure_is_taken_as_a_function_by_name_or_by_mapping(measure: Any) -> None:
+    check_risk(measure)
