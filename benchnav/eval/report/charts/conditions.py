@@ -28,6 +28,7 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     legend_below,
     planner_colours,
+    planner_name,
     styled,
 )
 from benchnav.eval.experiment.condition import NOT_USED
@@ -96,9 +97,8 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     tall = _ROW_IN * (max(heights.values()) + 1.4) + 0.5
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     figure = Figure(figsize=(width, tall * down + 0.2 + legend_in), layout="constrained")
-    axes = figure.subplots(
-        down, across, squeeze=False, sharex="col" if columns > 1 else True, sharey=True
-    ).flat
+    shared = "col" if columns > 1 else True
+    axes = list(figure.subplots(down, across, squeeze=False, sharex=shared, sharey=True).flat)
     panels = tuple((panel, rows) for panel, (_, rows) in zip(axes, every, strict=False))
     for place, (panel, (title, _)) in enumerate(zip(axes, every, strict=False)):
         panel.set_title(title)
@@ -275,7 +275,8 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
         panel.plot(row["difference"], height, "o", color=BLUE, ms=4.5, mfc=face, zorder=3)
         beside = panel.get_yaxis_transform()
         panel.text(1.01, height, p_in_words(row["p_holm"]), transform=beside, va="center")
-        names.append(f"{row['number']}. {row['names'][0]}\nless {row['names'][1]}")
+        one, other = (", ".join(map(planner_name, name.split(", "))) for name in row["names"])
+        names.append(f"{row['number']}. {one}\nless {other}")
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color="0.93", zorder=0)

@@ -47,7 +47,7 @@ MOST_PANELS = 8
 _PANELS_A_LINE = 4
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
 _CLOSED = "0.25"
-_LETTER_IN = 0.057
+_LETTER_IN = 0.048
 _SAME_MAP = ("data", "scenario", "map", "seed", "realisation")
 _PATH_STYLES = ("solid", "dashed")
 _DARKEST = 0.35  # grey of λ = 0
@@ -124,6 +124,7 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
             _mark_places(panel, snapshot, snapshot.track[snapshot.now])
         if snapshot.field is not None:
             _draw_field(last[0], snapshot, snapshot.field, letters)
+        (below if snapshot.field is None else last[0]).set_xlabel("x [m]")
         for panel in panels[first : first + layers, place % across]:
             panel.tick_params(labelleft=place % across == 0)
     for panel in panels[:, 0]:

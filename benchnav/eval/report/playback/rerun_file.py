@@ -103,10 +103,7 @@ def arrange(drivers: Sequence[Driver]) -> Any:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                rrb.Spatial3DView(
-                    name=drivers[0].recording.title if len(drivers) == 1 else "All conditions",
-                    origin="/world",
-                ),
+                rrb.Spatial3DView(name=title, origin="/world"),
                 rrb.Horizontal(*series, rrb.TextDocumentView(name="About", origin="/about")),
                 row_shares=[3, 1],
             ),
