@@ -16,6 +16,7 @@ NOTHING = "–"
 
 # Wide enough for any table where there is no terminal to fit it into.
 _UNBROKEN = 400
+_WIDEST_LINE = 56  # of a list in a cell, that is not broken
 
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
@@ -66,7 +67,7 @@ def to_markdown(table: Table) -> str:
     """Writes a table in Markdown, with its notes under it and what its columns hold."""
     right = "---:" if table.numbers else "---"
     lines = [
-        _markdown_row(_one_line(heading) for heading in table.headings),
+        _markdown_row(markdown(_one_line(heading)) for heading in table.headings),
         "|" + "---|" * table.labels + f"{right}|" * (len(table.headings) - table.labels),
     ]
     for place, row in enumerate(table.rows):
@@ -187,8 +188,8 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
         highlight=False,
     )
     # Square brackets are markup.
-    notes = map(escape, (*table.notes, *bold_note))
-    console.print(_drawn(table, styled), *notes, sep="\n")
+    title = [f"[bold]{escape(table.title)}[/bold]"] if table.title else []
+    console.print(*title, _drawn(table, styled), *map(escape, (*table.notes, *bold_note)), sep="\n")
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -199,20 +200,21 @@ def _drawn(table: Table, styled: bool) -> Any:
     from rich.table import Table as Drawn
 
     drawn = Drawn(
-        title=escape(table.title) or None,
-        title_justify="left",
         box=box.SIMPLE_HEAD,
         show_edge=False,
         padding=(0, 0 if table.numbers else 1, 0, 0),
     )
     for column, heading in enumerate(table.headings):
         is_number = table.numbers and column >= table.labels
+        # A list of lines that are not too long keeps them whole.
+        cells = [row[column] for row in table.rows]
+        lines = [line for cell in cells for line in cell.splitlines()]
+        is_list = len(lines) > len(cells) and max(map(len, lines)) <= _WIDEST_LINE
         drawn.add_column(
             escape(heading),
             justify="right" if is_number else "left",
-            no_wrap=is_number,
+            no_wrap=is_number or is_list,
             overflow="fold",
-            vertical="top",
         )
 
     def cell(place: int, column: int, text: str) -> str:

@@ -18,13 +18,26 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 
-from benchnav.core.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
 from benchnav.core.errors import ConfigError
+from benchnav.core.figures import (
+    LACKING,
+    TEXT,
+    TITLE,
+    TRAVERSABILITY_COLOURS,
+    TWO_COLUMNS_IN,
+    add_axes,
+    add_bar,
+    legend_at,
+    mark,
+    mark_handle,
+    number_map,
+    save,
+    write,
+)
 from benchnav.core.grid import Grid
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
@@ -43,11 +56,9 @@ STEEP_DEG = 30.0
 _PAGE, _DPI = 9.4, 300.0
 _LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.06, 0.42, 0.94, 0.12
 _LINE, _LETTER = 0.135, 0.054
-LACKING = "0.7"
 _HATCH = "//////"
 _READ_MAPS = 20
-_MARK: dict[str, Any] = {"ls": "", "mfc": "white", "mec": "black", "mew": 0.75, "clip_on": False}
-_MARKS = {"start": _MARK | {"marker": "o", "ms": 3.6}, "goal": _MARK | {"marker": "*", "ms": 6.5}}
+_MARK_SIZE = 0.75
 
 
 def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path, kind: str) -> None:
@@ -69,7 +80,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         indices: which maps.
 
     Returns:
-        A figure 7.2 inches wide; narrower where panels shrink to fit a page.
+        A figure as wide as a page; narrower where panels shrink to fit a page.
 
     Raises:
         ConfigError: no map is asked for.
@@ -106,9 +117,9 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
                 _draw_soft_ground(panel, soft[row], extent, hatched=True)
             if field == "traversability":
                 _draw_soft_ground(panel, soft[row], extent)
-            for name, style in _MARKS.items():
-                panel.plot(*maps[f"{name}_m"][row], **style)
-            _tick(panel, sheet.panel, left=column == 0, bottom=row == len(indices) - 1)
+            for name in ("start", "goal"):
+                mark(panel, name, maps[f"{name}_m"][row], _MARK_SIZE, clip_on=False)
+            number_map(panel, sheet.panel, left=column == 0, bottom=row == len(indices) - 1)
         write(figure, 0.1, sheet.down[row], f"map {index}", rotation=90, ha="center", va="center")
     for centre, title in zip(sheet.across, TITLES.values(), strict=True):
         write(figure, centre, _TOP - 0.05, title, size=TITLE, ha="center", va="bottom")
@@ -148,7 +159,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     across = grid.width * (2 if paired else 1)
     count, ratio, gap = min(held, most), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
-    wide = min(max((PAGE_WIDTH_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
+    wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
     number = f"{held} maps" if count == held else f"first {count} of {held} maps"
     title = f"{dataset.id}, split {split} (scenario {dataset.splits[split]['scenario']}): {number}"
@@ -196,15 +207,23 @@ def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     return colours
 
 
+def class_patches(names: Sequence[str], colours: np.ndarray) -> list[Artist]:
+    """Entries of a legend for classes, whose colours are of shape [C, 3]."""
+    return [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
+
+
 def class_shades(colours: np.ndarray) -> Colormap:
     """The colours of classes, [C, 3], as a colour map; cells that are masked have no class."""
     return ListedColormap(list(colours)).with_extremes(bad=LACKING)
 
 
+def _shades_of_traversability() -> Colormap:
+    return matplotlib.colormaps[TRAVERSABILITY_COLOURS].with_extremes(bad=LACKING)
+
+
 def _coloured(traversability: np.ndarray) -> np.ndarray:
     """λ in the colours of the sheets, from [H, W] to uint8 [H, W, 3]."""
-    shades = matplotlib.colormaps["viridis"].with_extremes(bad=LACKING)
-    return shades(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
+    return _shades_of_traversability()(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
 
 
 def contact_columns(count: int, ratio: float) -> int:
@@ -244,7 +263,7 @@ class _Sheet:
 
 def _lay_out(grid: Grid, rows: int, names: Sequence[str]) -> _Sheet:
     ratio, columns = grid.height / grid.width, len(TITLES)
-    widest = (PAGE_WIDTH_IN - _LEFT - _RIGHT + _GAP) / columns - _GAP
+    widest = (TWO_COLUMNS_IN - _LEFT - _RIGHT + _GAP) / columns - _GAP
     high = min(widest * ratio, 2.0, max((_PAGE - _TOP - 1.1) / rows - _GAP, 0.8))
     column, row = max(high / ratio, 0.95), max(high, 0.5)
     bottom = _TOP + rows * (row + _GAP) - _GAP
@@ -273,10 +292,8 @@ def _scales(relief_m: float, colours: np.ndarray) -> dict[str, dict[str, Any]]:
         "class_id": {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5},
         "elevation_m": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
         "slope_deg": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
-        "traversability": {
-            "cmap": matplotlib.colormaps["viridis"].with_extremes(bad=LACKING), "vmin": 0, "vmax": 1
-        },
-    }  # fmt: skip
+        "traversability": {"cmap": _shades_of_traversability(), "vmin": 0, "vmax": 1},
+    }
 
 
 def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: float) -> np.ndarray:
@@ -330,25 +347,14 @@ def _draw_soft_ground(
         panel.contour(x, y, member, levels=[0.5], colors="black", linewidths=line)
 
 
-def _tick(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
-    for axis, inches in zip((panel.xaxis, panel.yaxis), size, strict=True):
-        # A tick at the very end is left out, as its number would touch the next panel's first.
-        bins = int(np.clip(inches / 0.2, 1, 4))
-        axis.set_major_locator(MaxNLocator(bins, steps=[1, 2, 5, 10], prune="upper"))
-    thin_ticks(panel, labelleft=left, labelbottom=bottom)
-
-
 def _draw_bars(figure: Figure, sheet: _Sheet, levels: np.ndarray) -> None:
     drawn = {str(panel.get_label()): panel.images[0] for panel in figure.axes}
+    wide = sheet.column - 0.12
     # Neither the colour image nor the classes have numbers to read off.
     for field, middle in list(zip(TITLES, sheet.across, strict=True))[2:]:
-        wide = sheet.column - 0.12
-        bar = add_axes(figure, (middle - wide / 2, sheet.bottom + 0.44, wide, 0.07), f"{field} bar")
+        place = (middle - wide / 2, sheet.bottom + 0.44, wide, 0.07)
         extend = "max" if field == "slope_deg" else "neither"
-        drawn_bar = figure.colorbar(drawn[f"{field} 0"], cax=bar, orientation="horizontal", extend=extend)
-        drawn_bar.outline.set_linewidth(0.5)
-        bar.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-        bar.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
+        bar = add_bar(figure, drawn[f"{field} 0"], place, f"{field} bar", extend)
         if field == "elevation_m":
             bar.vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
             label = f"above the lowest point,\ncontours every {levels[1]:g} m"
@@ -369,17 +375,7 @@ def _draw_legends(
     figure: Figure, sheet: _Sheet, names: Sequence[str], colours: np.ndarray, extra: Sequence[Artist]
 ) -> None:
     """Explains the marks over the panels, and the classes under the first two columns."""
-    marks: list[Artist] = [Line2D([], [], label=name, **style) for name, style in _MARKS.items()]
+    marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
     marks += extra
-    classes = [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
-    style: dict[str, Any] = {
-        "fontsize": TEXT, "frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.1,
-        "handletextpad": 0.4, "columnspacing": 1, "labelspacing": 0.3, "bbox_transform": figure.transFigure,
-    }  # fmt: skip
-    right, below = 1 - _RIGHT / sheet.size[0], 1 - sheet.legend_top / sheet.size[1]
-    corner = (right, 1 - 0.06 / sheet.size[1])
-    figure.legend(handles=marks, loc="upper right", bbox_to_anchor=corner, ncols=len(marks), **style)
-    corner, columns = (_LEFT / sheet.size[0], below), sheet.legend_columns
-    legend = figure.legend(handles=classes, loc="upper left", bbox_to_anchor=corner, ncols=columns, **style)
-    for text in legend.get_texts():
-        text.set_parse_math(False)
+    legend_at(figure, marks, (sheet.size[0] - _RIGHT, 0.06), len(marks), "upper right")
+    legend_at(figure, class_patches(names, colours), (_LEFT, sheet.legend_top), sheet.legend_columns)
