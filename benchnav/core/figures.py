@@ -162,10 +162,15 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
 
 
-def legend_below(figure: Figure, handles: Sequence[Artist] | None = None, columns: int = 4) -> Legend:
-    """Lays a legend under the panels, of what has a label where no handles are given."""
-    entries: dict[str, Any] = {} if handles is None else {"handles": handles}
-    return figure.legend(**entries, loc="outside lower center", ncols=columns)
+def legend_below(figure: Figure, handles: Sequence[Artist] = (), columns: int = 4) -> Legend:
+    """Lays a legend under the panels, of what has a label in them, once each, where no handles are given."""
+    labelled: dict[str, Artist] = {}
+    for panel in figure.axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            labelled.setdefault(label, handle)
+    return figure.legend(
+        handles=handles or list(labelled.values()), loc="outside lower center", ncols=columns
+    )
 
 
 def legend_at(

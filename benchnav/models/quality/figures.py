@@ -9,11 +9,8 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.stats import binom
 
@@ -116,14 +113,15 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
         cells, confidence, accuracy = map(np.array, (curve.cells, curve.confidence, curve.accuracy))
         share, filled = cells / cells.sum(), cells > 0
         often = share >= _RARE
-        upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--")
-        upper.vlines(confidence[filled], confidence[filled], accuracy[filled], color=ORANGE, lw=2, alpha=0.45)
-        upper.plot(confidence[often], accuracy[often], color=BLUE, lw=1)
-        for many, fill in ((often, BLUE), (filled & ~often, "white")):
-            # Unclipped points ask for room; none at all would ask for all of it.
-            if many.any():
-                points = confidence[many], accuracy[many]
-                upper.plot(*points, "o", ms=3, mfc=fill, mec=BLUE, mew=0.7, clip_on=False)
+        few = filled & ~often
+        upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--", label="calibrated")
+        points: dict[str, Any] = {"color": BLUE, "ms": 3, "lw": 1, "clip_on": False}
+        upper.plot(confidence[often], accuracy[often], "o-", **points, label="observed")
+        if few.any():  # no point at all would ask for all the room there is
+            words = "observed, under 0.1 % of cells"
+            upper.plot(confidence[few], accuracy[few], "o", mfc="white", **points, label=words)
+        gap = (confidence[filled], confidence[filled], accuracy[filled])
+        upper.vlines(*gap, color=ORANGE, lw=2, alpha=0.45, zorder=1.5, label="gap")
         upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1], title=f"{split}: ECE {quality.ece:.3f}")
         lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
@@ -137,14 +135,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
         lower.set_ylabel("cells")
     figure.align_ylabels(panels[:, 0])
     figure.supxlabel("probability of the most likely class")
-    observed: dict[str, Any] = {"color": BLUE, "marker": "o", "ms": 3}
-    handles = [
-        Line2D([], [], color="0.5", lw=0.8, ls="--", label="calibrated"),
-        Line2D([], [], **observed, lw=1, label="observed"),
-        Line2D([], [], **observed, ls="", mfc="white", label="observed, under 0.1 % of cells"),
-        Line2D([], [], color=ORANGE, lw=2, alpha=0.45, label="gap"),
-    ]
-    _explain(figure, handles)
+    _explain(figure)
     return figure
 
 
@@ -165,14 +156,18 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
         low, high = (bound / level for bound in binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
-        panel.fill_between([0, 1], low, high, color=_BAND, lw=0)
-        for first, last, colour in ((0, tail, ORANGE), (tail, PIT_BINS, SKY)):
+        for first, last, colour, label in (
+            (0, tail, ORANGE, "observed, under VaR at 0.9"),
+            (tail, PIT_BINS, SKY, "observed"),
+        ):
             heights, ends = counts[first:last] / level, edges[first : last + 1]
-            panel.stairs(heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0)
+            panel.stairs(heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0, label=label)
             panel.stairs(heights, ends, baseline=None, color=colour, lw=1)
-        panel.axhline(1, color="black", lw=0.7)
+        panel.axhline(1, color="black", lw=0.7, label="calibrated")
+        words = "90 % of a calibrated model's bins"
+        panel.fill_between([0, 1], low, high, color=_BAND, lw=0, zorder=0.5, label=words)
         for bound in (0.05, 0.95):
-            panel.axvline(bound, color="black", lw=0.7, ls=":")
+            panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
         panel.text(
             0.5, 0.97,
             f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
@@ -184,14 +179,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         panel.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     figure.supxlabel("PIT of the realised λ")
     figure.supylabel("density")
-    handles: list[Artist] = [
-        Patch(facecolor=SKY, label="observed"),
-        Patch(facecolor=ORANGE, label="observed, under VaR at 0.9"),
-        Line2D([], [], color="black", lw=0.7, label="calibrated"),
-        Patch(facecolor=_BAND, label="90 % of a calibrated model's bins"),
-        Line2D([], [], color="black", lw=0.7, ls=":", label="central 90 %"),
-    ]
-    _explain(figure, handles, most=5)
+    _explain(figure, most=5)
     return figure
 
 
@@ -218,25 +206,21 @@ def severity_figure(
     for panel, (_, name, ideal) in zip(panels, quantities, strict=True):
         for scenario, series in all_series.items():
             severities, splits = zip(*series, strict=True)
-            panel.plot(severities, [_quantity(qualities[split], name) for split in splits], **looks[scenario])
+            values = [_quantity(qualities[split], name) for split in splits]
+            panel.plot(severities, values, label=scenario, **looks[scenario])
             if name == "entropy_auroc" and ensemble:
                 others = [_quantity(qualities[split], "mutual_information_auroc") for split in splits]
-                panel.plot(severities, others, ls=":", mfc="white", **looks[scenario])
+                words = "of mutual information; solid: of entropy"
+                panel.plot(severities, others, ls=":", mfc="white", **looks[scenario], label=words)
         panel.margins(x=0.05, y=0.12)
         if ideal is not None:
-            panel.axhline(ideal, color="0.4", lw=0.8, ls="--")
+            panel.axhline(ideal, color="0.4", lw=0.8, ls="--", label="calibrated")
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
         panel.grid(alpha=0.3)
         panel.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
     figure.supxlabel("severity of the shift")
-    handles = [Line2D([], [], label=scenario, **style) for scenario, style in looks.items()]
-    handles.append(Line2D([], [], color="0.4", lw=0.8, ls="--", label="calibrated"))
-    if ensemble:
-        handles.append(
-            Line2D([], [], color="0.4", lw=1, ls=":", label="of mutual information; solid: of entropy")
-        )
-    _explain(figure, handles)
+    _explain(figure)
     return figure
 
 
@@ -267,40 +251,36 @@ def latent_figure(
     for number, (panel, item) in enumerate(zip(panels, classes, strict=True)):
         mean, std = means[number, shown], stds[number, shown]
         latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
-        panel.fill_between(x, mean - 2 * std, mean + 2 * std, color=SKY, alpha=0.3, lw=0)
-        panel.fill_between(x, mean - 2 * latent, mean + 2 * latent, color=BLUE, alpha=0.45, lw=0)
-        panel.plot(x, mean, color=BLUE, lw=1.1)
-        panel.plot(x, _with_soft(expected_traversability(mean, std), *soft[number]), color=ORANGE, lw=1.1)
+        panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
+        expected = _with_soft(expected_traversability(mean, std), *soft[number])
+        panel.plot(x, expected, color=ORANGE, lw=1.1, label="predicted E[λ]")
+        for spread, colour, alpha, label in (
+            (std, SKY, 0.3, "± 2σ with noise"),
+            (latent, BLUE, 0.45, "± 2σ of the latent function"),
+        ):
+            low, high = mean - 2 * spread, mean + 2 * spread
+            panel.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, label=label)
         words = f"σ {noise[number]:.3f}"
         if truth:
             true = latent_mean(np.full(len(x), number), x, tuple(classes))
-            panel.plot(x, true, color="black", lw=0.9, ls="--")
+            panel.plot(x, true, color="black", lw=0.9, ls="--", label="true latent function")
             firm = expected_traversability(true, np.full_like(x, item.noise))
             true_soft = (item.soft.weight, item.soft.mean, item.soft.std) if item.soft else _NO_SOFT
-            panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":")
+            panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":", label="true E[λ]")
             words += f" ({item.noise:.3f})"
         if soft[number][0]:
-            panel.axhline(soft[number][1], color=BLUE, lw=0.9, ls="-.")
-        for share, shade in ((_RARE, 0.12), (0.0, 0.25)):
-            panel.axvspan(_steeper_than(slope_cells[number], share), 90, color="0.4", alpha=shade, lw=0)
+            panel.axhline(soft[number][1], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
+        for share, shade, label in (
+            (_RARE, 0.12, "steeper: 1 cell in 1000"),
+            (0.0, 0.25, "steeper: no cell of the class"),
+        ):
+            steeper = _steeper_than(slope_cells[number], share)
+            panel.axvspan(steeper, 90, color="0.4", alpha=shade, lw=0, label=label)
         panel.text(0.05, 0.05, words, size=TEXT, transform=panel.transAxes)
     panels[0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
     figure.supylabel("traversability")
-    handles: list[Artist] = [
-        Line2D([], [], color=BLUE, lw=1.1, label="GP mean"),
-        Patch(facecolor=BLUE, alpha=0.45, label="± 2σ of the latent function"),
-        Patch(facecolor=SKY, alpha=0.3, label="± 2σ with noise"),
-        Line2D([], [], color=ORANGE, lw=1.1, label="predicted E[λ]"),
-    ]
-    if truth:
-        handles.append(Line2D([], [], color="black", lw=0.9, ls="--", label="true latent function"))
-        handles.append(Line2D([], [], color="black", lw=1, ls=":", label="true E[λ]"))
-    if table.soft:
-        handles.append(Line2D([], [], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots"))
-    handles.append(Patch(facecolor="0.4", alpha=0.12, label="steeper: 1 cell in 1000"))
-    handles.append(Patch(facecolor="0.4", alpha=0.35, label="steeper: no cell of the class"))
-    _explain(figure, handles)
+    _explain(figure)
     return figure
 
 
@@ -350,6 +330,6 @@ def _figure(share: float, high: float) -> Figure:
     return Figure(figsize=(max(TWO_COLUMNS_IN * share, _LEAST_WIDTH), high), layout="constrained")
 
 
-def _explain(figure: Figure, handles: Sequence[Artist], most: int = 4) -> None:
+def _explain(figure: Figure, most: int = 4) -> None:
     """Lays a legend under the panels, in at most so many columns where the figure is of full width."""
-    legend_below(figure, handles, min(len(handles), most if figure.get_figwidth() == TWO_COLUMNS_IN else 2))
+    legend_below(figure, columns=most if figure.get_figwidth() == TWO_COLUMNS_IN else 2)

@@ -11,21 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
-from benchnav.core.figures import (
-    LACKING,
-    TITLE,
-    TRAVERSABILITY_COLOURS,
-    add_axes,
-    add_bar,
-    legend_at,
-    number_map,
-    show_map,
-    write,
-)
+from benchnav.core.figures import TRAVERSABILITY_COLOURS
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.preview import class_colours, class_patches, class_shades
+from benchnav.datagen.preview import (
+    LACKING_PATCH,
+    SheetColumn,
+    class_colours,
+    class_patches,
+    class_shades,
+    sheet_of_maps,
+)
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.predictor import AnyModel, ClassModel, EnsembleModel, Oracle, predict
@@ -55,9 +51,6 @@ _PALETTES = {
     **dict.fromkeys(("error", "error_observed"), "RdBu_r"),
     **dict.fromkeys(("width", "entropy", "information"), "magma"),
 }
-_PANEL, _GAP = 1.2, 0.1
-_LEFT, _RIGHT, _TOP, _FOOT = 0.5, 0.08, 0.45, 0.8
-_LEGEND_COLUMNS = 3
 _SHOWN_SHARE = 0.995
 
 
@@ -156,50 +149,29 @@ def map_sheet_figure(
         classes: of the dataset.
         title: which model and dataset; the split follows.
     """
-    names = [name for name in TITLES if name in sheet.layers]
-    width_m, height_m = sheet.extent_m
-    high = _PANEL * float(np.clip(height_m / width_m, 0.3, 3))
+    columns = []
+    for name in (name for name in TITLES if name in sheet.layers):
+        layers, unit, is_error = sheet.layers[name], _UNITS.get(name), name.startswith("error")
+        columns.append(
+            SheetColumn(
+                name=name,
+                title=TITLES[name],
+                layers=np.ma.masked_equal(layers, UNLABELLED) if name == "class_true" else layers,
+                shades=scales[name],
+                unit=unit,
+                # λ ends at 0 and 1.
+                extend="neither" if unit == "λ" else "both" if is_error else "max",
+                most=2 if is_error else 4,
+            )
+        )
     shown = _shown_classes(sheet)
-    lacking = any(bool(np.isnan(layer).any()) for layer in sheet.layers.values())
-    legend_rows = -(-(len(shown) + lacking) // _LEGEND_COLUMNS)
-    bottom = _TOP + len(sheet.indices) * (high + _GAP) - _GAP
-    size = (
-        _LEFT + len(names) * (_PANEL + _GAP) - _GAP + _RIGHT,
-        bottom + max(_FOOT, 0.42 + 0.14 * legend_rows),
+    patches = class_patches(
+        [classes[number].name.replace("_", " ") for number in shown], class_colours(classes)[shown]
     )
-    figure = Figure(figsize=size)
-    for column, name in enumerate(names):
-        left = _LEFT + column * (_PANEL + _GAP)
-        middle = left + _PANEL / 2
-        for row, index in enumerate(sheet.indices):
-            top = _TOP + row * (high + _GAP)
-            panel = add_axes(figure, (left, top, _PANEL, high), f"{name} {row}")
-            panel.set_facecolor(LACKING)
-            layer = sheet.layers[name][row]
-            if name == "class_true":
-                layer = np.ma.masked_equal(layer, UNLABELLED)
-            image = show_map(panel, layer, sheet.extent_m, aspect="auto", **scales[name])
-            number_map(panel, (_PANEL, high), left=column == 0, bottom=row == len(sheet.indices) - 1)
-            if column == 0:
-                write(figure, 0.1, top + high / 2, f"map {index}", rotation=90, ha="center", va="center")
-        write(figure, middle, _TOP - 0.06, TITLES[name], size=TITLE, ha="center", va="bottom")
-        write(figure, middle, bottom + 0.2, "x [m]", ha="center", va="top")
-        if name in _UNITS:
-            signed = name.startswith("error")
-            # λ ends at 0 and 1.
-            extend = "neither" if _UNITS[name] == "λ" else "both" if signed else "max"
-            place = (left + 0.06, bottom + 0.42, _PANEL - 0.12, 0.07)
-            add_bar(figure, image, place, f"{name} bar", extend, most=2 if signed else 4)
-            write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")
-    write(figure, _LEFT, 0.06, f"{title}, split {sheet.split}", size=TITLE, weight="bold", va="top")
-    write(figure, 0.26, (_TOP + bottom) / 2, "y [m]", rotation=90, ha="center", va="center")
-    if shown:
-        shown_names = [classes[number].name.replace("_", " ") for number in shown]
-        patches = class_patches(shown_names, class_colours(classes)[shown])
-        if lacking:
-            patches.append(Patch(facecolor=LACKING, label="not known"))
-        legend_at(figure, patches, (_LEFT, bottom + 0.38), _LEGEND_COLUMNS)
-    return figure
+    if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
+        patches.append(LACKING_PATCH)
+    rows = [f"map {index}" for index in sheet.indices]
+    return sheet_of_maps(columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches)
 
 
 def _shown_classes(sheet: MapSheet) -> list[int]:

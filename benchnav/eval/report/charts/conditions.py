@@ -97,8 +97,8 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     tall = _ROW_IN * (max(heights.values()) + 1.4) + 0.5
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     figure = Figure(figsize=(width, tall * down + 0.2 + legend_in), layout="constrained")
-    shared = "col" if columns > 1 else True
-    axes = list(figure.subplots(down, across, squeeze=False, sharex=shared, sharey=True).flat)
+    axes = figure.subplots(down, across, squeeze=False, sharex="all" if columns == 1 else "col", sharey=True)
+    axes = list(axes.flat)
     panels = tuple((panel, rows) for panel, (_, rows) in zip(axes, every, strict=False))
     for place, (panel, (title, _)) in enumerate(zip(axes, every, strict=False)):
         panel.set_title(title)
@@ -170,13 +170,12 @@ def outcome_figure(summary: pd.DataFrame) -> Figure:
             left = 0.0
             for name in ended:
                 share = 100 * row[f"{name}_count"] / row["n_episodes"]
-                panel.barh(height, share, 0.78, left, color=OUTCOME_COLOURS[name], lw=0)
+                colour, label = OUTCOME_COLOURS[name], outcome_in_words(name)
+                panel.barh(height, share, 0.78, left, color=colour, lw=0, label=label)
                 left += share
-            panel.barh(height, 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0)
+            panel.barh(height, 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
     layout.panels[0][0].set_xlim(0, 100)
-    handles = [Patch(color=OUTCOME_COLOURS[name], label=outcome_in_words(name)) for name in ended]
-    handles.append(Patch(color=SUCCESS_COLOUR, label="success"))
-    legend_below(layout.figure, handles, 3 if layout.figure.get_figwidth() < TWO_COLUMNS_IN else 6)
+    legend_below(layout.figure, columns=3 if layout.figure.get_figwidth() < TWO_COLUMNS_IN else 6)
     return layout.figure
 
 
