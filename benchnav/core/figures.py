@@ -7,7 +7,7 @@ Ito (2008), "Color universal design".
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 from matplotlib.artist import Artist
@@ -162,15 +162,22 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
 
 
-def legend_below(figure: Figure, handles: Sequence[Artist] = (), columns: int = 4) -> Legend:
-    """Lays a legend under the panels, of what has a label in them, once each, where no handles are given."""
+def legend_outside(
+    figure: Figure,
+    handles: Sequence[Artist] = (),
+    columns: int = 4,
+    side: Literal["lower", "upper"] = "lower",
+) -> Legend:
+    """Lays a legend under or over the panels, of what has a label in them, once each, where no handles are given.
+
+    A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
+    """
     labelled: dict[str, Artist] = {}
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
-    return figure.legend(
-        handles=handles or list(labelled.values()), loc="outside lower center", ncols=columns
-    )
+    loc: Any = f"outside {side} center"
+    return figure.legend(handles=handles or list(labelled.values()), loc=loc, ncols=columns)
 
 
 def legend_at(

@@ -22,7 +22,7 @@ from benchnav.core.figures import (
     SKY,
     TEXT,
     TWO_COLUMNS_IN,
-    legend_below,
+    legend_outside,
     styled,
     thin_ticks,
 )
@@ -331,5 +331,6 @@ def _figure(share: float, high: float) -> Figure:
 
 
 def _explain(figure: Figure, most: int = 4) -> None:
-    """Lays a legend under the panels, in at most so many columns where the figure is of full width."""
-    legend_below(figure, columns=most if figure.get_figwidth() == TWO_COLUMNS_IN else 2)
+    """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
+    columns = most if figure.get_figwidth() == TWO_COLUMNS_IN else 2
+    legend_outside(figure, columns=columns, side="upper")

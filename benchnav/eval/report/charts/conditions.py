@@ -26,7 +26,7 @@ from benchnav.core.figures import (
     PINK,
     SKY,
     TWO_COLUMNS_IN,
-    legend_below,
+    legend_outside,
     planner_colours,
     planner_name,
     styled,
@@ -175,7 +175,7 @@ def outcome_figure(summary: pd.DataFrame) -> Figure:
                 left += share
             panel.barh(height, 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
     layout.panels[0][0].set_xlim(0, 100)
-    legend_below(layout.figure, columns=3 if layout.figure.get_figwidth() < TWO_COLUMNS_IN else 6)
+    legend_outside(layout.figure, columns=3 if layout.figure.get_figwidth() < TWO_COLUMNS_IN else 6)
     return layout.figure
 
 
@@ -201,7 +201,7 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
     handles.append(
         Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label="median and quartiles of all")
     )
-    legend_below(layout.figure, handles)
+    legend_outside(layout.figure, handles)
     return layout.figure
 
 
@@ -250,7 +250,7 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
     ]
     if (tests["margin"] > 0).any():
         handles.append(Patch(color=_MARGIN, label="within the margin"))
-    legend_below(figure, handles, 5)
+    legend_outside(figure, handles, 5)
     return figure
 
 

@@ -20,7 +20,7 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     condition_colours,
     draw_edged,
-    legend_below,
+    legend_outside,
     mark,
     mark_handle,
     show_map,
@@ -129,7 +129,7 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
             panel.tick_params(labelleft=place % across == 0)
     for panel in panels[:, 0]:
         panel.set_ylabel("y [m]")
-    legend_below(figure, _legend(snapshots), 1 if across == 1 else 4)
+    legend_outside(figure, _legend(snapshots), 1 if across == 1 else 4)
     shrink = min(1.0, 4 / figure.get_figheight())
     figure.colorbar(
         driven, ax=panels, fraction=0.03, aspect=40, shrink=shrink, anchor=(0, 1), label="traversability λ"
@@ -316,7 +316,7 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
     handles.append(Line2D([], [], color="black", lw=1.1, label="driven"))
     if any(line.ground.immobilising.any() for line in lines):
         handles.append(Patch(color=unit(IMMOBILISING), label="ground that immobilises a robot"))
-    legend_below(figure, handles, 5 if across > 2 else 3)
+    legend_outside(figure, handles, 5 if across > 2 else 3)
     return figure
 
 

@@ -16,7 +16,7 @@ from benchnav.core.figures import (
     MARKERS,
     ONE_COLUMN_IN,
     TWO_COLUMNS_IN,
-    legend_below,
+    legend_outside,
     planner_colours,
     planner_name,
     styled,
@@ -208,7 +208,7 @@ class _Curves:
             Line2D([], [], color=colour, marker=marker, ms=3.5, lw=1.2, label=name)
             for name, (colour, marker) in self.looks.items()
         ]
-        legend_below(figure, [*lines_drawn, *self.references.values()], 2 if across == 1 else 4)
+        legend_outside(figure, [*lines_drawn, *self.references.values()], 2 if across == 1 else 4)
         return figure
 
     def panels(self) -> list[tuple[str, list[Line]]]:
