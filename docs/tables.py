@@ -25,11 +25,11 @@ import pandas as pd
 from scipy.stats import fisher_exact, t, ttest_ind_from_stats
 from statsmodels.stats.multitest import multipletests
 
+from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.folder import EPISODES, open_run
 from benchnav.eval.report.hypotheses import hypothesis_table
-from benchnav.eval.report.rendering import to_markdown
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Pair, find_pairs
@@ -45,8 +45,7 @@ _BESIDE_RISK = ("data", "scenario", "world", "robot", "model", "planner")
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Formats a Markdown table."""
-    lines = [headings, ["---"] * len(headings), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return to_markdown(Table(headings=tuple(headings), rows=tuple(map(tuple, rows)))).rstrip()
 
 
 def results(run: Path) -> str:

@@ -5,19 +5,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchnav.core import drawing
+from benchnav.core import figures
 from tests import factories
 
 torch.set_num_threads(1)
 # To embed a font as publishers ask takes half a second a file.
-_SAVED = drawing._SAVED.copy()
-drawing._SAVED["pdf.fonttype"] = 3
+_SAVED = figures._SAVED.copy()
+figures._SAVED["pdf.fonttype"] = 3
 
 
 @pytest.fixture
 def whole_fonts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Has figures saved as they are outside tests."""
-    monkeypatch.setattr(drawing, "_SAVED", _SAVED)
+    monkeypatch.setattr(figures, "_SAVED", _SAVED)
 
 
 @pytest.fixture(scope="session")

@@ -49,7 +49,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval/report": (
         *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
         "planning",
-        "models.quality.series",  # how scenarios are named that make a series
+        "datagen.recipe.scenario",  # how scenarios are named that make a series
     ),
 }
 

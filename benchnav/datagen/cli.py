@@ -47,12 +47,11 @@ def create(
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         overwrite: Replace what is there.
     """
-    from rich.console import Console
-
     from benchnav.core.command import show_progress
     from benchnav.core.errors import ConfigError
     from benchnav.core.store import output_path, read_shard
-    from benchnav.datagen.difficulty import explain, table
+    from benchnav.core.tables import print_table
+    from benchnav.datagen.difficulty import table
     from benchnav.datagen.files.create import create as create_dataset
     from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.reader import TerrainDataset, is_dataset
@@ -92,10 +91,7 @@ def create(
         return
     made = TerrainDataset(path)
     say_written(made)
-    console = Console(highlight=False)
-    console.print(table(made))
-    for line in explain(made):
-        console.print(line, soft_wrap=True, markup=False)
+    print_table(table(made))
 
 
 def list_datasets(folder: str = "") -> None:
@@ -138,8 +134,7 @@ def show(file: str, json: bool = False) -> None:
     """
     from json import dumps
 
-    from rich.console import Console
-
+    from benchnav.core.tables import Table, print_table
     from benchnav.datagen.files.describe import describe, tables
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
@@ -147,9 +142,11 @@ def show(file: str, json: bool = False) -> None:
     if json:
         print(dumps(described, indent=1))
         return
-    console = Console(highlight=False)
     for item in tables(described):
-        console.print(item, soft_wrap=isinstance(item, str), markup=not isinstance(item, str))
+        if isinstance(item, Table):
+            print_table(item)
+        else:
+            print(item)
 
 
 def validate(file: str) -> int:

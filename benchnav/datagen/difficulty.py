@@ -8,18 +8,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
 from benchnav.core.grid import Grid
+from benchnav.core.tables import NOTHING, Table
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import UNLABELLED, Maps
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
-_HEADS = (
-    "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
+_HEADINGS = (
+    "split", "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
 )  # fmt: skip
 # What columns hold: heading and sentence.
 _EXPLAINED = (
@@ -129,29 +128,24 @@ def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.nda
 
 
 def table(dataset: TerrainDataset) -> Table:
-    """Lays out how hard every split of a dataset is, for a terminal."""
-    title = (
-        f"how hard the maps are: what stands in a robot's way (λ_stuck {dataset.recipe.stuck_threshold:g})"
-    )
-    laid = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
-    laid.add_column("split", no_wrap=True)
-    for head in _HEADS:
-        laid.add_column(head, justify="right", no_wrap=True)
+    """Formats how hard every split of a dataset is."""
+    stuck = dataset.recipe.stuck_threshold
+    rows = []
     for split in dataset.splits:
         found = of_split(dataset, split)
         shares = (f"{100 * share:.1f}" for share in (found.stuck, found.soft_ground, found.soft_spots))
         times = found.reference_times_s
-        typical, spread = "-", "-"
+        typical, spread = NOTHING, NOTHING
         if len(times):
             typical, spread = f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}"
-        laid.add_row(split, *shares, typical, spread, f"{found.straight}/{found.maps}")
-    return laid
-
-
-def explain(dataset: TerrainDataset) -> list[str]:
-    """Says in plain words what the columns of `table` hold: a line a column."""
-    stuck = dataset.recipe.stuck_threshold
-    return [f"  {heading}: {sentence.format(stuck=stuck)}" for heading, sentence in _EXPLAINED]
+        rows.append((split, *shares, typical, spread, f"{found.straight}/{found.maps}"))
+    return Table(
+        title=f"how hard the maps are: what stands in a robot's way (λ_stuck {stuck:g})",
+        headings=_HEADINGS,
+        numbers=True,
+        rows=tuple(rows),
+        notes=tuple(f"  {heading}: {sentence.format(stuck=stuck)}" for heading, sentence in _EXPLAINED),
+    )
 
 
 def _together(pieces: Iterable[Difficulty]) -> Difficulty:

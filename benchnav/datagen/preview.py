@@ -7,7 +7,7 @@ Where the classes have soft spots, the ground that may hide them is hatched and 
 """
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,27 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 
-from benchnav.core.drawing import PAGE_WIDTH_IN, TEXT, TITLE, add_axes, save, thin_ticks, write
 from benchnav.core.errors import ConfigError
+from benchnav.core.figures import (
+    LACKING,
+    TEXT,
+    TITLE,
+    TRAVERSABILITY_COLOURS,
+    TWO_COLUMNS_IN,
+    add_axes,
+    add_bar,
+    legend_at,
+    mark,
+    mark_handle,
+    number_map,
+    save,
+    show_map,
+    write,
+)
 from benchnav.core.grid import Grid
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
@@ -41,13 +55,12 @@ TITLES = {
 STEEP_DEG = 30.0
 
 _PAGE, _DPI = 9.4, 300.0
-_LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.06, 0.42, 0.94, 0.12
-_LINE, _LETTER = 0.135, 0.054
-LACKING = "0.7"
+_LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.1, 0.42, 0.94, 0.12
+_LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.0
 _HATCH = "//////"
 _READ_MAPS = 20
-_MARK: dict[str, Any] = {"ls": "", "mfc": "white", "mec": "black", "mew": 0.75, "clip_on": False}
-_MARKS = {"start": _MARK | {"marker": "o", "ms": 3.6}, "goal": _MARK | {"marker": "*", "ms": 6.5}}
+_MARK_SIZE = 0.75
+LACKING_PATCH = Patch(facecolor=LACKING, label="not known")
 
 
 def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path, kind: str) -> None:
@@ -69,7 +82,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         indices: which maps.
 
     Returns:
-        A figure 7.2 inches wide; narrower where panels shrink to fit a page.
+        A figure as wide as a page; narrower where panels shrink to fit a page.
 
     Raises:
         ConfigError: no map is asked for.
@@ -86,39 +99,138 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     shown, colours = np.unique(maps["class_id"][~unlabelled]), class_colours(classes)
     maps["class_id"] = np.ma.masked_array(maps["class_id"], unlabelled)
     soft = soft_ground(maps["class_id"], classes)
-    names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
-    sheet = _lay_out(grid, len(indices), names)
-    figure = Figure(figsize=sheet.size, dpi=_DPI)
     relief_m = float(maps["elevation_m"].max()) or 1.0
-    scales = _scales(relief_m, colours)
+    shades = {
+        "class_id": {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5},
+        "elevation_m": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
+        "slope_deg": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
+        "traversability": {"cmap": _shades_of_traversability(), "vmin": 0, "vmax": 1},
+    }
     levels = np.array(MaxNLocator(9, steps=[1, 2, 2.5, 5, 10]).tick_values(0, relief_m))
     levels = levels[levels <= relief_m]
+    units = {
+        "elevation_m": f"above the lowest point,\ncontours every {levels[1]:g} m", "slope_deg": "",
+        "traversability": "",
+    }  # fmt: skip
+    columns = [
+        SheetColumn(
+            name=name, title=title, layers=maps[name], shades=shades.get(name, {}), unit=units.get(name),
+            extend="max" if name == "slope_deg" else "neither",
+        )
+        for name, title in TITLES.items()
+    ]  # fmt: skip
+    names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
+    marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
+    if unlabelled.any() or np.isnan(maps["traversability"]).any():
+        marks.append(LACKING_PATCH)
+    if soft.any():
+        marks.append(Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label="may hide soft spots"))
+    figure = sheet_of_maps(
+        columns,
+        [f"map {index}" for index in indices],
+        grid.extent_m,
+        f"{dataset.id}, split {split}",
+        class_patches(names, colours[shown]),
+        marks,
+    )
+    panels = {str(panel.get_label()): panel for panel in figure.axes}
     veils = _hillshade(maps["elevation_m"], maps["slope_deg"], grid.resolution_m)
     extent = (0.0, grid.extent_m[0], 0.0, grid.extent_m[1])
-    for row, index in enumerate(indices):
-        for column, field in enumerate(TITLES):
-            panel = add_axes(figure, sheet.place(row, column), f"{field} {row}")
-            _draw_image(panel, maps[field][row], extent, **scales[field])
-            if field == "elevation_m":
-                _draw_image(panel, veils[row], extent)
-                _draw_contours(panel, maps[field][row], levels, grid)
-            if field == "class_id":
-                _draw_soft_ground(panel, soft[row], extent, hatched=True)
-            if field == "traversability":
-                _draw_soft_ground(panel, soft[row], extent)
-            for name, style in _MARKS.items():
-                panel.plot(*maps[f"{name}_m"][row], **style)
-            _tick(panel, sheet.panel, left=column == 0, bottom=row == len(indices) - 1)
-        write(figure, 0.1, sheet.down[row], f"map {index}", rotation=90, ha="center", va="center")
-    for centre, title in zip(sheet.across, TITLES.values(), strict=True):
-        write(figure, centre, _TOP - 0.05, title, size=TITLE, ha="center", va="bottom")
-    write(figure, 0.25, sheet.down.mean(), "y [m]", rotation=90, ha="center", va="center")
-    write(figure, sheet.across[2], sheet.bottom + 0.2, "x [m]", ha="center", va="top")
-    write(figure, _LEFT, 0.06, f"{dataset.id}, split {split}", size=TITLE, va="top")
-    _draw_bars(figure, sheet, levels)
-    lacking = bool(unlabelled.any() or np.isnan(maps["traversability"]).any())
-    extra = _extra_marks(lacking, bool(soft.any()))
-    _draw_legends(figure, sheet, names, colours[shown], extra)
+    for row in range(len(indices)):
+        show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m, aspect="auto")
+        _draw_contours(panels[f"elevation_m {row}"], maps["elevation_m"][row], levels, grid)
+        _draw_soft_ground(panels[f"class_id {row}"], soft[row], extent, hatched=True)
+        _draw_soft_ground(panels[f"traversability {row}"], soft[row], extent)
+        for field in TITLES:
+            for name in ("start", "goal"):
+                mark(panels[f"{field} {row}"], name, maps[f"{name}_m"][row], _MARK_SIZE, clip_on=False)
+    panels["elevation_m bar"].vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
+    return figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class SheetColumn:
+    """A column of a sheet of maps.
+
+    Args:
+        name: its panels have the label `NAME ROW`, and its colour bar `NAME bar`.
+        title: over the column.
+        layers: a map a row, shape [R, H, W], or [R, H, W, 3] of colours.
+        shades: keywords of `imshow`.
+        unit: what stands under the colour bar; None where there is no bar.
+        extend: at which ends the bar goes on: neither, max or both.
+        most: intervals of the bar.
+    """
+
+    name: str
+    title: str
+    layers: np.ndarray
+    shades: Mapping[str, Any]
+    unit: str | None = None
+    extend: str = "neither"
+    most: int = 4
+
+
+def sheet_of_maps(
+    columns: Sequence[SheetColumn],
+    rows: Sequence[str],
+    extent_m: tuple[float, float],
+    heading: str,
+    classes: Sequence[Artist],
+    marks: Sequence[Artist] = (),
+) -> Figure:
+    """Draws maps side by side, a row a map and a column a layer, for the page of a paper.
+
+    Args:
+        columns: of R rows each; those without a colour bar first.
+        rows: names of the R rows.
+        extent_m: size of a map along x and y.
+        heading: over everything.
+        classes: entries of the legend, which stands under the columns without a bar, or, where it is long, under
+            everything.
+        marks: entries of a legend beside the heading.
+
+    Returns:
+        A figure as wide as a page; narrower where panels shrink to fit one, wider where columns are many.
+    """
+    ratio, across = extent_m[1] / extent_m[0], len(columns)
+    widest = max((TWO_COLUMNS_IN - _LEFT - _RIGHT + _GAP) / across - _GAP, _COLUMN)
+    high = min(widest * ratio, 2.0, max((_PAGE - _TOP - 1.1) / len(rows) - _GAP, 0.8))
+    wide = high / ratio
+    column_in, row_in = max(wide, _COLUMN), max(high, 0.5)
+    bottom = _TOP + len(rows) * (row_in + _GAP) - _GAP
+    width = _LEFT + across * (column_in + _GAP) - _GAP + _RIGHT
+    entry = 0.28 + _LETTER * max((len(str(patch.get_label())) for patch in classes), default=0)
+    beside = sum(column.unit is None for column in columns) * (column_in + _GAP) - _GAP
+    legend_columns, legend_top = max(1, int(beside / entry)), bottom + 0.34
+    if len(classes) > 6 * legend_columns:
+        legend_columns, legend_top = max(1, int((width - _LEFT) / entry)), bottom + _FOOT
+    legend_bottom = legend_top + _LINE * -(-len(classes) // legend_columns) + 0.03
+    figure = Figure(figsize=(width, max(bottom + _FOOT, legend_bottom)), dpi=_DPI)
+    middles = _TOP + row_in / 2 + np.arange(len(rows)) * (row_in + _GAP)
+    for number, column in enumerate(columns):
+        centre = _LEFT + column_in / 2 + number * (column_in + _GAP)
+        for row, middle in enumerate(middles):
+            place = (centre - wide / 2, middle - high / 2, wide, high)
+            panel = add_axes(figure, place, f"{column.name} {row}")
+            panel.set_facecolor(LACKING)
+            image = show_map(panel, column.layers[row], extent_m, aspect="auto", **column.shades)
+            number_map(panel, (wide, high), left=number == 0, bottom=row == len(rows) - 1)
+        write(figure, centre, _TOP - 0.05, column.title, size=TITLE, ha="center", va="bottom")
+        if column.unit is not None:
+            place = (centre - column_in / 2 + 0.06, bottom + 0.44, column_in - 0.12, 0.07)
+            bar = add_bar(figure, image, place, f"{column.name} bar", column.extend, column.most)
+            bar.set_xlabel(column.unit, size=TEXT, labelpad=1.5, linespacing=1.1)
+    for name, middle in zip(rows, middles, strict=True):
+        write(figure, 0.1, middle, name, rotation=90, ha="center", va="center")
+    write(figure, 0.25, middles.mean(), "y [m]", rotation=90, ha="center", va="center")
+    x_middle = _LEFT + column_in / 2 + across // 2 * (column_in + _GAP)
+    write(figure, x_middle, bottom + 0.2, "x [m]", ha="center", va="top")
+    write(figure, _LEFT, 0.06, heading, size=TITLE, va="top")
+    if marks:
+        legend_at(figure, marks, (width - _RIGHT, 0.06), len(marks), "upper right")
+    if classes:
+        legend_at(figure, classes, (_LEFT, legend_top), legend_columns)
     return figure
 
 
@@ -148,7 +260,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     across = grid.width * (2 if paired else 1)
     count, ratio, gap = min(held, most), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
-    wide = min(max((PAGE_WIDTH_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
+    wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
     number = f"{held} maps" if count == held else f"first {count} of {held} maps"
     title = f"{dataset.id}, split {split} (scenario {dataset.splits[split]['scenario']}): {number}"
@@ -196,15 +308,23 @@ def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
     return colours
 
 
+def class_patches(names: Sequence[str], colours: np.ndarray) -> list[Artist]:
+    """Entries of a legend for classes, whose colours are of shape [C, 3]."""
+    return [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
+
+
 def class_shades(colours: np.ndarray) -> Colormap:
     """The colours of classes, [C, 3], as a colour map; cells that are masked have no class."""
     return ListedColormap(list(colours)).with_extremes(bad=LACKING)
 
 
+def _shades_of_traversability() -> Colormap:
+    return matplotlib.colormaps[TRAVERSABILITY_COLOURS].with_extremes(bad=LACKING)
+
+
 def _coloured(traversability: np.ndarray) -> np.ndarray:
     """λ in the colours of the sheets, from [H, W] to uint8 [H, W, 3]."""
-    shades = matplotlib.colormaps["viridis"].with_extremes(bad=LACKING)
-    return shades(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
+    return _shades_of_traversability()(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
 
 
 def contact_columns(count: int, ratio: float) -> int:
@@ -218,65 +338,6 @@ def contact_columns(count: int, ratio: float) -> int:
     rows = -(-count // columns)
     uneven = np.abs(np.log(columns / (rows * ratio))) + 2 * (rows * columns / count - 1)
     return int(columns[np.argmin(uneven.round(6))])
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Sheet:
-    """Where things stand: sizes of figure, panel and column; middles of columns and rows; the last row's end.
-
-    A panel stands in the middle of its column and row. The class legend stands under the first two
-    columns, or, where it is long, under everything.
-    """
-
-    size: tuple[float, float]
-    panel: tuple[float, float]
-    column: float
-    across: np.ndarray
-    down: np.ndarray
-    bottom: float
-    legend_top: float
-    legend_columns: int
-
-    def place(self, row: int, column: int) -> tuple[float, float, float, float]:
-        wide, high = self.panel
-        return self.across[column] - wide / 2, self.down[row] - high / 2, wide, high
-
-
-def _lay_out(grid: Grid, rows: int, names: Sequence[str]) -> _Sheet:
-    ratio, columns = grid.height / grid.width, len(TITLES)
-    widest = (PAGE_WIDTH_IN - _LEFT - _RIGHT + _GAP) / columns - _GAP
-    high = min(widest * ratio, 2.0, max((_PAGE - _TOP - 1.1) / rows - _GAP, 0.8))
-    column, row = max(high / ratio, 0.95), max(high, 0.5)
-    bottom = _TOP + rows * (row + _GAP) - _GAP
-    width = _LEFT + columns * (column + _GAP) - _GAP + _RIGHT
-    entry = 0.28 + _LETTER * max(map(len, names))
-    narrow, broad = (max(1, int(room / entry)) for room in (2 * column + _GAP, width - _LEFT))
-    beneath = len(names) > 6 * narrow
-    legend_columns, legend_top = (broad, bottom + _FOOT) if beneath else (narrow, bottom + 0.34)
-    lowest = max(bottom + _FOOT, legend_top + _LINE * -(-len(names) // legend_columns) + 0.03)
-    return _Sheet(
-        size=(width, lowest),
-        panel=(high / ratio, high),
-        column=column,
-        across=_LEFT + column / 2 + np.arange(columns) * (column + _GAP),
-        down=_TOP + row / 2 + np.arange(rows) * (row + _GAP),
-        bottom=bottom,
-        legend_top=legend_top,
-        legend_columns=legend_columns,
-    )
-
-
-def _scales(relief_m: float, colours: np.ndarray) -> dict[str, dict[str, Any]]:
-    """How each field is drawn: keywords of `imshow`."""
-    return {
-        "rgb": {},
-        "class_id": {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5},
-        "elevation_m": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
-        "slope_deg": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
-        "traversability": {
-            "cmap": matplotlib.colormaps["viridis"].with_extremes(bad=LACKING), "vmin": 0, "vmax": 1
-        },
-    }  # fmt: skip
 
 
 def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: float) -> np.ndarray:
@@ -328,58 +389,3 @@ def _draw_soft_ground(
     if not soft.all():
         panel.contour(x, y, member, levels=[0.5], colors="white", linewidths=2.5 * line)
         panel.contour(x, y, member, levels=[0.5], colors="black", linewidths=line)
-
-
-def _tick(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
-    for axis, inches in zip((panel.xaxis, panel.yaxis), size, strict=True):
-        # A tick at the very end is left out, as its number would touch the next panel's first.
-        bins = int(np.clip(inches / 0.2, 1, 4))
-        axis.set_major_locator(MaxNLocator(bins, steps=[1, 2, 5, 10], prune="upper"))
-    thin_ticks(panel, labelleft=left, labelbottom=bottom)
-
-
-def _draw_bars(figure: Figure, sheet: _Sheet, levels: np.ndarray) -> None:
-    drawn = {str(panel.get_label()): panel.images[0] for panel in figure.axes}
-    # Neither the colour image nor the classes have numbers to read off.
-    for field, middle in list(zip(TITLES, sheet.across, strict=True))[2:]:
-        wide = sheet.column - 0.12
-        bar = add_axes(figure, (middle - wide / 2, sheet.bottom + 0.44, wide, 0.07), f"{field} bar")
-        extend = "max" if field == "slope_deg" else "neither"
-        drawn_bar = figure.colorbar(drawn[f"{field} 0"], cax=bar, orientation="horizontal", extend=extend)
-        drawn_bar.outline.set_linewidth(0.5)
-        bar.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-        bar.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
-        if field == "elevation_m":
-            bar.vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
-            label = f"above the lowest point,\ncontours every {levels[1]:g} m"
-            bar.set_xlabel(label, size=TEXT, labelpad=1.5, linespacing=1.1)
-
-
-def _extra_marks(lacking: bool, soft: bool) -> list[Artist]:
-    """Entries of the legend for what few maps show."""
-    marks: list[Artist] = []
-    if lacking:
-        marks.append(Patch(facecolor=LACKING, label="not known"))
-    if soft:
-        marks.append(Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label="may hide soft spots"))
-    return marks
-
-
-def _draw_legends(
-    figure: Figure, sheet: _Sheet, names: Sequence[str], colours: np.ndarray, extra: Sequence[Artist]
-) -> None:
-    """Explains the marks over the panels, and the classes under the first two columns."""
-    marks: list[Artist] = [Line2D([], [], label=name, **style) for name, style in _MARKS.items()]
-    marks += extra
-    classes = [Patch(facecolor=c, ec="0.3", lw=0.4, label=n) for c, n in zip(colours, names, strict=True)]
-    style: dict[str, Any] = {
-        "fontsize": TEXT, "frameon": False, "borderpad": 0, "borderaxespad": 0, "handlelength": 1.1,
-        "handletextpad": 0.4, "columnspacing": 1, "labelspacing": 0.3, "bbox_transform": figure.transFigure,
-    }  # fmt: skip
-    right, below = 1 - _RIGHT / sheet.size[0], 1 - sheet.legend_top / sheet.size[1]
-    corner = (right, 1 - 0.06 / sheet.size[1])
-    figure.legend(handles=marks, loc="upper right", bbox_to_anchor=corner, ncols=len(marks), **style)
-    corner, columns = (_LEFT / sheet.size[0], below), sheet.legend_columns
-    legend = figure.legend(handles=classes, loc="upper left", bbox_to_anchor=corner, ncols=columns, **style)
-    for text in legend.get_texts():
-        text.set_parse_math(False)

@@ -5,15 +5,13 @@ import json
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.options import dataclass_in, list_options, plain
 from benchnav.core.registry import Option
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from benchnav.core.tables import Table, print_table
 
 TITLES = {
     "planner": "planners",
@@ -27,8 +25,6 @@ HELP = (
     "More by package.module:Name and path/to/file.py:Name. NAME:VALUE sets the first option, "
     "{part: NAME, label: LABEL, options: {...}} any."
 )
-
-_WIDEST_OPTION = 56  # that is not broken, at 100 columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +60,10 @@ def print_catalogue(*kinds: str) -> None:
     if not sys.stdout.isatty():
         print("\n".join(line for kind in chosen for line in plain_lines(kind)))
         return
-    from rich.console import Console
-
-    console = Console()
     for kind in chosen:
-        console.print(make_table(kind))
-    console.print(HELP, markup=False, highlight=False)
+        print_table(make_table(kind))
+        print()
+    print(HELP)
 
 
 def list_entries(kind: str) -> list[Entry]:
@@ -89,27 +83,15 @@ def plain_lines(kind: str) -> list[str]:
     return lines
 
 
-def make_table(kind: str) -> "Table":
-    """The catalogue of a kind as a table for a terminal."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
+def make_table(kind: str) -> Table:
+    """The catalogue of a kind as a table."""
     entries = list_entries(kind)
-    widest = max((len(option) for entry in entries for option in entry.options), default=0)
-    table = Table(
-        title=Text(TITLES[kind]),
-        title_justify="left",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
+    return Table(
+        title=TITLES[kind],
+        headings=("name", "purpose", "options"),
+        rows=tuple((entry.name, entry.purpose, "\n".join(entry.options)) for entry in entries),
+        bold=frozenset((place, 0) for place in range(len(entries))),
     )
-    table.add_column("name", no_wrap=True, style="bold")
-    table.add_column("purpose", min_width=20)
-    table.add_column("options", overflow="fold", no_wrap=widest <= _WIDEST_OPTION)
-    for entry in entries:
-        table.add_row(Text(entry.name), Text(entry.purpose), Text("\n".join(entry.options)))
-    return table
 
 
 def _describe(kind: str, name: str) -> Entry:

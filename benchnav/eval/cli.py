@@ -174,7 +174,8 @@ def compare(
         out: Path without a suffix; .csv, .md and .tex are written there.
     """
     from benchnav.core.errors import ConfigError
-    from benchnav.eval.compare import compare_runs, print_comparison, write_comparison
+    from benchnav.core.tables import print_table
+    from benchnav.eval.compare import compare_runs, write_comparison
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
         raise ConfigError(f"Expected `out` as the path of files without a suffix, got the folder {out}.")
@@ -185,7 +186,7 @@ def compare(
     asked = {name: label for name, label in labels.items() if label}
     runs = [Path(folder) for folder in folders]
     table, shown = compare_runs(runs, by, against, asked, points / 100, allow_different == "code")
-    print_comparison(shown)
+    print_table(shown)
     if out:
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
 

@@ -1,8 +1,6 @@
 """Compares conditions of one run or several: reads them, refuses what else differs, and writes the table."""
 
 import json
-import shutil
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -15,13 +13,12 @@ import pandas as pd
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import write_text
+from benchnav.core.tables import Table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
 from benchnav.eval.folder.provenance import code_differences
 from benchnav.eval.folder.sameness import differences
 from benchnav.eval.report.comparison import comparison_table
-from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
-from benchnav.eval.report.tables import ResultTable
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import (
     DRAW,
@@ -47,7 +44,7 @@ def compare_runs(
     asked: Mapping[str, str],
     difference: float,
     allow_different_code: bool = False,
-) -> tuple[pd.DataFrame, ResultTable]:
+) -> tuple[pd.DataFrame, Table]:
     """Compares the conditions of runs pair by pair.
 
     Args:
@@ -89,14 +86,14 @@ def compare_runs(
     table = compare(pairs, difference).assign(
         different_code=["; ".join(_in_words(found)) for found in unlike]
     )
-    shown = comparison_table(table, difference)
+    shown = comparison_table(table, difference, by)
     notes = (*_about(pairs, table), *_left_out(pairs), *_no_partner(conditions, pairs), *shown.notes)
     notes += tuple(f"Different code: {line}." for line in lines)
     notes += tuple(dict.fromkeys(line for run in runs for line in caveats(run.about)))
-    return table, ResultTable(headings=shown.headings, labels=shown.labels, rows=shown.rows, notes=notes)
+    return table, replace(shown, notes=notes)
 
 
-def write_comparison(stem: Path, table: pd.DataFrame, shown: ResultTable) -> list[Path]:
+def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path]:
     """Writes a comparison as CSV, with all its numbers, Markdown and LaTeX.
 
     Args:
@@ -110,19 +107,12 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: ResultTable) -> lis
     texts = {
         ".csv": table.to_csv(index=False, float_format="%.6g"),
         ".md": to_markdown(shown),
-        ".tex": to_latex(shown, _CAPTION, stem.name),
+        ".tex": to_latex([shown], _CAPTION, stem.name),
     }
     paths = [stem.with_name(stem.name + suffix) for suffix in texts]
     for path, text in zip(paths, texts.values(), strict=True):
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
     return paths
-
-
-def print_comparison(shown: ResultTable) -> None:
-    """Prints the table as wide as the terminal, or unbroken where none is."""
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-    print(to_terminal(shown, width).rstrip())
 
 
 def read_conditions(runs: Sequence[Run]) -> list[Compared]:

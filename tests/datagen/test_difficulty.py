@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 
 from benchnav.core.grid import Grid
+from benchnav.core.tables import to_terminal
 from benchnav.datagen import difficulty
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
@@ -119,25 +119,26 @@ def test_a_split_is_measured_in_pieces(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_the_table_fits_a_terminal_and_names_every_split(tmp_path: Path) -> None:
     dataset = TerrainDataset(tiny_dataset(tmp_path / "d.h5", small_stakes()))
-    console = Console(width=80, record=True)
-    console.print(difficulty.table(dataset))
-    lines = console.export_text().splitlines()
+    lines = to_terminal(replace(difficulty.table(dataset), notes=()), width=80).splitlines()
     assert "λ_stuck 0.1" in lines[0]
-    train, hg = (next(line.split() for line in lines if f" {name} " in line) for name in ("train", "test/hg"))
+    train, hg = (
+        next(line.split() for line in lines if line.startswith(f"{name} ")) for name in ("train", "test/hg")
+    )
     found = difficulty.of_split(dataset, "test/hg")
     times = found.reference_times_s
     assert hg == [
         "test/hg", f"{100 * found.stuck:.1f}", f"{100 * found.soft_ground:.1f}", f"{100 * found.soft_spots:.1f}",
         f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}", f"{found.straight}/3",
     ]  # fmt: skip
-    assert train[4:6] == ["-", "-"]
+    assert train[4:6] == ["–", "–"]
     assert not any("…" in line for line in lines)
 
 
 def test_every_column_is_explained_in_one_line(tmp_path: Path) -> None:
     dataset = TerrainDataset(tiny_dataset(tmp_path / "d.h5", small_stakes()))
-    explained = [line.strip().partition(": ") for line in difficulty.explain(dataset)]
-    columns = [str(column.header).replace("\n", " ") for column in difficulty.table(dataset).columns]
+    table = difficulty.table(dataset)
+    explained = [line.strip().partition(": ") for line in table.notes]
+    columns = [heading.replace("\n", " ") for heading in table.headings]
     headings = list(dict.fromkeys(column.partition(",")[0] for column in columns[1:]))
     assert sorted(heading for heading, _, _ in explained) == sorted(headings)
     assert all(sentence.endswith(".") and "\n" not in sentence for _, _, sentence in explained)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.figures import TWO_COLUMNS_IN
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import (
     TITLES,
@@ -163,7 +164,7 @@ def test_tables_of_any_size_have_colours(count: int) -> None:
 def test_texts_are_legible(dataset: TerrainDataset, indices: list[int]) -> None:
     figure = preview_figure(dataset, "train", indices)
     check_texts(figure)
-    assert figure.get_figwidth() == pytest.approx(7.2) if len(indices) < 5 else figure.get_figheight() < 9.7
+    assert figure.get_figwidth() == pytest.approx(TWO_COLUMNS_IN) if len(indices) < 5 else figure.get_figheight() < 9.7
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 16), (12, 96), (48, 12), (20, 30)])

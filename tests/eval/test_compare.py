@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.tables import latex
 from benchnav.eval import cli
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.rendering import latex
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, find_pairs
 from tests.eval.forged import code_with, forge_run

@@ -5,9 +5,8 @@ from dataclasses import asdict
 from typing import Any
 
 from rich.filesize import decimal
-from rich.markup import escape
-from rich.table import Table
 
+from benchnav.core.tables import Table
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, open_file
 
@@ -75,18 +74,21 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
         f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
     )
     yield _making(described)
-    splits = Table("split", "scenario", "maps", "MB", "truth of λ", "made from", title="splits")
-    for name, entry in described["splits"].items():
-        origin = ", ".join(_origin(described, part) for part in entry["parts"])
-        splits.add_row(
-            name,
-            entry["scenario"],
-            str(entry["maps"]),
-            f"{entry['stored_bytes'] / 1e6:.1f}",
-            entry["truth"],
-            origin,
-        )
-    yield splits
+    yield Table(
+        title="splits",
+        headings=("split", "scenario", "maps", "MB", "truth of λ", "made from"),
+        rows=tuple(
+            (
+                name,
+                entry["scenario"],
+                str(entry["maps"]),
+                f"{entry['stored_bytes'] / 1e6:.1f}",
+                entry["truth"],
+                ", ".join(_origin(described, part) for part in entry["parts"]),
+            )
+            for name, entry in described["splits"].items()
+        ),
+    )
     extra = [name for name in described["fields"] if name not in schema.FIELDS]
     if extra:
         yield f"fields beside those of every dataset: {', '.join(extra)}"
@@ -94,17 +96,16 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
         yield title
         yield from (f"  {name:12} {entry[key]}" for name, entry in described["splits"].items())
     soft = any(item["soft"] for item in described["classes"])
-    heads = ["id", "class", "colour", "a", "b", "o", "σ"]
-    if soft:
-        heads.append("soft spots")
-    classes = Table(*heads, title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)")
+    rows = []
     for number, item in enumerate(described["classes"]):
         colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
-        if soft:
-            numbers.append(_soft_spots(item["soft"]))
-        classes.add_row(str(number), escape(item["name"]), f"[on {colour}]  [/] {colour}", *numbers)
-    yield classes
+        rows.append((str(number), item["name"], colour, *numbers, *[_soft_spots(item["soft"])] * soft))
+    yield Table(
+        title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)",
+        headings=("id", "class", "colour", "a", "b", "o", "σ", *["soft spots"] * soft),
+        rows=tuple(rows),
+    )
 
 
 def _making(described: dict[str, Any]) -> str:

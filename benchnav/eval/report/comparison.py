@@ -3,84 +3,63 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
+from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.report.tables import ResultTable
+from benchnav.eval.report.words import count_range, differ, p_value, short, signed, signed_interval
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
 
 _LABELS = (*LABELS, "run")
 
 
-def comparison_table(table: pd.DataFrame, difference: float) -> ResultTable:
+def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
     """Formats a comparison: success in percentage points, times in seconds, p after Holm's correction.
 
     Args:
         table: from `comparison.compare`.
         difference: of success, that `maps_needed` is for.
+        by: in what the conditions of a pair differ.
     """
-    shown = [name for name in _LABELS if name in table and _differs(table[name])]
+    shown = [name for name in _LABELS if name in table and differ(table[name])]
     counts = ["n_maps"] if table["n_maps"].nunique() > 1 else []
     unit = "% of T" if "time_difference_share" in table else "s"
     headings = (
-        *shown,
-        "",
-        "against",
+        *(*shown, by, "against"),
         *("maps" for _ in counts),
-        "Succ. [%]",
-        "Δ [points]",
-        "95 %",
-        "p",
-        "significant",
-        "detectable",
-        f"Δ T_total [{unit}]",
-        "95 %",
-        "p (ranks)",
-        "Δ T if both arrive [s]",
-        "95 %",
-        "on maps",
+        *("Succ. [%]", "Δ [points]", "95 %", "p", "significant", "detectable"),
+        *(f"Δ T_total [{unit}]", "95 %", "p (ranks)"),
+        *("Δ T if both arrive [s]", "95 %", "on maps"),
     )
-    rows = [
-        (
-            *(row[name] for name in shown),
-            row["one"],
-            row["other"],
-            *(str(row[name]) for name in counts),
-            *_results(row),
-        )
-        for row in table.to_dict("records")
-    ]
-    return ResultTable(
-        headings=headings, labels=len(shown) + 2, rows=tuple(rows), notes=_notes(table, difference)
-    )
+    rows = []
+    for row in table.to_dict("records"):
+        labels = [row[name] for name in (*shown, "one", "other")]
+        rows.append((*labels, *(str(row[name]) for name in counts), *_results(row)))
+    return Table(headings=headings, labels=len(shown) + 2, rows=tuple(rows), notes=_notes(table, difference))
 
 
 def _results(row: Mapping[Any, Any]) -> tuple[str, ...]:
     names = [f"time_{value}_share" for value in ("difference", "low", "high")]
     late = [100 * row[name] if name in row else row[f"{name.removesuffix('share')}s"] for name in names]
     return (
-        f"{_short(100 * row['success_one'])} : {_short(100 * row['success_other'])}",
-        _signed(100 * row["success_difference"]),
-        _range(100 * row["success_low"], 100 * row["success_high"]),
-        _p(row["success_p_holm"]),
+        f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
+        signed(100 * row["success_difference"]),
+        signed_interval(100 * row["success_low"], 100 * row["success_high"]),
+        p_value(row["success_p_holm"]),
         "yes" if row["success_p_holm"] < ALPHA else "no",
         f"{100 * row['success_detectable']:.0f}" if row["success_detectable"] <= 1 else NOT_USED,
-        _signed(late[0]),
-        _range(*late[1:]),
-        _p(row["time_p_holm"]),
-        _signed(row["arrival_time_difference_s"]),
-        _range(row["arrival_time_low_s"], row["arrival_time_high_s"]),
+        signed(late[0]),
+        signed_interval(*late[1:]),
+        p_value(row["time_p_holm"]),
+        signed(row["arrival_time_difference_s"]),
+        signed_interval(row["arrival_time_low_s"], row["arrival_time_high_s"]),
         str(row["arrival_time_n_maps"]),
     )
 
 
 def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
     pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
-    points = f"{100 * difference:g} points"
-    needed = table["maps_needed"]
-    maps = f"{needed.min()}" if needed.nunique() == 1 else f"{needed.min()} to {needed.max()}"
     share = (
         " T differs between conditions, so that T_total and its difference are in shares of each condition's own T."
         if "time_difference_share" in table
@@ -97,25 +76,5 @@ def _notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
         f"where there are fewer than {LEAST_MAPS} maps.",
         "detectable: minimum detectable difference of success [points], at a power of 80 %; "
         "a dash where they are too few to show any. "
-        f"A difference of {points} needs {maps} maps.",
+        f"A difference of {100 * difference:g} points needs {count_range(table['maps_needed'])} maps.",
     )
-
-
-def _differs(labels: pd.Series) -> bool:
-    return labels[labels != NOT_USED].nunique() > 1
-
-
-def _short(value: float) -> str:
-    return f"{value:.1f}".removesuffix(".0")
-
-
-def _signed(value: float) -> str:
-    return NOT_USED if np.isnan(value) else f"{round(value, 1) + 0.0:+.1f}"  # no minus before a zero
-
-
-def _range(low: float, high: float) -> str:
-    return NOT_USED if np.isnan(low) else f"{_signed(low)} to {_signed(high)}"
-
-
-def _p(value: float) -> str:
-    return "< 0.0001" if value < 1e-4 else f"{value:.2g}"

@@ -1,6 +1,6 @@
 """Which failures the sheets show: of each block those of the best setting and those of the worst."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,17 +9,36 @@ import pandas as pd
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.charts.failure_sheet import FailedGround, Shown, choose
-from benchnav.eval.report.charts.panels import blocks, several_models
+from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.failures import steps_of
-from benchnav.eval.report.figure_style import condition_name
+from benchnav.eval.report.words import blocks, condition_name, several_models
 from benchnav.eval.stats.best import competing
 
 GroundOf = Callable[[pd.DataFrame], FailedGround]
 
+ACROSS = 4  # failures of a condition that are shown
 _MOST_BLOCKS = 6
 # Failures of one condition whose ground is predicted again.
 _MOST_FAILURES = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailedLine:
+    """A line of a sheet: failures of one condition.
+
+    Args:
+        name: of the condition.
+        failures: rows of `failures.failures_table`, at most `ACROSS`.
+        ground: of these.
+        tracks: driven positions of each, shape [steps, 2].
+        among: number of failures that these were chosen of.
+    """
+
+    name: str
+    failures: pd.DataFrame
+    ground: FailedGround
+    tracks: Sequence[np.ndarray]
+    among: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +51,7 @@ class Sheets:
         left_out: why sheets are missing; empty where none is, or nothing failed.
     """
 
-    shown: tuple[tuple[str, tuple[Shown, ...]], ...]
+    shown: tuple[tuple[str, tuple[FailedLine, ...]], ...]
     told: dict[str, np.ndarray]
     left_out: str
 
@@ -91,15 +110,23 @@ def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
         yield {str(name): value for name, value in row.items()}
 
 
-def _line(folder: Path, name: str, failures: pd.DataFrame, ground: FailedGround, among: int) -> Shown:
-    chosen = choose(failures)
+def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:
+    """Chooses failures to be shown: each outcome once before any twice, the most frequent outcome first."""
+    placed = failures[failures["x_m"].notna()]
+    turn = placed.groupby("outcome", sort=False).cumcount()
+    often = -placed.groupby("outcome")["outcome"].transform("size")
+    return placed.assign(turn=turn, often=often).sort_values(["turn", "often"], kind="stable").head(ACROSS)
+
+
+def _line(folder: Path, name: str, failures: pd.DataFrame, ground: FailedGround, among: int) -> FailedLine:
+    chosen = choose_failures(failures)
     steps = steps_of(folder, [chosen["condition"].iloc[0]])
     tracks = []
     for row in chosen.to_dict("records"):
         own = np.logical_and.reduce([steps[key] == row[key] for key in ("seed", "realisation", "map")])
         tracks.append(steps.loc[own, ["x_m", "y_m"]].to_numpy())
     places = chosen.index.to_numpy()
-    return Shown(
+    return FailedLine(
         name=name,
         failures=chosen.reset_index(drop=True),
         ground=FailedGround(

@@ -7,9 +7,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.report.charts.panels import blocks, several_models
-from benchnav.eval.report.figure_style import condition_name
-from benchnav.eval.report.tables import rate_in_words
+from benchnav.eval.report.words import (
+    blocks,
+    condition_name,
+    outcome_in_words,
+    p_in_words,
+    rate_in_words,
+    several_models,
+)
 from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.planning.world.outcome import FAILURES
@@ -47,11 +52,6 @@ def findings(
         Finding(title=title, sentences=tuple(_sentences(block, names, failures, told or {})))
         for title, block in blocks(summary)
     ]
-
-
-def p_in_words(p: float) -> str:
-    """Writes a p-value; of drawn sign flips the least there can be is 0.0001."""
-    return "p ≤ 0.0001" if p <= 1e-4 else f"p = {p:.2g}"
 
 
 def _sentences(
@@ -157,5 +157,5 @@ def _shares(outcomes: pd.Series) -> str:
     words = []
     for name, count in counted.items():
         share = f"{100 * count / total:.0f}" if count / total >= 0.005 else "< 1"
-        words.append(f"{count} {str(name).removesuffix('_count').replace('_', ' ')} ({share} %)")
+        words.append(f"{count} {outcome_in_words(str(name).removesuffix('_count'))} ({share} %)")
     return ", ".join(words)

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.findings import Finding, p_in_words
-from benchnav.eval.report.tables import ResultTable
+from benchnav.eval.report.findings import Finding
+from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
 
@@ -40,43 +41,36 @@ def hypothesis_finding(tests: pd.DataFrame, about: Mapping[str, Any], grouped: b
     )
 
 
-def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> ResultTable:
+def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> Table:
     """Formats the tests, a row a hypothesis; bold where it is supported.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
         grouped: the unit is a group of maps.
     """
-    headings = (
-        "",
-        "hypothesis",
-        "groups" if grouped else "maps",
-        "values",
-        "difference",
-        "interval",
-        "p",
-        "result",
-    )
-    rows = []
-    for number, row in enumerate(tests.to_dict("records"), start=1):
-        p = p_in_words(row["p_holm"]).removeprefix("p ").removeprefix("= ")
-        values = f"{_short(row['mean_one'])} : {_short(row['mean_other'])}"
-        cells = (
+    unit = "group" if grouped else "map"
+    headings = ("", "hypothesis", f"{unit}s", "values", "difference", "interval", "p", "result")
+    rows = tuple(
+        (
+            str(number),
+            row["claim"],
             str(row["n_maps"]),
-            values,
-            _with_unit(row["difference"], row["unit"]),
-            _range(row),
-            p,
+            f"{_value(row['mean_one'])} : {_value(row['mean_other'])}",
+            _with_unit(row),
+            _interval(row),
+            p_value(row["p_holm"]),
             _verdict(row),
         )
-        rows.append((str(number), row["claim"], *cells))
-    used = [_TESTS[kind] for kind in _TESTS if (tests["kind"] == kind).any()]
+        for number, row in enumerate(tests.to_dict("records"), start=1)
+    )
+    used = "; ".join(words for kind, words in _TESTS.items() if (tests["kind"] == kind).any())
+    family = "1 hypothesis" if len(tests) == 1 else f"{len(tests)} hypotheses"
     notes = [
-        f"Tests: {'; '.join(used).format(unit=headings[2].removesuffix('s'))}. p is after Holm's correction over "
-        f"{_count(len(tests))}; supported where it is under {ALPHA}.",
+        f"Tests: {used.format(unit=unit)}. p is after Holm's correction over {family}; supported where it is under "
+        f"{ALPHA}.",
         "Intervals are of one difference alone: 95 % of a difference, and 90 % where a margin is tested, whose end "
         "beyond the margin decides the test before the correction. "
-        f"Under {LEAST_MAPS} {headings[2]} success alone has one.",
+        f"Under {LEAST_MAPS} {unit}s success alone has one.",
     ]
     if ((tests["metric"] == "T_total") & (tests["kind"] == "difference")).any():
         notes.append(
@@ -86,10 +80,10 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> ResultTable:
     if (tests["metric"] == "path_length").any():
         notes.append("Path length: of the episodes in which both arrived.")
     bold = frozenset((place, 7) for place, supported in enumerate(tests["supported"]) if supported)
-    note = "supported." if bold else ""
-    return ResultTable(
-        headings=headings, labels=2, rows=tuple(rows), notes=tuple(notes), bold=bold, bold_note=note
-    )
+    return Table(
+        headings=headings, labels=2, rows=rows, notes=tuple(notes), bold=bold,
+        bold_note="supported." if bold else "",
+    )  # fmt: skip
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
@@ -107,10 +101,10 @@ def _verdict(row: Mapping[Any, Any]) -> str:
 
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:
-    words = [f"difference {_with_unit(row['difference'], row['unit'])}"]
-    if (ends := _range(row)) != NOT_USED:
+    words = [f"difference {_with_unit(row)}"]
+    if (ends := _interval(row)) != NOT_USED:
         words.append(f"interval {ends}")
-    return ", ".join([*words, f"{p_in_words(row['p_holm'])}, {row['n_maps']} {unit}s"])
+    return ", ".join([*words, p_in_words(row["p_holm"]), f"{row['n_maps']} {unit}s"])
 
 
 def _extended(about: Mapping[str, Any]) -> list[str]:
@@ -123,39 +117,30 @@ def _extended(about: Mapping[str, Any]) -> list[str]:
     if now == planned:
         return []
     return [
-        f"They were fixed for {_span(planned.values())} episodes of a condition; the run was extended to "
-        f"{_span(now.values())} later, so that their p-values hold only if that was planned."
+        f"They were fixed for {count_range(planned.values())} episodes of a condition; the run was extended to "
+        f"{count_range(now.values())} later, so that their p-values hold only if that was planned."
     ]
 
 
-def _span(counts: Any) -> str:
-    least, most = min(counts), max(counts)
-    return f"{least}" if least == most else f"{least} to {most}"
-
-
-def _range(row: Mapping[Any, Any]) -> str:
+def _interval(row: Mapping[Any, Any]) -> str:
     suffix, words = _INTERVALS[row["kind"]]
     low, high = row[f"low{suffix}"], row[f"high{suffix}"]
     return NOT_USED if np.isnan(low) else f"{_signed(low)} to {_signed(high)} ({words})"
 
 
-def _with_unit(value: float, unit: str) -> str:
-    return NOT_USED if np.isnan(value) else f"{_signed(value)} {unit}".rstrip()
+def _with_unit(row: Mapping[Any, Any]) -> str:
+    value = row["difference"]
+    return NOT_USED if np.isnan(value) else f"{_signed(value)} {row['unit']}".rstrip()
 
 
 def _signed(value: float) -> str:
-    digits = 1 if abs(value) >= 0.95 else 2
-    return f"{round(value, digits) + 0.0:+.{digits}f}"  # no minus before a zero
+    return signed(value, 1 if abs(value) >= 0.95 else 2)
 
 
-def _short(value: float) -> str:
+def _value(value: float) -> str:
     return NOT_USED if np.isnan(value) else f"{value:.3g}"
 
 
 def _capital(text: str) -> str:
     # Symbols such as λ̄ stay as they are.
     return text[0].upper() + text[1:] if text.startswith(("success", "score", "path")) else text
-
-
-def _count(tests: int) -> str:
-    return "1 hypothesis" if tests == 1 else f"{tests} hypotheses"

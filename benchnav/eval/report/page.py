@@ -10,8 +10,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import benchnav
+from benchnav.core.tables import Table
 from benchnav.eval.report.findings import Finding
-from benchnav.eval.report.tables import ResultTable
 
 # Of a figure's own pixels; fine enough for screens of twice the density.
 _SCREEN = 0.6
@@ -35,7 +35,7 @@ def write_page(
     header: Sequence[str],
     warnings: Sequence[str],
     findings: Sequence[Finding],
-    table: ResultTable,
+    table: Table,
     figures: Sequence[Drawn],
     about: Mapping[str, Any],
 ) -> str:

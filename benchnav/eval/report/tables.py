@@ -1,17 +1,31 @@
-"""The table of a run: a row a condition, as the paper's Table I formats it, with notes under it."""
+"""The tables of a run: a row a condition, and, for a paper, settings down and scenarios across.
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+Source of both: Endo, Honda and Ishigami (2024), Table I.
+"""
+
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from benchnav.core.figures import planner_name
+from benchnav.core.tables import Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
+from benchnav.eval.report.words import (
+    blocks,
+    count_range,
+    differ,
+    failures_in_words,
+    maps_in_words,
+    mean_and_std,
+    rate_in_words,
+    several_models,
+    success_interval_in_words,
+)
 from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.difference import LEAST_MAPS
-from benchnav.planning.world.outcome import FAILURES
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")
@@ -47,33 +61,13 @@ _COLUMNS = {
 }
 # Of the columns that not every run has, that of the summary which says so.
 _TIMES = {ALONE: "latency_median_ms", IN_BATCH: "planning_ms_median"}
+_RESULTS = ("Succ. [%]", "95 % interval", "T_total [s]", "T if success [s]", "λ̄ [%]")
+_PAPER = ("Succ. [%]", "T_total [s]", "λ̄ [%]")
+_MOST_ACROSS = 3
 _SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResultTable:
-    """A table as text, for any way of writing it.
-
-    Args:
-        headings: one a column, those of labels first.
-        labels: number of columns that are labels.
-        rows: a row a condition.
-        notes: what the raised numbers behind the planners' labels refer to, beginning with the number.
-        bold: cells (row, column) that are set in bold.
-        bold_note: what bold means.
-        explained: what columns hold, (heading, sentence).
-    """
-
-    headings: tuple[str, ...]
-    labels: int
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...]
-    bold: frozenset[tuple[int, int]] = frozenset()
-    bold_note: str = ""
-    explained: tuple[tuple[str, str], ...] = ()
-
-
-def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> ResultTable:
+def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> Table:
     """Formats a summary: rates and λ̄ in per cent; bold what is not significantly worse than the best.
 
     Columns of labels that are the same for all conditions are left out, but for scenario, planner and risk; so
@@ -83,69 +77,120 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
         summary: from `summary.summarise`, joined with `best.against_best` and perhaps with latencies.
         conditions: by id what `run.json` knows of them: `follows` and `remarks` become notes.
     """
-    shown = [name for name in LABELS if name in _ALWAYS or _differs(summary[name])]
-    grouped = is_grouped(summary)
+    labels = [name for name in LABELS if name in _ALWAYS or differ(summary[name])]
     counts = [
-        name for name in ("n_groups", "n_maps", "n_episodes")
-        if summary[name].nunique() > 1 and (grouped or name != "n_groups")
-    ]  # fmt: skip
+        name
+        for name in ("groups", "maps", "episodes")
+        if summary[f"n_{name}"].nunique() > 1 and (is_grouped(summary) or name != "groups")
+    ]
+    times = [heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()]
+    headings = (*labels, *counts, *_RESULTS, *times, "failures")
     marks, notes = _notes(summary, conditions)
-    headings = (
-        *shown,
-        *(name.removeprefix("n_") for name in counts),
-        "Succ. [%]",
-        "95 % interval",
-        "T_total [s]",
-        "T if success [s]",
-        "λ̄ [%]",
-        *(heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()),
-        "failures",
-    )
     rows = []
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
-        labels = [str(row[name]) + (mark if name == "planner" else "") for name in shown]
-        results = _results(row)
-        rows.append(
-            (*labels, *(str(row[name]) for name in counts), *(results[h] for h in headings if h in results))
-        )
+        cells = {name: str(row[name]) for name in labels} | {name: str(row[f"n_{name}"]) for name in counts}
+        cells |= {"planner": row["planner"] + mark, **_results(row)}
+        rows.append(tuple(cells[heading] for heading in headings))
     if any("¶" in cell for row in rows for cell in row):
         notes.append("¶ compiled planner: its time is that of compiled code.")
-    rate = headings.index("Succ. [%]")
-    marked = [place for place, value in enumerate(summary["best_marked"]) if value]
-    return ResultTable(
+    return Table(
         headings=headings,
-        labels=len(shown),
+        labels=len(labels),
         rows=tuple(rows),
         notes=tuple(notes),
-        bold=frozenset((place, rate) for place in marked),
-        bold_note=bold_note(summary) if marked else "",
+        bold=frozenset(
+            (place, headings.index(_RESULTS[0]))
+            for place, is_best in enumerate(summary["best_marked"])
+            if is_best
+        ),
+        bold_note=bold_note(summary),
         explained=tuple((heading, _COLUMNS[heading]) for heading in headings),
     )
 
 
+def paper_table(summary: pd.DataFrame, label: str) -> str:
+    """Writes a complete LaTeX table, settings down and blocks across, each with success, T_total and λ̄.
+
+    More than three blocks stand in several tabulars under each other.
+
+    Args:
+        summary: from `summary.summarise`, joined with `best.against_best`.
+        label: what the table is referred to by.
+    """
+    known = blocks(summary)
+    count = maps_in_words(*(count_range(summary[name]) for name in ("n_maps", "n_groups")))
+    note = f" Bold: {bold_note(summary)}" if bold_note(summary) else ""
+    caption = (
+        f"Planning results on {count} a scenario: success with its 95 % interval, T_total with a failure counted as "
+        f"T and mean traversability observed λ̄, mean ± standard deviation over episodes.{note}"
+    )
+    several = several_models(summary)
+    tables = [_across(known[i : i + _MOST_ACROSS], several) for i in range(0, len(known), _MOST_ACROSS)]
+    return to_latex(tables, caption, label, wide=len(known) > 1, size="footnotesize")
+
+
+def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -> Table:
+    """The table of some blocks, side by side; a label that is the same as over it is left out."""
+    labels = ["planner", *several, "risk"]
+    results = [
+        {tuple(row[name] for name in labels): row for row in rows.to_dict("records")} for _, rows in known
+    ]
+    settings = list(dict.fromkeys(setting for block in results for setting in block))
+    planners = list(dict.fromkeys(setting[0] for setting in settings))
+    rows, bold, rules = [], set(), set()
+    above: tuple[str, ...] = ()
+    for place, setting in enumerate(sorted(settings, key=lambda setting: planners.index(setting[0]))):
+        if above and setting[0] != above[0]:
+            rules.add(place)
+        cells = [planner_name(setting[0]), *setting[1:]]
+        for column in range(len(labels) - 1):
+            if setting[: column + 1] == above[: column + 1]:
+                cells[column] = ""
+        for block in results:
+            if setting in block and block[setting]["best_marked"]:
+                bold.add((place, len(cells)))
+            cells += _in_paper(block[setting]) if setting in block else [NOT_USED] * len(_PAPER)
+        rows.append(tuple(cells))
+        above = setting
+    return Table(
+        headings=(*(name.capitalize() for name in labels), *_PAPER * len(known)),
+        labels=len(labels),
+        rows=tuple(rows),
+        bold=frozenset(bold),
+        groups=tuple(title for title, _ in known),
+        rules=frozenset(rules),
+    )
+
+
+def _in_paper(row: Mapping[Any, Any]) -> list[str]:
+    return [
+        f"{rate_in_words(row)} ({success_interval_in_words(row)})",
+        mean_and_std(row["total_time_mean_s"], row["total_time_std_s"]),
+        mean_and_std(100 * row["traversability_mean"], 100 * row["traversability_std"]),
+    ]
+
+
 def bold_note(summary: pd.DataFrame) -> str:
-    """Says what bold means in a table of a run.
+    """Says what bold means in a table of a run; nothing where nothing is bold.
 
     Args:
         summary: as in `result_table`.
     """
-    words = ["not significantly worse than the highest success rate of its block"]
+    if not summary["best_marked"].any():
+        return ""
     by = "group" if is_grouped(summary) else "map"
-    words.append(
-        f"(max-T sign-flip test by {by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
-        "significantly worse none is marked"
+    words = (
+        "not significantly worse than the highest success rate of its block (max-T sign-flip test by "
+        f"{by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is significantly worse none is "
+        "marked"
     )
-    left_out = [
-        summary.loc[rows.index[~competing(rows)]]
-        for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)
-    ]
-    told = pd.concat(left_out).sort_values(
-        "privileged", key=lambda parts: parts.map(PRIVILEGED.index), kind="stable"
+    left_out = pd.concat(
+        [rows[~competing(rows)] for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)]
     )
-    if not told.empty:
-        out = ", ".join(dict.fromkeys(told["model"]))
-        words.append(f"; privileged models ({out}) do not compete")
-    return " ".join(words).replace(" ;", ";") + "."
+    models = dict.fromkeys(
+        model for part in PRIVILEGED for model in left_out.loc[left_out["privileged"] == part, "model"]
+    )
+    return f"{words}; privileged models ({', '.join(models)}) do not compete." if models else f"{words}."
 
 
 def is_grouped(summary: pd.DataFrame) -> bool:
@@ -153,40 +198,19 @@ def is_grouped(summary: pd.DataFrame) -> bool:
     return bool((summary["n_groups"] < summary["n_maps"]).any())
 
 
-def maps_in_words(maps: int | str, groups: int | str) -> str:
-    """Says how many maps there are, and in how many groups where they have such."""
-    return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"
-
-
-def rate_in_words(row: Mapping[Any, Any]) -> str:
-    """Writes a success rate in per cent, so that one failure of 200 does not read as none."""
-    return f"{100 * row['success_rate']:.1f}".removesuffix(".0")
-
-
-def failures_in_words(row: Mapping[Any, Any]) -> str:
-    """Says how a condition's failures ended, such as `2 stuck, 1 stalled`; a dash where there are none.
-
-    Args:
-        row: of the summary.
-    """
-    names = [outcome.name.lower() for outcome in FAILURES]
-    counts = {name.replace("_", " "): int(row[f"{name}_count"]) for name in names}
-    return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or NOT_USED
-
-
 def _results(row: Mapping[Any, Any]) -> dict[str, str]:
-    met = _spread(100 * row["traversability_mean"], 100 * row["traversability_std"])
+    met = mean_and_std(100 * row["traversability_mean"], 100 * row["traversability_std"])
     compiled = "¶" if row["compiled_share"] > 0 and not np.isnan(row["planning_ms_median"]) else ""
     # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the row.
     if 0 < row["traversability_n"] < row["n_episodes"]:
         met += f" (n = {row['traversability_n']})"
     return {
         "Succ. [%]": rate_in_words(row),
-        "95 % interval": f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}",
+        "95 % interval": success_interval_in_words(row),
         "T_total [s]": _with_interval(
             row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]
         ),
-        "T if success [s]": _spread(row["success_time_mean_s"], row["success_time_std_s"]),
+        "T if success [s]": mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
         "λ̄ [%]": met,
         ALONE: _times(*(row.get(f"latency_{name}", np.nan) for name in LATENCIES)),
         IN_BATCH: _times(row["planning_ms_median"], row["planning_ms_p95_median"]) + compiled,
@@ -208,17 +232,6 @@ def _times(middle: float, *others: float) -> str:
 
 def _with_interval(mean: float, low: float, high: float) -> str:
     return f"{mean:.1f}" if np.isnan(low) else f"{mean:.1f} ({low:.1f}–{high:.1f})"
-
-
-def _spread(mean: float, std: float) -> str:
-    if np.isnan(mean):
-        return NOT_USED
-    return f"{mean:.1f}" if np.isnan(std) else f"{mean:.1f} ± {std:.1f}"
-
-
-def _differs(labels: pd.Series) -> bool:
-    """Tells whether a column has something to say; a planner that uses none of it does not count."""
-    return labels[labels != NOT_USED].nunique() > 1
 
 
 def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:

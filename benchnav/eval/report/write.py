@@ -1,46 +1,41 @@
 """The report of a run: what it says, its table, where its rows come from, and its figures."""
 
-import shutil
-import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
+from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
+from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
-from benchnav.eval.report.charts.curves import curve_figure, sweep_name
-from benchnav.eval.report.charts.distributions import distribution_figure
-from benchnav.eval.report.charts.driven import write_driven
-from benchnav.eval.report.charts.failure_sheet import failure_sheet
-from benchnav.eval.report.charts.forest import forest_figure
-from benchnav.eval.report.charts.outcomes import outcome_figure
-from benchnav.eval.report.charts.success import success_figure
-from benchnav.eval.report.charts.sweeps import find_sweeps
-from benchnav.eval.report.charts.trajectories import choose, trajectory_figure
+from benchnav.eval.report.charts.conditions import (
+    distribution_figure,
+    forest_figure,
+    outcome_figure,
+    success_figure,
+)
+from benchnav.eval.report.charts.driven import read_driven
+from benchnav.eval.report.charts.maps import (
+    choose_snapshots,
+    driven_figure,
+    failure_figure,
+    trajectory_figure,
+)
+from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
 from benchnav.eval.report.failure_choice import GroundOf, Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
-from benchnav.eval.report.figure_style import STYLE, save
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.page import Drawn, write_page
-from benchnav.eval.report.paper_table import paper_table
 from benchnav.eval.report.recorded.recording import read_snapshots
-from benchnav.eval.report.rendering import markdown, to_latex, to_markdown, to_terminal
-from benchnav.eval.report.tables import (
-    LATENCIES,
-    NOT_USED,
-    ResultTable,
-    is_grouped,
-    maps_in_words,
-    result_table,
-)
+from benchnav.eval.report.tables import LATENCIES, is_grouped, paper_table, result_table
+from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
@@ -65,6 +60,7 @@ _FAILURES = (
 )
 _TRAJECTORIES = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
 _TO_THE_END = "Below, the whole driven path on λ as it was."
+_MOST_PATHS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +82,7 @@ class Report:
 
     header: tuple[str, ...]
     findings: tuple[Finding, ...]
-    table: ResultTable
+    table: Table
     warnings: tuple[str, ...]
     summary: pd.DataFrame
     tests: pd.DataFrame
@@ -153,8 +149,16 @@ def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | No
     if not report.tests.empty:
         write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
         shown = hypothesis_table(report.tests, is_grouped(report.summary))
-        write_text(out / "hypotheses.tex", to_latex(shown, _HYPOTHESES, f"{name}-hypotheses"))
-    figures = [*_charts(out, report), *_trajectories(folder, out, report.summary), *_driven(folder, out)]
+        write_text(out / "hypotheses.tex", to_latex([shown], _HYPOTHESES, f"{name}-hypotheses"))
+    figures = []
+    for figure_name, caption, draw, trim in (
+        *_charts(report),
+        *_trajectories(folder, report.summary),
+        *_driven(folder),
+    ):
+        path = out / "figures" / f"{figure_name}.png"
+        save_twice(draw(), path, trim)
+        figures.append(Drawn(path=path, caption=caption))
     write_text(out / "summary.md", _as_markdown(report, figures))
     page = write_page(
         name, report.header, report.warnings, report.findings, report.table, figures, report.about
@@ -165,11 +169,10 @@ def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | No
 
 def print_report(report: Report) -> None:
     """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
-    is_terminal = sys.stdout.isatty()
-    width = shutil.get_terminal_size().columns if is_terminal else None
-    table = to_terminal(report.table, width, styled=is_terminal).rstrip()
+    print("\n".join(report.header))
+    print_table(report.table)
     said = [line for finding in report.findings for line in (f"{finding.title}:", *finding.sentences)]
-    print("\n".join([*report.header, table, *report.warnings, *said]))
+    print("\n".join([*report.warnings, *said]))
 
 
 def _findings(
@@ -182,53 +185,64 @@ def _findings(
     return (hypothesis_finding(tests, about, grouped), *rest)
 
 
-def _charts(out: Path, report: Report) -> list[Drawn]:
-    """Draws the figures at the width of a column."""
+# Name, caption, what draws it, and whether its white borders are cut away.
+ToDraw = tuple[str, str, Callable[[], Figure], bool]
+
+
+def _charts(report: Report) -> Iterator[ToDraw]:
+    """The figures at the width of a column or a page."""
     summary = report.summary
     marked = set(summary.loc[summary["best_marked"], "condition"])
-    made: list[tuple[str, str, Callable[[], Figure]]] = []
     if not report.tests.empty:
-        made.append(("forest", _FOREST, partial(forest_figure, report.tests)))
-    made.append(("success", _SUCCESS, partial(success_figure, summary, marked)))
+        yield "forest", _FOREST, partial(forest_figure, report.tests), False
+    yield "success", _SUCCESS, partial(success_figure, summary, marked), False
     sweeps = find_sweeps(report.about["conditions"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
     for sweep in sweeps:
         short = sweep_name(sweep.number)
         name = short if names[short] == 1 else sweep.number.replace(".", "-")
-        made.append((f"over-{name}", _SWEEP.format(name), partial(curve_figure, sweep, summary)))
-    made.append(("outcomes", _OUTCOMES, partial(outcome_figure, summary)))
-    made.append(("distributions", _DISTRIBUTIONS, partial(distribution_figure, summary, report.episodes)))
-    for place, (title, lines) in enumerate(report.sheets.shown):
-        name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place + 1}"
-        made.append((name, _FAILURES.format(title), partial(failure_sheet, lines)))
-    drawn = []
-    with matplotlib.rc_context(STYLE):
-        for name, caption, make in made:
-            path = out / "figures" / f"{name}.png"
-            save(make(), path, trim=False)
-            drawn.append(Drawn(path=path, caption=caption))
-    return drawn
+        yield f"over-{name}", _SWEEP.format(name), partial(curve_figure, sweep, summary), False
+    yield "outcomes", _OUTCOMES, partial(outcome_figure, summary), False
+    yield "distributions", _DISTRIBUTIONS, partial(distribution_figure, summary, report.episodes), False
+    for place, (title, lines) in enumerate(report.sheets.shown, start=1):
+        name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place}"
+        yield name, _FAILURES.format(title), partial(failure_figure, lines), False
 
 
-def _trajectories(folder: Path, out: Path, summary: pd.DataFrame) -> list[Drawn]:
-    """Draws the trajectories of recorded episodes; none where nothing was recorded."""
+def _trajectories(folder: Path, summary: pd.DataFrame) -> Iterator[ToDraw]:
+    """The figure of recorded episodes; none where nothing was recorded."""
     recorded = read_snapshots(folder)
-    chosen = choose(recorded, list(summary["condition"]))
-    if not chosen:
-        return []
-    path = out / "figures" / "trajectories.png"
-    save(trajectory_figure(chosen), path)
-    words = [_TRAJECTORIES, f"{len(chosen)} of {len(recorded)} recorded episodes."]
-    if any(snapshot.field is not None for snapshot in chosen):
-        words.insert(1, _TO_THE_END)
-    return [Drawn(path=path, caption=" ".join(words))]
+    chosen = choose_snapshots(recorded, list(summary["condition"]))
+    if chosen:
+        whole = [_TO_THE_END] if any(snapshot.field is not None for snapshot in chosen) else []
+        count = f"{len(chosen)} of {len(recorded)} recorded episodes."
+        yield (
+            "trajectories",
+            " ".join([_TRAJECTORIES, *whole, count]),
+            partial(trajectory_figure, chosen),
+            True,
+        )
 
 
-def _driven(folder: Path, out: Path) -> list[Drawn]:
-    return [
-        Drawn(path=out / "figures" / f"{name}.png", caption=caption)
-        for name, caption in write_driven(folder, out).items()
+def _driven(folder: Path) -> Iterator[ToDraw]:
+    """The figure of whole driven paths; none where no steps were kept."""
+    driven = read_driven(folder)
+    if driven is None:
+        return
+    ground, rows, tracks = driven
+    about, shown = ground.about, rows.iloc[:_MOST_PATHS]
+    why = (
+        "of all maps the one on which outcomes differ most."
+        if rows["success"].nunique() > 1
+        else "on no map did outcomes differ."
+    )
+    words = [
+        f"Whole driven paths on {about['scenario']} {about['map']}, seed {about['seed']}, realisation "
+        f"{about['realisation']}: {why}"
     ]
+    if len(shown) < len(rows):
+        words.append(f"{len(shown)} of {len(rows)} conditions.")
+    yield "driven", " ".join(words), partial(driven_figure, ground, shown, tracks[:_MOST_PATHS]), True
 
 
 def _with_latency(summary: pd.DataFrame, conditions: Mapping[str, Any]) -> pd.DataFrame:
@@ -243,7 +257,8 @@ def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     worlds = {condition["labels"]["world"]: _world(condition["value"]) for condition in conditions}
     lines = [f"World {label}: {text}." for label, text in worlds.items()]
     seeds = dict.fromkeys(seed for condition in conditions for seed in condition["seeds"])
-    lines.append(f"Data: {_list(summary['data'])}. Models: {_list(summary['model'])}. Seeds: {_list(seeds)}.")
+    data, models = (joined(summary[name].unique()) or NOT_USED for name in ("data", "model"))
+    lines.append(f"Data: {data}. Models: {models}. Seeds: {joined(map(str, seeds))}.")
     if len(summary[["n_episodes", "n_maps", "n_groups"]].drop_duplicates()) == 1:
         maps = maps_in_words(summary["n_maps"][0], summary["n_groups"][0])
         lines.append(f"Each condition: {summary['n_episodes'][0]} episodes on {maps}.")
@@ -294,34 +309,24 @@ def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:
     return [f"In {episodes} a planner or model failed; tracebacks: {folder / ERRORS}"]
 
 
-def _list(values: Iterable[Any]) -> str:
-    return ", ".join(dict.fromkeys(str(value) for value in values if value != NOT_USED)) or NOT_USED
-
-
-def _as_markdown(report: Report, figures: Iterable[Drawn]) -> str:
+def _as_markdown(report: Report, figures: Sequence[Drawn]) -> str:
     lines = ["# Run summary", "", "## What the run says", ""]
     for finding in report.findings:
-        lines += [
-            f"**{markdown(finding.title)}**",
-            "",
-            *(f"- {markdown(said)}" for said in finding.sentences),
-            "",
-        ]
+        lines += [f"**{markdown(finding.title)}**", "", *_items(finding.sentences)]
     if not report.tests.empty:
-        lines += [
-            "## Hypotheses",
-            "",
-            to_markdown(hypothesis_table(report.tests, is_grouped(report.summary))),
-            "",
-        ]
-    lines += ["## Results", "", *(f"- {markdown(line)}" for line in report.header), ""]
-    lines += [to_markdown(report.table)]
-    lines += [f"- {markdown(line)}" for line in report.warnings] + ([""] if report.warnings else [])
+        shown = hypothesis_table(report.tests, is_grouped(report.summary))
+        lines += ["## Hypotheses", "", to_markdown(shown), ""]
+    lines += ["## Results", "", *_items(report.header), to_markdown(report.table)]
+    lines += _items(report.warnings) if report.warnings else []
     for drawn in figures:
         lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", markdown(drawn.caption), ""]
     return "\n".join(
         [*lines, "Commands:", "", *(f"    {command}" for command in report.about["commands"]), ""]
     )
+
+
+def _items(lines: Sequence[str]) -> list[str]:
+    return [*(f"- {markdown(line)}" for line in lines), ""]
 
 
 def _as_latex(report: Report, name: str) -> str:

@@ -1,6 +1,5 @@
 """The command `benchnav-train evaluate`: whether a model's probabilities can be trusted."""
 
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,8 +16,7 @@ if TYPE_CHECKING:
     from benchnav.models.slope_gp.table import SlopeTable
 
 REPORT, CSV, PAGE, FIGURES = "quality.json", "quality.csv", "quality.md", "figures"
-
-_WIDTH = 124  # of the table where there is no terminal to fill
+DPI = 300
 
 
 def evaluate(
@@ -45,12 +43,11 @@ def evaluate(
         overwrite: Replace an evaluation that is in `out`.
         device: Where the model is measured; auto takes CUDA where there is a GPU. Figures are made on the CPU.
     """
-    from rich.console import Console
-
     from benchnav import __version__
     from benchnav.core.command import show_progress
     from benchnav.core.errors import ConfigError
     from benchnav.core.store import write_text
+    from benchnav.core.tables import print_table
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.models.config import check_seed
 
@@ -64,8 +61,7 @@ def evaluate(
 
     from benchnav.core.device import find_device
     from benchnav.models.predictor import load_model, trained_on
-    from benchnav.models.quality.baseline import nearest_colour_accuracy
-    from benchnav.models.quality.measure import choose_splits
+    from benchnav.models.quality.measure import choose_splits, nearest_colour_accuracy
     from benchnav.models.quality.measure import evaluate as evaluate_model
     from benchnav.models.quality.report import quality_csv, quality_json, quality_markdown, quality_table
 
@@ -80,8 +76,7 @@ def evaluate(
 
     show_progress(steps(), "splits")
     title = f"{checkpoint} on {dataset.id}"
-    console = Console(width=None if sys.stdout.isatty() else _WIDTH, highlight=False)
-    console.print(quality_table(title, qualities))
+    print_table(quality_table(title, qualities))
     by_colour: dict[str, float] = {}
     if all(quality.classes for quality in qualities.values()):
         by_colour = {split: nearest_colour_accuracy(dataset, split) for split in chosen}
@@ -91,7 +86,7 @@ def evaluate(
         *_without_truth(model, dataset, chosen),
     ]
     for note in notes:
-        console.print(note, soft_wrap=True)
+        print(note)
     about = {
         "model": checkpoint,
         "dataset": {"id": dataset.id, "digest": dataset.digest},
@@ -112,7 +107,7 @@ def evaluate(
     folder = Path(out)
     write_text(folder / REPORT, report)
     write_text(folder / CSV, quality_csv(qualities))
-    for old in (folder / FIGURES).glob("*.png"):
+    for old in (folder / FIGURES).glob("*.p[nd][gf]"):
         old.unlink()
     absent = _absent(model, qualities)
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
@@ -212,7 +207,7 @@ def _without_truth(
 
 def _absent(model: "TraversabilityModel", qualities: "Mapping[str, Quality]") -> list[str]:
     """Says which figures do not apply, and why."""
-    from benchnav.models.quality.series import find_series
+    from benchnav.datagen.recipe.scenario import find_series
 
     lines = []
     if not all(quality.classes for quality in qualities.values()):
@@ -234,14 +229,14 @@ def _save_figures(
 ) -> list[str]:
     """Draws what applies; returns paths from the page's folder."""
     from benchnav.core.command import show_progress
-    from benchnav.models.quality.figures import save_figure
+    from benchnav.core.figures import save_twice
 
     written: list[str] = []
 
     def steps() -> Iterator[tuple[int, int]]:
         drawn = list(_figures(title, model, dataset, qualities, maps))
         for name, draw in drawn:
-            save_figure(draw(), folder / f"{name}.png")
+            save_twice(draw(), folder / f"{name}.png", dpi=DPI)
             written.append(f"{folder.name}/{name}.png")
             yield len(written), len(drawn)
 
@@ -259,9 +254,9 @@ def _figures(
     """Names the figures that apply, each with what draws it."""
     from functools import partial
 
+    from benchnav.datagen.recipe.scenario import find_series
     from benchnav.models.quality import figures, map_sheet
-    from benchnav.models.quality.series import find_series
-    from benchnav.models.quality.words import sheet_name
+    from benchnav.models.quality.report import sheet_name
 
     by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
     by_cell = {split: quality.traversability for split, quality in qualities.items()}

@@ -1,38 +1,39 @@
 """Figures of a model's quality: where it errs, and whether its probabilities can be trusted.
 
-Sizes are in inches and points as printed over the two columns of a page. Colours are those of Okabe
-and Ito (2008) and of maps even in lightness, distinct to every kind of colour vision; lines differ in
-marker or dash too. A figure has a panel a split, in the order given. Letters in shapes: C classes, G
-nodes.
+They are as wide as the two columns of a page, or narrower where panels are few. Lines differ in marker or dash
+beside their colour. A figure has a panel a split, in the order given. Letters in shapes: C classes, G nodes.
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.stats import binom
 
-from benchnav.core.drawing import PAGE_WIDTH_IN, TEXT, TITLE, save, thin_ticks
-from benchnav.core.store import replacing
+from benchnav.core.figures import (
+    BLUE,
+    LINE_COLOURS,
+    MARKERS,
+    ORANGE,
+    SKY,
+    TEXT,
+    TWO_COLUMNS_IN,
+    legend_outside,
+    styled,
+    thin_ticks,
+)
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
 from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 
-DPI = 300
-
 _LEAST_WIDTH = 4.4
 _SMALL = 5.5
-_BLUE, _ORANGE, _GREEN, _PINK, _SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9"
-_COLOURS = (_BLUE, _ORANGE, _GREEN, _PINK, _SKY, "#E69F00", "black")
-_MARKERS = "os^Dv<P"
 _MOST_NUMBERED = 16  # classes; among more, numbers would not fit their cells
 _BAND = "0.82"
 _RARE = 1e-3
@@ -54,6 +55,7 @@ _LATENT_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
 )
 
 
+@styled()
 def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]) -> Figure:
     """Draws which classes are taken for which: shares of each true class, in percent.
 
@@ -62,106 +64,82 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
         names: of the C classes.
     """
     most = 3 if len(qualities) > 2 else 2
-    columns, rows = _grid(len(qualities), most)
-    names_within = 0.55 if len(qualities) % columns else 0.0  # those of columns, under panels that end above
-    figure = _figure(columns / most, rows, 2.2 if most == 3 else 3.1, 0.7 + names_within)
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    titles = [f"{split}: accuracy {quality.accuracy:.3f}" for split, quality in qualities.items()]
+    ragged = len(titles) > most and len(titles) % most  # panels that end above hold the names of columns too
+    high = 2.2 if most == 3 else 3.1
+    figure, panels = _grid(titles, most, high, 1.25 if ragged else 0.7, share_y=True)
     labels = [name.replace("_", " ") for name in names]
-    palette, image = matplotlib.colormaps["Blues"].with_extremes(bad="0.85"), None
-    for panel, (split, quality) in zip(panels.flat, qualities.items(), strict=False):
+    palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
+    for panel, quality in zip(panels, qualities.values(), strict=True):
         counts = np.array(quality.confusion, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             shares = 100 * counts / counts.sum(1, keepdims=True)
         image = panel.imshow(shares, cmap=palette, vmin=0, vmax=100)
-        if len(names) <= _MOST_NUMBERED:
-            for row, column in zip(*np.nonzero(shares >= 0.5), strict=True):
-                share = shares[row, column]
-                colour = "white" if share > 55 else "black"
-                panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
+        shown = np.argwhere(shares >= 0.5) if len(names) <= _MOST_NUMBERED else ()
+        for row, column in shown:
+            share = shares[row, column]
+            colour = "white" if share > 55 else "black"
+            panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
         panel.set_xticks(range(len(names)), labels, rotation=90, parse_math=False)
         panel.set_yticks(range(len(names)), labels, parse_math=False)
-        panel.set_title(f"{split}: accuracy {quality.accuracy:.3f}", size=TITLE)
-        panel.tick_params(labelsize=TEXT - 0.5, length=2, width=0.5, pad=1.5)
-    _drop_rest(panels, len(qualities))
-    for panel in panels[:, 0]:
-        panel.set_ylabel("true class", size=TEXT)
-    figure.supxlabel("most likely class", size=TEXT)
-    if image is not None:
-        # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
-        beside = panels[0, -1].inset_axes((1.04, 0, 0.05, 1))
-        bar = figure.colorbar(image, cax=beside)
-        bar.set_label("share of the true class [%]", size=TEXT)
-        bar.ax.tick_params(labelsize=TEXT, length=2, width=0.5)
+        thin_ticks(panel)
+    figure.supxlabel("most likely class")
+    figure.supylabel("true class")
+    # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
+    beside = panels[min(len(panels), most) - 1].inset_axes((1.04, 0, 0.05, 1))
+    figure.colorbar(image, cax=beside, label="share of the true class [%]")
     return figure
 
 
+@styled()
 def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
     """Draws how often the most likely class is right against its probability, over how many cells say so.
 
     Args:
         qualities: by split.
     """
-    columns, rows = _grid(len(qualities), 3)
-    figure = _figure(columns / 3, rows, 2.6, 0.35)
-    heights = [3, 1] * rows
-    panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, height_ratios=heights)
+    columns = min(len(qualities), 3)
+    rows = -(-len(qualities) // columns)
+    figure = _figure(columns / 3, rows * 2.6 + 0.35)
+    panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, height_ratios=[3, 1] * rows)
+    pairs = [
+        (panels[2 * row, column], panels[2 * row + 1, column])
+        for row in range(rows)
+        for column in range(columns)
+    ]
     edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
-    for place, (split, quality) in enumerate(qualities.items()):
-        row, column = divmod(place, columns)
-        upper, lower = panels[2 * row, column], panels[2 * row + 1, column]
-        cells, confidence, accuracy = (
-            np.array(values) for values in (
-                quality.reliability.cells, quality.reliability.confidence, quality.reliability.accuracy
-            )
-        )  # fmt: skip
-        share, told = cells / cells.sum(), cells > 0
-        upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--")
-        upper.vlines(confidence[told], confidence[told], accuracy[told], color=_ORANGE, lw=2, alpha=0.45)
+    for (upper, lower), (split, quality) in zip(pairs, qualities.items(), strict=False):
+        curve = quality.reliability
+        cells, confidence, accuracy = map(np.array, (curve.cells, curve.confidence, curve.accuracy))
+        share, filled = cells / cells.sum(), cells > 0
         often = share >= _RARE
-        upper.plot(confidence[often], accuracy[often], color=_BLUE, lw=1)
-        for many, fill in ((often, _BLUE), (told & ~often, "white")):
-            # Unclipped points ask for room; none at all would ask for all of it.
-            if many.any():
-                points = confidence[many], accuracy[many]
-                upper.plot(*points, "o", ms=3, mfc=fill, mec=_BLUE, mew=0.7, clip_on=False)
-        upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
-        upper.set_title(f"{split}: ECE {quality.ece:.3f}", size=TITLE)
-        lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=_SKY, ec="white", lw=0.4)
+        few = filled & ~often
+        upper.plot([0, 1], [0, 1], color="0.5", lw=0.8, ls="--", label="calibrated")
+        points: dict[str, Any] = {"color": BLUE, "ms": 3, "lw": 1, "clip_on": False}
+        upper.plot(confidence[often], accuracy[often], "o-", **points, label="observed")
+        if few.any():  # no point at all would ask for all the room there is
+            words = "observed, under 0.1 % of cells"
+            upper.plot(confidence[few], accuracy[few], "o", mfc="white", **points, label=words)
+        gap = (confidence[filled], confidence[filled], accuracy[filled])
+        upper.vlines(*gap, color=ORANGE, lw=2, alpha=0.45, zorder=1.5, label="gap")
+        upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1], title=f"{split}: ECE {quality.ece:.3f}")
+        lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-        if column == 0:
-            upper.set_ylabel("how often right", size=TEXT)
-            lower.set_ylabel("cells", size=TEXT)
-        for panel in (upper, lower):
-            thin_ticks(panel)
-    for place in range(len(qualities), rows * columns):
-        row, column = divmod(place, columns)
-        panels[2 * row, column].remove()
-        panels[2 * row + 1, column].remove()
-        panels[2 * row - 1, column].tick_params(labelbottom=True)
+    for place in range(len(qualities), len(pairs)):
+        for panel in pairs[place]:
+            panel.remove()
+        pairs[place - columns][1].tick_params(labelbottom=True)
+    for upper, lower in pairs[::columns]:
+        upper.set_ylabel("how often right")
+        lower.set_ylabel("cells")
     figure.align_ylabels(panels[:, 0])
-    figure.supxlabel("probability of the most likely class", size=TEXT)
-    _legend(
-        figure,
-        [
-            Line2D([], [], color="0.5", lw=0.8, ls="--", label="calibrated"),
-            Line2D([], [], color=_BLUE, lw=1, marker="o", ms=3, label="observed"),
-            Line2D(
-                [],
-                [],
-                ls="",
-                color=_BLUE,
-                marker="o",
-                ms=3,
-                mfc="white",
-                label="observed, under 0.1 % of cells",
-            ),
-            Line2D([], [], color=_ORANGE, lw=2, alpha=0.45, label="gap"),
-        ],
-    )
+    figure.supxlabel("probability of the most likely class")
+    _explain(figure)
     return figure
 
 
+@styled()
 def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     """Draws the histogram of the PIT of λ as it departs from 1, its height for a calibrated model.
 
@@ -171,51 +149,41 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     Args:
         qualities: by split.
     """
-    columns, rows = _grid(len(qualities), 3)
-    figure = _figure(columns / 3, rows, 1.75, 0.45 if columns == 3 else 0.65)
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True)
+    figure, panels = _grid(list(qualities), 3, 1.75, 0.45 if len(qualities) > 2 else 0.65)
     edges = np.linspace(0, 1, PIT_BINS + 1)
-    for panel, (split, quality) in zip(panels.flat, qualities.items(), strict=False):
+    tail = round((1 - LEVEL) * PIT_BINS)
+    for panel, quality in zip(panels, qualities.values(), strict=True):
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
         low, high = (bound / level for bound in binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
-        panel.fill_between([0, 1], low, high, color=_BAND, lw=0)
-        tail = round((1 - LEVEL) * PIT_BINS)
-        for bins, colour in ((slice(0, tail), _ORANGE), (slice(tail, None), _SKY)):
-            ends = np.append(edges[:-1][bins], edges[1:][bins][-1])
-            panel.stairs(counts[bins] / level, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0)
-            panel.stairs(counts[bins] / level, ends, baseline=None, color=colour, lw=1)
-        panel.axhline(1, color="black", lw=0.7)
+        for first, last, colour, label in (
+            (0, tail, ORANGE, "observed, under VaR at 0.9"),
+            (tail, PIT_BINS, SKY, "observed"),
+        ):
+            heights, ends = counts[first:last] / level, edges[first : last + 1]
+            panel.stairs(heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0, label=label)
+            panel.stairs(heights, ends, baseline=None, color=colour, lw=1)
+        panel.axhline(1, color="black", lw=0.7, label="calibrated")
+        words = "90 % of a calibrated model's bins"
+        panel.fill_between([0, 1], low, high, color=_BAND, lw=0, zorder=0.5, label=words)
         for bound in (0.05, 0.95):
-            panel.axvline(bound, color="black", lw=0.7, ls=":")
+            panel.axvline(bound, color="black", lw=0.7, ls=":", label="central 90 %")
         panel.text(
             0.5, 0.97,
             f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
             size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
         )  # fmt: skip
-        panel.set_title(split, size=TITLE)
         lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
         panel.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        thin_ticks(panel)
-    _drop_rest(panels, len(qualities))
-    figure.supxlabel("PIT of the realised λ", size=TEXT)
-    figure.supylabel("density", size=TEXT)
-    _legend(
-        figure,
-        [
-            Patch(facecolor=_SKY, label="observed"),
-            Patch(facecolor=_ORANGE, label="observed, under VaR at 0.9"),
-            Line2D([], [], color="black", lw=0.7, label="calibrated"),
-            Patch(facecolor=_BAND, label="90 % of a calibrated model's bins"),
-            Line2D([], [], color="black", lw=0.7, ls=":", label="central 90 %"),
-        ],
-        most=5,
-    )
+    figure.supxlabel("PIT of the realised λ")
+    figure.supylabel("density")
+    _explain(figure, most=5)
     return figure
 
 
+@styled()
 def severity_figure(
     all_series: Mapping[str, Sequence[tuple[float, str]]], qualities: Mapping[str, Quality]
 ) -> Figure:
@@ -225,54 +193,38 @@ def severity_figure(
         all_series: by scenario, its pairs as (severity, split), ascending.
         qualities: of all these splits.
     """
-    pairs = [split for series in all_series.values() for _, split in series]
-    kinds = [_CLASS_SEVERITY] * all(bool(qualities[split].classes) for split in pairs) + [_LATENT_SEVERITY]
-    ensemble = not any(np.isnan(_quantity(qualities[split], "mutual_information")) for split in pairs)
-
-    def values(series: Sequence[tuple[float, str]], name: str) -> list[float]:
-        return [_quantity(qualities[split], name) for _, split in series]
-
-    figure = _figure(1, len(kinds), 1.65, 0.45)
-    panels = figure.subplots(len(kinds), 4, squeeze=False, sharex=True)
-    for panel, (title, name, ideal) in zip(panels.flat, [one for kind in kinds for one in kind], strict=True):
-        for place, series in enumerate(all_series.values()):
-            severities = [severity for severity, _ in series]
-            style = {"color": _COLOURS[place % len(_COLOURS)], "marker": _MARKERS[place % len(_MARKERS)]}
-            panel.plot(severities, values(series, name), ms=3, lw=1, **style)
+    shown = [qualities[split] for series in all_series.values() for _, split in series]
+    quantities = [*_CLASS_SEVERITY * all(bool(quality.classes) for quality in shown), *_LATENT_SEVERITY]
+    ensemble = not any(np.isnan(_quantity(quality, "mutual_information")) for quality in shown)
+    looks: dict[str, dict[str, Any]] = {
+        scenario: {"ms": 3, "lw": 1, "color": colour, "marker": MARKERS[place % len(MARKERS)]}
+        for place, (scenario, colour) in enumerate(
+            zip(all_series, LINE_COLOURS * len(all_series), strict=False)
+        )
+    }
+    figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
+    for panel, (_, name, ideal) in zip(panels, quantities, strict=True):
+        for scenario, series in all_series.items():
+            severities, splits = zip(*series, strict=True)
+            values = [_quantity(qualities[split], name) for split in splits]
+            panel.plot(severities, values, label=scenario, **looks[scenario])
             if name == "entropy_auroc" and ensemble:
-                others = values(series, "mutual_information_auroc")
-                panel.plot(severities, others, ms=3, lw=1, ls=":", mfc="white", **style)
-        panel.set_title(title, size=TITLE)
+                others = [_quantity(qualities[split], "mutual_information_auroc") for split in splits]
+                words = "of mutual information; solid: of entropy"
+                panel.plot(severities, others, ls=":", mfc="white", **looks[scenario], label=words)
         panel.margins(x=0.05, y=0.12)
         if ideal is not None:
-            panel.axhline(ideal, color="0.4", lw=0.8, ls="--")
+            panel.axhline(ideal, color="0.4", lw=0.8, ls="--", label="calibrated")
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
-        panel.grid(alpha=0.3, lw=0.5)
+        panel.grid(alpha=0.3)
         panel.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-        thin_ticks(panel)
-    figure.supxlabel("severity of the shift", size=TEXT)
-    lines = [
-        Line2D(
-            [],
-            [],
-            color=_COLOURS[i % len(_COLOURS)],
-            marker=_MARKERS[i % len(_MARKERS)],
-            ms=3,
-            lw=1,
-            label=name,
-        )
-        for i, name in enumerate(all_series)
-    ]
-    lines.append(Line2D([], [], color="0.4", lw=0.8, ls="--", label="calibrated"))
-    if ensemble:
-        lines.append(
-            Line2D([], [], color="0.4", lw=1, ls=":", label="of mutual information; solid: of entropy")
-        )
-    _legend(figure, lines)
+    figure.supxlabel("severity of the shift")
+    _explain(figure)
     return figure
 
 
+@styled()
 def latent_figure(
     table: SlopeTable,
     classes: Sequence[TerrainClass],
@@ -287,58 +239,48 @@ def latent_figure(
         slope_cells: measured cells by true class and whole degree of slope, [C][90].
         truth: whether they are.
     """
-    columns, rows = _grid(len(classes), 5)
-    figure = _figure(columns / 5, rows, 1.55, 0.5 if columns == 5 else 1.0)
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    titles = [item.name.replace("_", " ") for item in classes]
+    figure, panels = _grid(titles, 5, 1.55, 0.5 if len(titles) > 4 else 1.0, share_y=True)
     slopes = table_slopes().numpy()
     shown = slopes <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))
     soft = _soft_modes(table)
-    means, stds = (values.double().cpu().numpy() for values in (table.mean, table.std))
-    noise = table.noise_std.double().cpu().numpy()
+    means, stds, noise = (
+        values.double().cpu().numpy() for values in (table.mean, table.std, table.noise_std)
+    )
     x = slopes[shown]
-    for number, (panel, one) in enumerate(zip(panels.flat, classes, strict=False)):
+    for number, (panel, item) in enumerate(zip(panels, classes, strict=True)):
         mean, std = means[number, shown], stds[number, shown]
         latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
-        panel.fill_between(x, mean - 2 * std, mean + 2 * std, color=_SKY, alpha=0.3, lw=0)
-        panel.fill_between(x, mean - 2 * latent, mean + 2 * latent, color=_BLUE, alpha=0.45, lw=0)
-        panel.plot(x, mean, color=_BLUE, lw=1.1)
-        panel.plot(x, _with_soft(expected_traversability(mean, std), *soft[number]), color=_ORANGE, lw=1.1)
+        panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
+        expected = _with_soft(expected_traversability(mean, std), *soft[number])
+        panel.plot(x, expected, color=ORANGE, lw=1.1, label="predicted E[λ]")
+        for spread, colour, alpha, label in (
+            (std, SKY, 0.3, "± 2σ with noise"),
+            (latent, BLUE, 0.45, "± 2σ of the latent function"),
+        ):
+            low, high = mean - 2 * spread, mean + 2 * spread
+            panel.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, label=label)
+        words = f"σ {noise[number]:.3f}"
         if truth:
             true = latent_mean(np.full(len(x), number), x, tuple(classes))
-            panel.plot(x, true, color="black", lw=0.9, ls="--")
-            firm = expected_traversability(true, np.full_like(x, one.noise))
-            true_soft = (one.soft.weight, one.soft.mean, one.soft.std) if one.soft else _NO_SOFT
-            panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":")
+            panel.plot(x, true, color="black", lw=0.9, ls="--", label="true latent function")
+            firm = expected_traversability(true, np.full_like(x, item.noise))
+            true_soft = (item.soft.weight, item.soft.mean, item.soft.std) if item.soft else _NO_SOFT
+            panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":", label="true E[λ]")
+            words += f" ({item.noise:.3f})"
         if soft[number][0]:
-            panel.axhline(soft[number][1], color=_BLUE, lw=0.9, ls="-.")
-        for share, shade in ((_RARE, 0.12), (0.0, 0.25)):
-            panel.axvspan(_steeper_than(slope_cells[number], share), 90, color="0.4", alpha=shade, lw=0)
-        panel.set_title(one.name.replace("_", " "), size=TITLE, parse_math=False)
-        true_noise = f" ({one.noise:.3f})" if truth else ""
-        panel.text(0.05, 0.05, f"σ {noise[number]:.3f}{true_noise}", size=TEXT, transform=panel.transAxes)
-        thin_ticks(panel)
-    panels[0, 0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
-    _drop_rest(panels, len(classes))
-    figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})", size=TEXT)
-    figure.supylabel("traversability", size=TEXT)
-    handles: list[Line2D] = []
-    if truth:
-        handles.append(Line2D([], [], color="black", lw=0.9, ls="--", label="true latent function"))
-        handles.append(Line2D([], [], color="black", lw=1, ls=":", label="true E[λ]"))
-    if table.soft:
-        handles.append(Line2D([], [], color=_BLUE, lw=0.9, ls="-.", label="mean of soft spots"))
-    _legend(
-        figure,
-        [
-            Line2D([], [], color=_BLUE, lw=1.1, label="GP mean"),
-            Patch(facecolor=_BLUE, alpha=0.45, label="± 2σ of the latent function"),
-            Patch(facecolor=_SKY, alpha=0.3, label="± 2σ with noise"),
-            Line2D([], [], color=_ORANGE, lw=1.1, label="predicted E[λ]"),
-            *handles,
-            Patch(facecolor="0.4", alpha=0.12, label="steeper: 1 cell in 1000"),
-            Patch(facecolor="0.4", alpha=0.35, label="steeper: no cell of the class"),
-        ],
-    )
+            panel.axhline(soft[number][1], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
+        for share, shade, label in (
+            (_RARE, 0.12, "steeper: 1 cell in 1000"),
+            (0.0, 0.25, "steeper: no cell of the class"),
+        ):
+            steeper = _steeper_than(slope_cells[number], share)
+            panel.axvspan(steeper, 90, color="0.4", alpha=shade, lw=0, label=label)
+        panel.text(0.05, 0.05, words, size=TEXT, transform=panel.transAxes)
+    panels[0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
+    figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
+    figure.supylabel("traversability")
+    _explain(figure)
     return figure
 
 
@@ -356,12 +298,6 @@ def _with_soft(expected: np.ndarray, weight: float, mean: float, std: float) -> 
     return (1 - weight) * expected + weight * soft
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a figure as PNG, whole or not at all; its folder is made."""
-    with replacing(path, durable=False) as partial:
-        save(figure, partial, "png", DPI)
-
-
 def _steeper_than(cells: Sequence[int], share: float) -> float:
     """The whole degree of slope that at most `share` of the cells are steeper than."""
     steeper = np.cumsum(cells[::-1])[::-1]
@@ -373,31 +309,28 @@ def _quantity(quality: Quality, name: str) -> float:
     return next((float(getattr(source, name)) for source in sources if hasattr(source, name)), float("nan"))
 
 
-def _grid(count: int, most: int) -> tuple[int, int]:
-    """Columns and rows of `count` panels."""
-    columns = min(count, most)
-    return columns, -(-count // columns)
+def _grid(
+    titles: Sequence[str], most: int, high: float, rest: float, share_y: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel a title, at most so many side by side, each so high, and with room for the rest."""
+    columns = min(len(titles), most)
+    rows = -(-len(titles) // columns)
+    figure = _figure(columns / most, rows * high + rest)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=share_y).flat
+    for panel, title in zip(panels[: len(titles)], titles, strict=True):
+        panel.set_title(title, parse_math=False)
+    for place in range(len(titles), rows * columns):
+        panels[place].remove()
+        panels[place - columns].tick_params(labelbottom=True)
+    return figure, list(panels[: len(titles)])
 
 
-def _figure(share: float, rows: int, high: float, rest: float) -> Figure:
+def _figure(share: float, high: float) -> Figure:
     """A figure of this share of the full width, but wide enough for its legend."""
-    return Figure(
-        figsize=(max(PAGE_WIDTH_IN * share, _LEAST_WIDTH), rows * high + rest), layout="constrained"
-    )
+    return Figure(figsize=(max(TWO_COLUMNS_IN * share, _LEAST_WIDTH), high), layout="constrained")
 
 
-def _drop_rest(panels: np.ndarray, count: int) -> None:
-    """Takes away panels that nothing stands in; those above them get their tick labels."""
-    columns = panels.shape[1]
-    for place in range(count, panels.size):
-        panels.flat[place].remove()
-        panels.flat[place - columns].tick_params(labelbottom=True)
-
-
-def _legend(figure: Figure, handles: Sequence[Any], most: int = 4) -> None:
+def _explain(figure: Figure, most: int = 4) -> None:
     """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
-    columns = min(len(handles), most if figure.get_figwidth() == PAGE_WIDTH_IN else 2)
-    figure.legend(
-        handles=handles, loc="outside upper center", ncols=columns, fontsize=TEXT, frameon=False,
-        handlelength=1.6, columnspacing=1.4,
-    )  # fmt: skip
+    columns = most if figure.get_figwidth() == TWO_COLUMNS_IN else 2
+    legend_outside(figure, columns=columns, side="upper")

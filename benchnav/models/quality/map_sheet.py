@@ -11,18 +11,23 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from benchnav.core.drawing import TEXT, add_axes, thin_ticks, write
+from benchnav.core.figures import TRAVERSABILITY_COLOURS
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.preview import LACKING, class_colours, class_shades
+from benchnav.datagen.preview import (
+    LACKING_PATCH,
+    SheetColumn,
+    class_colours,
+    class_patches,
+    class_shades,
+    sheet_of_maps,
+)
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
 from benchnav.models.probabilities import class_probabilities
-from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
+from benchnav.models.quality.scores import mutual_information, predictive_entropy
 
 TITLES = {
     "rgb": "Image",
@@ -39,18 +44,14 @@ TITLES = {
 }
 
 _UNITS = {
-    "expected_true": "λ",
-    "observed": "λ",
-    "expected": "λ",
-    "error_observed": "predicted − observed",
-    "error": "predicted − true",
-    "width": "width",
-    "entropy": "nats",
-    "information": "nats",
+    **dict.fromkeys(("expected_true", "observed", "expected"), "λ"),
+    **{"error_observed": "predicted − observed", "error": "predicted − true", "width": "width"},
+    **dict.fromkeys(("entropy", "information"), "nats"),
 }
-_PANEL, _GAP = 1.2, 0.1
-_LEFT, _RIGHT, _TOP, _FOOT = 0.5, 0.08, 0.45, 0.8
-_LEGEND_COLUMNS = 3
+_PALETTES = {
+    **dict.fromkeys(("error", "error_observed"), "RdBu_r"),
+    **dict.fromkeys(("width", "entropy", "information"), "magma"),
+}
 _SHOWN_SHARE = 0.995
 
 
@@ -123,21 +124,14 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
         sheets: at least one.
         classes: of the dataset.
     """
-    kinds: dict[str, Any] = {
-        "cmap": class_shades(class_colours(classes)), "vmin": -0.5, "vmax": len(classes) - 0.5
-    }  # fmt: skip
-    share = {"cmap": "viridis", "vmin": 0, "vmax": 1}
+    kinds = {"cmap": class_shades(class_colours(classes)), "vmin": -0.5, "vmax": len(classes) - 0.5}
+    share = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
     scales: dict[str, dict[str, Any]] = {
-        "rgb": {}, "class_true": kinds, "class_found": kinds, "expected_true": share, "observed": share,
-        "expected": share,
-    }  # fmt: skip
-    for name, palette in (
-        ("error", "RdBu_r"),
-        ("error_observed", "RdBu_r"),
-        ("width", "magma"),
-        ("entropy", "magma"),
-        ("information", "magma"),
-    ):
+        "rgb": {},
+        **dict.fromkeys(("class_true", "class_found"), kinds),
+        **dict.fromkeys(("expected_true", "observed", "expected"), share),
+    }
+    for name, palette in _PALETTES.items():
         values = [np.abs(sheet.layers[name]).ravel() for sheet in sheets if name in sheet.layers]
         if values:
             shown = np.concatenate(values)
@@ -158,73 +152,29 @@ def map_sheet_figure(
         classes: of the dataset.
         title: which model and dataset; the split follows.
     """
-    names = [name for name in TITLES if name in sheet.layers]
-    width_m, height_m = sheet.extent_m
-    high = _PANEL * float(np.clip(height_m / width_m, 0.3, 3))
+    columns = []
+    for name in (name for name in TITLES if name in sheet.layers):
+        layers, unit, is_error = sheet.layers[name], _UNITS.get(name), name.startswith("error")
+        columns.append(
+            SheetColumn(
+                name=name,
+                title=TITLES[name],
+                layers=np.ma.masked_equal(layers, UNLABELLED) if name == "class_true" else layers,
+                shades=scales[name],
+                unit=unit,
+                # λ ends at 0 and 1.
+                extend="neither" if unit == "λ" else "both" if is_error else "max",
+                most=2 if is_error else 4,
+            )
+        )
     shown = _shown_classes(sheet)
-    lacking = any(bool(np.isnan(layer).any()) for layer in sheet.layers.values())
-    legend_rows = -(-(len(shown) + lacking) // _LEGEND_COLUMNS)
-    bottom = _TOP + len(sheet.indices) * (high + _GAP) - _GAP
-    size = (
-        _LEFT + len(names) * (_PANEL + _GAP) - _GAP + _RIGHT,
-        bottom + max(_FOOT, 0.42 + 0.14 * legend_rows),
+    patches = class_patches(
+        [classes[number].name.replace("_", " ") for number in shown], class_colours(classes)[shown]
     )
-    figure = Figure(figsize=size)
-    extent = (0.0, width_m, 0.0, height_m)
-    for column, name in enumerate(names):
-        left = _LEFT + column * (_PANEL + _GAP)
-        middle = left + _PANEL / 2
-        for row, index in enumerate(sheet.indices):
-            top = _TOP + row * (high + _GAP)
-            panel = add_axes(figure, (left, top, _PANEL, high), f"{name} {row}")
-            panel.set_facecolor(LACKING)
-            layer = sheet.layers[name][row]
-            image = panel.imshow(
-                np.ma.masked_equal(layer, UNLABELLED) if name == "class_true" else layer,
-                origin="lower",
-                extent=extent,
-                aspect="auto",
-                interpolation="none",
-                **scales[name],
-            )
-            for axis in (panel.xaxis, panel.yaxis):
-                axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="upper"))
-            thin_ticks(panel)
-            panel.tick_params(labelleft=column == 0, labelbottom=row == len(sheet.indices) - 1)
-            if column == 0:
-                write(figure, 0.1, top + high / 2, f"map {index}", rotation=90, ha="center", va="center")
-        write(figure, middle, _TOP - 0.06, TITLES[name], size=TEXT + 1, ha="center", va="bottom")
-        write(figure, middle, bottom + 0.2, "x [m]", ha="center", va="top")
-        if name in _UNITS:
-            bar = add_axes(figure, (left + 0.06, bottom + 0.42, _PANEL - 0.12, 0.07), f"{name} bar")
-            extend = "both" if name.startswith("error") else "max"
-            extend = "neither" if name in ("expected", "expected_true", "observed") else extend
-            drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
-            drawn.outline.set_linewidth(0.5)
-            bar.xaxis.set_major_locator(
-                MaxNLocator(2 if name.startswith("error") else 4, steps=[1, 2, 2.5, 5, 10])
-            )
-            bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            thin_ticks(bar)
-            write(figure, middle, bottom + 0.64, _UNITS[name], ha="center", va="top")
-    write(figure, _LEFT, 0.06, f"{title}, split {sheet.split}", size=TEXT + 1, weight="bold", va="top")
-    write(figure, 0.26, (_TOP + bottom) / 2, "y [m]", rotation=90, ha="center", va="center")
-    if shown:
-        colours = class_colours(classes)
-        patches = [
-            Patch(facecolor=colours[n], ec="0.3", lw=0.4, label=classes[n].name.replace("_", " "))
-            for n in shown
-        ]
-        if lacking:
-            patches.append(Patch(facecolor=LACKING, label="not known"))
-        legend = figure.legend(
-            handles=patches, loc="upper left", ncols=_LEGEND_COLUMNS, fontsize=TEXT, frameon=False,
-            bbox_to_anchor=(_LEFT / size[0], 1 - (bottom + 0.38) / size[1]), borderaxespad=0, borderpad=0,
-            handlelength=1.1, handletextpad=0.4, columnspacing=1.6, labelspacing=0.3,
-        )  # fmt: skip
-        for text in legend.get_texts():
-            text.set_parse_math(False)
-    return figure
+    if patches and any(bool(np.isnan(layer).any()) for layer in sheet.layers.values()):
+        patches.append(LACKING_PATCH)
+    rows = [f"map {index}" for index in sheet.indices]
+    return sheet_of_maps(columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches)
 
 
 def _shown_classes(sheet: MapSheet) -> list[int]:

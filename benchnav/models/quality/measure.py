@@ -1,7 +1,7 @@
 """How good a model's predictions are, a split at a time: of classes, and of traversability.
 
 One pass over the maps with sums and counts alone, so that memory does not grow with them. The scores
-themselves stand in `scores` and `uncertainty`. Letters in shapes: B maps, H×W cells, C classes, N
+themselves stand in `scores`. Letters in shapes: B maps, H×W cells, C classes, N
 cells of all maps.
 """
 
@@ -30,20 +30,23 @@ from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import MeanIoU
 from benchnav.models.probabilities import class_probabilities
-from benchnav.models.quality.look_alikes import LookAlikeQuality, LookAlikeTally
 from benchnav.models.quality.scores import (
     LEVEL,
     PIT_BINS,
     BrierScore,
+    ErrorRanking,
+    LookAlikeQuality,
+    LookAlikeTally,
     ReliabilityCurve,
     calibration_error,
     coverage,
     crps,
+    mutual_information,
     pit,
     pit_counts,
+    predictive_entropy,
     tail_rate,
 )
-from benchnav.models.quality.uncertainty import ErrorRanking, mutual_information, predictive_entropy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -390,3 +393,33 @@ def _score_cells(
         torch.as_tensor(errors.numel(), device=observed.device),
     ]
     return torch.stack([total.double() for total in sums]), transformed
+
+
+def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
+    """Takes for each cell the class whose colour in full light is nearest, by Euclidean distance.
+
+    Args:
+        rgb: 0–255, shape [B, 3, H, W].
+        colours: of the classes, 0–255, shape [C, 3].
+
+    Returns:
+        Class indices, int64, shape [B, H, W]; of classes equally near the first.
+    """
+    pixels = rgb.movedim(1, -1).float()
+    return (
+        torch.cdist(pixels.flatten(1, 2), colours.float().expand(len(rgb), -1, -1))
+        .argmin(-1)
+        .view(len(rgb), *rgb.shape[-2:])
+    )
+
+
+def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:
+    """Share of a split's labelled cells whose class `nearest_colour` tells."""
+    colours = torch.tensor([item.colour for item in dataset.recipe.classes])
+    right, cells = 0, 0
+    for _, maps in dataset.chunks(split, ("rgb", "class_id")):
+        found = nearest_colour(torch.from_numpy(maps["rgb"]), colours)
+        class_id = torch.from_numpy(maps["class_id"])
+        right += int((found == class_id).sum())
+        cells += int((class_id != UNLABELLED).sum())
+    return right / max(1, cells)

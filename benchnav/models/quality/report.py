@@ -1,69 +1,188 @@
-"""A model's quality in words and numbers: rows of a table, Markdown, CSV and JSON."""
+"""A model's quality in numbers and words: a table for each kind of file, and what columns and figures mean."""
 
-import csv
-import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import PurePath
 from typing import Any
 
-from rich.table import Table
-
+from benchnav.core.tables import NOTHING, Table, to_markdown
+from benchnav.datagen.recipe.scenario import find_series
 from benchnav.models.quality.measure import Quality
-from benchnav.models.quality.series import find_series
-from benchnav.models.quality.words import COLUMNS, caption
 
-# Headings of the numbers of ClassQuality and TraversabilityQuality, in two lines.
-HEADINGS = {
-    "accuracy": "accuracy\n",
-    "miou": "mIoU\n",
-    "miou_predicted": "mIoU\n∪ pred.",
-    "look_alike_accuracy": "accuracy\nlook-alikes=1",
-    "look_alike_miou": "mIoU\nlook-alikes=1",
-    "look_alike_share_error": "look-alikes\noff ½",
-    "look_alike_share_ece": "ECE\nlook-alikes",
-    "ece": "ECE\n",
-    "brier": "Brier\n",
-    "entropy": "entropy\n[nats]",
-    "mutual_information": "mutual\ninf.",
-    "entropy_auroc": "AUROC\nentropy",
-    "mutual_information_auroc": "AUROC\nm. inf.",
-    "rmse_observed": "RMSE\nλ",
-    "rmse_expected": "RMSE\nE[λ]",
-    "nll": "NLL\nλ",
-    "crps": "CRPS\nλ",
-    "coverage": "in 90 %\n(0.9)",
-    "tail_rate": "< VaR\n(0.1)",
+# Of the numbers of ClassQuality and TraversabilityQuality: the heading in two lines, and what it means to who meets
+# it first.
+COLUMNS = {
+    "accuracy": (
+        "accuracy\n",
+        "share of cells whose most likely class is the true one; 1 is perfect.",
+    ),
+    "miou": (
+        "mIoU\n",
+        "mean intersection over union: the cells where a class is both predicted and true, over those where it "
+        "is either, in the mean over the classes that occur in truth; 1 is perfect.",
+    ),
+    "miou_predicted": (
+        "mIoU\n∪ pred.",
+        "the same in the mean over the classes that are true or predicted somewhere; one that never occurs "
+        "counts as 0 as soon as a cell is taken for it.",
+    ),
+    "look_alike_accuracy": (
+        "accuracy\nlook-alikes=1",
+        "accuracy with classes of one colour counted as one, as no image tells them apart; 1 is perfect.",
+    ),
+    "look_alike_miou": (
+        "mIoU\nlook-alikes=1",
+        "mean intersection over union with classes of one colour counted as one; 1 is perfect.",
+    ),
+    "look_alike_share_error": (
+        "look-alikes\noff ½",
+        "of two classes that share a colour, how far the share of the true one is from ½, which is all that can "
+        "be said; 0 is perfect.",
+    ),
+    "look_alike_share_ece": (
+        "ECE\nlook-alikes",
+        "of two classes that share a colour, the calibration error of the larger share; 0 is perfect.",
+    ),
+    "ece": (
+        "ECE\n",
+        "expected calibration error: how far the probability of the most likely class is from how often it is "
+        "right, in the mean over cells; 0 is perfect.",
+    ),
+    "brier": (
+        "Brier\n",
+        "squared distance of the class probabilities to the truth, which is 1 for the true class and 0 for the "
+        "rest; 0 is perfect, 2 is sure and wrong.",
+    ),
+    "entropy": (
+        "entropy\n[nats]",
+        "mean uncertainty of the class in nats; 0 is sure.",
+    ),
+    "mutual_information": (
+        "mutual\ninf.",
+        "the part of the entropy in which the members of an ensemble disagree, in nats.",
+    ),
+    "entropy_auroc": (
+        "AUROC\nentropy",
+        "how often a wrongly classified cell has a higher entropy than a right one: 1 where uncertainty finds "
+        "every error, 0.5 where it tells nothing.",
+    ),
+    "mutual_information_auroc": (
+        "AUROC\nm. inf.",
+        "the same of mutual information.",
+    ),
+    "rmse_observed": (
+        "RMSE\nλ",
+        "typical distance of the predicted mean to λ as observed; the noise of the ground stays in it, even for "
+        "a perfect model.",
+    ),
+    "rmse_expected": (
+        "RMSE\nE[λ]",
+        "typical distance of the predicted mean to the true mean of λ; 0 is perfect, and – stands where the true "
+        "mean is unknown.",
+    ),
+    "nll": (
+        "NLL\nλ",
+        "minus the logarithm of the predicted density at λ as observed, in the mean; lower is better, and it may "
+        "be negative.",
+    ),
+    "crps": (
+        "CRPS\nλ",
+        "continuous ranked probability score: distance of the predicted distribution to λ as observed, in units "
+        "of λ; lower is better.",
+    ),
+    "coverage": (
+        "in 90 %\n(0.9)",
+        "share of observed λ within the central 90 % of their prediction; 0.9 is perfect, and less means that "
+        "the model is too sure.",
+    ),
+    "tail_rate": (
+        "< VaR\n(0.1)",
+        "share of observed λ under the value at risk (VaR) at level 0.9, under which a tenth should fall; 0.1 is "
+        "perfect, and more means that bad ground comes more often than predicted.",
+    ),
 }
 # Where classes look alike.
 LOOK_ALIKES = ("look_alike_accuracy", "look_alike_miou", "look_alike_share_error", "look_alike_share_ece")
+# For these a terminal is too narrow.
 _FILES_ONLY = (
     "miou_predicted",
     "entropy",
     "mutual_information",
     "look_alike_miou",
     "look_alike_share_error",
-)  # for which the terminal is too narrow
+)
+
+# Title and explanation by the name of a figure; those of map sheets go on with the split.
+_FIGURES = {
+    "confusion": (
+        "Which class is taken for which",
+        "A row is a true class, a column the most likely one; a number is a share of the row in percent. A perfect "
+        "model has 100 along the diagonal, but no model can tell classes of one colour apart. A grey row is of a class "
+        "that no map of the split shows.",
+    ),
+    "reliability": (
+        "Whether the class probabilities can be trusted",
+        "Above, how often the most likely class is right, over its probability: on the dashed line they are the same, "
+        "under it the model is too sure. ECE is the mean gap. Below, how many cells have such a probability.",
+    ),
+    "pit": (
+        "Whether the predicted distribution of λ can be trusted",
+        "The probability integral transform (PIT) says where an observed λ lies in its prediction, from 0 at the low "
+        "end to 1 at the high end. Calibrated is flat at 1. High at both ends means too sure, high in the middle not "
+        "sure enough; high at the left, in orange, that bad ground comes more often than predicted. Each panel has a "
+        "scale of its own.",
+    ),
+    "severity": (
+        "Quality over the severity of a shift",
+        "The numbers of the table over the severity of each scenario, from 0, the maps of training, to the scenario "
+        "itself at 1.",
+    ),
+    "latent": (
+        "What the Gaussian processes have learned",
+        "Traversability over slope, class by class, beside the truth in black where it is known. Where it is grey, few "
+        "of the measured cells are as steep, or none.",
+    ),
+    "maps": (
+        "Maps of",
+        "A row a map, from what the robot sees to the truth, the prediction, its error and its uncertainty; where the "
+        "true distribution of λ is unknown, λ as observed stands for it. A quantity has the same scale in all sheets "
+        "of an evaluation.",
+    ),
+}
 
 
-def quality_table(title: str, qualities: Mapping[str, Quality]) -> Table:
-    """Lays the numbers out for a terminal, a row a split; a number that there is not has a dash.
+def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = False) -> Table:
+    """Formats the numbers, a row a split; a number that there is not has a dash.
 
     Args:
         title: over the table.
         qualities: by split.
+        whole: with the numbers that a terminal is too narrow for.
     """
     rows = {split: numbers(quality) for split, quality in qualities.items()}
-    names = [name for name in _shown(rows) if name not in _FILES_ONLY]
-    table = Table(title=title, box=None, padding=(0, 1, 0, 0), header_style="bold")
-    table.add_column("split\n", overflow="fold")
-    for heading in ("maps\n", *(HEADINGS[name] for name in names)):
-        table.add_column(heading, no_wrap=True, justify="right")
-    for split, row in rows.items():
-        table.add_row(split, str(qualities[split].maps), *(_decimal(row.get(name)) for name in names))
-    return table
+    # Those that some split has, and the one whose truth may be unknown.
+    names = [
+        name
+        for name in COLUMNS
+        if (whole or name not in _FILES_ONLY)
+        and (name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values()))
+    ]
+    headings = [COLUMNS[name][0] for name in names]
+    explained = [
+        (" ".join(heading.split()), COLUMNS[name][1]) for heading, name in zip(headings, names, strict=True)
+    ]
+    return Table(
+        title=title,
+        headings=("split\n", "maps\n", *headings),
+        numbers=True,
+        rows=tuple(
+            (split, str(qualities[split].maps), *(_decimal(row.get(name, math.nan)) for name in names))
+            for split, row in rows.items()
+        ),
+        explained=(("split", "the maps that were measured; their number is under maps."), *explained),
+    )
 
 
 def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> str:
@@ -73,14 +192,7 @@ def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> 
         about: what is said of model and data.
         qualities: by split.
     """
-    splits = {
-        split: {
-            "maps": quality.maps,
-            **_class_numbers(quality),
-            **asdict(quality.traversability),
-        }
-        for split, quality in qualities.items()
-    }
+    splits = {split: {"maps": quality.maps, **_everything(quality)} for split, quality in qualities.items()}
     all_series = {
         scenario: [{"severity": severity, "split": split} for severity, split in pairs]
         for scenario, pairs in find_series(qualities).items()
@@ -93,22 +205,22 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 
     `std` stands at severity 0 with no scenario, as it begins every series.
     """
-    pairs: dict[str, tuple[str, float]] = {}
-    for scenario, series in find_series(qualities).items():
-        for severity, split in series:
-            pairs[split] = (scenario if severity else "", severity)
-    text = io.StringIO()
-    columns = [
-        name for name in HEADINGS if name not in LOOK_ALIKES or any(map(_has_look_alikes, qualities.values()))
-    ]
-    writer = csv.DictWriter(text, ["split", "scenario", "severity", "maps", *columns], lineterminator="\n")
-    writer.writeheader()
-    for split, quality in qualities.items():
-        scenario, severity = pairs.get(split, ("", math.nan))
-        row = {name: f"{value:.6g}" for name, value in numbers(quality).items() if math.isfinite(value)}
-        place = {"scenario": scenario, "severity": "" if math.isnan(severity) else f"{severity:g}"}
-        writer.writerow({"split": split, "maps": quality.maps} | place | row)
-    return text.getvalue()
+    import pandas as pd
+
+    table = pd.DataFrame({split: numbers(quality) for split, quality in qualities.items()}).T
+    table = table.replace((math.inf, -math.inf), math.nan)
+    alike = any(item.look_alikes for quality in qualities.values() for item in quality.classes)
+    table = table.reindex(columns=[name for name in COLUMNS if alike or name not in LOOK_ALIKES])
+    places = {
+        split: (scenario if severity else "", severity)
+        for scenario, series in find_series(qualities).items()
+        for severity, split in series
+    }
+    scenarios, severities = zip(*(places.get(split, ("", math.nan)) for split in qualities), strict=True)
+    table.insert(0, "scenario", scenarios)
+    table.insert(1, "severity", severities)
+    table.insert(2, "maps", [quality.maps for quality in qualities.values()])
+    return table.to_csv(index_label="split", float_format="%.6g")
 
 
 def quality_markdown(
@@ -122,15 +234,7 @@ def quality_markdown(
         notes: lines under the table.
         figures: paths of images from the page, each named for what it shows.
     """
-    rows = {split: numbers(quality) for split, quality in qualities.items()}
-    names = _shown(rows)
-    headings = ["split", "maps", *(" ".join(HEADINGS[name].split()) for name in names)]
-    lines = [f"# {title}", "", "| " + " | ".join(headings) + " |", "|---" + "|---:" * (len(names) + 1) + "|"]
-    for split, row in rows.items():
-        cells = [split, str(qualities[split].maps), *(_decimal(row.get(name)) for name in names)]
-        lines.append("| " + " | ".join(cells) + " |")
-    lines += ["", "- **split**: the maps that were measured; their number is under **maps**."]
-    lines += [f"- **{heading}**: {COLUMNS[name]}" for heading, name in zip(headings[2:], names, strict=True)]
+    lines = [f"# {title}", "", to_markdown(quality_table(title, qualities, whole=True)).rstrip()]
     lines += [text for note in notes for text in ("", note)]
     for path in figures:
         heading, text = caption(PurePath(path).stem, qualities)
@@ -139,35 +243,22 @@ def quality_markdown(
 
 
 def numbers(quality: Quality) -> dict[str, float]:
-    """The single numbers of a split's quality by name, in the order of `HEADINGS`."""
-    values = {**_class_numbers(quality), **vars(quality.traversability)}
-    return {name: float(values[name]) for name in HEADINGS if name in values}
+    """The single numbers of a split's quality by name, in the order of `COLUMNS`."""
+    values = _everything(quality)
+    return {name: float(values[name]) for name in COLUMNS if name in values}
 
 
-def _class_numbers(quality: Quality) -> dict[str, Any]:
-    """Everything of a split's classes, by name; what is of look-alikes only where there are any."""
-    found: dict[str, Any] = {}
+def _everything(quality: Quality) -> dict[str, Any]:
+    """Everything of a split by name; what is of look-alikes only where there are any."""
+    values: dict[str, Any] = {}
     for item in quality.classes:
-        found |= asdict(item)
-        found |= found.pop("look_alikes") or {}
-    return found
+        values |= asdict(item)
+        values |= values.pop("look_alikes") or {}
+    return values | asdict(quality.traversability)
 
 
-def _has_look_alikes(quality: Quality) -> bool:
-    return any(item.look_alikes is not None for item in quality.classes)
-
-
-def _shown(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Names of the numbers that some split has, and of the one whose truth may be unknown."""
-    return [
-        name
-        for name in HEADINGS
-        if name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values())
-    ]
-
-
-def _decimal(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.4f}"
+def _decimal(value: float) -> str:
+    return NOTHING if math.isnan(value) else f"{value:.4f}"
 
 
 def _finite(value: Any) -> Any:
@@ -177,3 +268,21 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def caption(figure: str, splits: Iterable[str]) -> tuple[str, str]:
+    """Gives the title of a figure, and what it shows.
+
+    Args:
+        figure: its name, such as `pit`, or `maps-test-std` of a map sheet.
+        splits: names of those that were measured.
+    """
+    if figure in _FIGURES:
+        return _FIGURES[figure]
+    title, text = _FIGURES["maps"]
+    return f"{title} {next(split for split in splits if sheet_name(split) == figure)}", text
+
+
+def sheet_name(split: str) -> str:
+    """Name of the map sheet of a split."""
+    return f"maps-{split.replace('/', '-')}"

@@ -1,21 +1,38 @@
-"""Scores of predicted probabilities: of distributions of traversability, and of classes.
+"""Scores of predicted probabilities: of distributions of traversability, of classes, and of their uncertainty.
 
 Calibration of λ is read off the probability integral transform (PIT) of what was observed: uniform
 when the predicted distributions are right. Where λ was clipped the distribution has an atom, and the
 PIT is drawn uniformly within it, so it is uniform there too. Sources: Gneiting and Raftery (2007),
 "Strictly proper scoring rules" (CRPS, Brier score); Czado et al. (2009), "Predictive model assessment
 for count data" (randomised PIT); Guo et al. (2017), "On calibration of modern neural networks"
-(reliability, ECE). Letters in shapes: K components, C classes, H×W cells, *B any leading dimensions.
+(reliability, ECE).
+
+The entropy of a prediction is its whole uncertainty. Of an ensemble, the part that its members do
+not share (mutual information of class and member, "BALD") is the epistemic one: what more training
+data would settle. In nats. Sources: Houlsby et al. (2011), "Bayesian active learning for
+classification and preference learning"; Lakshminarayanan et al. (2017), "Simple and scalable
+predictive uncertainty estimation using deep ensembles".
+
+Of classes that look alike, which are shown together, a perfect classifier says 1/2 each. So accuracy is
+also given with them merged into one class, and of the shares of the single classes within that one whether
+they are what they should be.
+
+Letters in shapes: K components, M members, B maps, C classes, G look-alikes, H×W cells, *B any leading
+dimensions.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import Metric
+from torchmetrics import Metric, MetricCollection
+from torchmetrics.classification import MulticlassAccuracy
 
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.models.nets.classifier import MeanIoU
 
 LEVEL = 0.9
 CONFIDENCE_BINS = 15
@@ -24,6 +41,8 @@ PIT_BINS = 20
 _QUADRATURE_NODES = 48
 _SMALLEST_STD = 1e-9
 _UNDER_1 = 1 - 2**-53  # the largest float64 under 1
+_DROPPED_BITS = 13  # of a float32's 23 fraction bits: scores that differ by over 0.1 % are distinct
+_PLACES = 2 ** (31 - _DROPPED_BITS)
 
 
 def crps(mixture: TraversabilityMixture, observed: Tensor) -> Tensor:
@@ -174,3 +193,136 @@ def _integrated_cdf(mixture: TraversabilityMixture, value: Tensor) -> Tensor:
     z = (value.unsqueeze(-3) - means) / stds
     density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
     return (weights * stds * (z * torch.special.ndtr(z) + density)).sum(-3)
+
+
+def predictive_entropy(probabilities: Tensor) -> Tensor:
+    """Entropy −Σ_c p_c ln p_c of the class in each cell.
+
+    Args:
+        probabilities: summing to 1 over C, shape [*B, C, H, W].
+
+    Returns:
+        Nats in [0, ln C], shape [*B, H, W].
+    """
+    return torch.special.entr(probabilities).sum(-3)
+
+
+def mutual_information(member_probabilities: Tensor) -> Tensor:
+    """Mutual information of class and member: the entropy of the mean less the mean of the entropies.
+
+    Args:
+        member_probabilities: of M equally trusted members, shape [M, B, C, H, W].
+
+    Returns:
+        Nats in [0, ln min(M, C)], 0 where all members agree, shape [B, H, W].
+    """
+    members = member_probabilities.double()
+    shared = predictive_entropy(members).mean(0)
+    return (predictive_entropy(members.mean(0)) - shared).clamp(min=0).to(member_probabilities.dtype)
+
+
+class ErrorRanking(Metric):
+    """AUROC of a score as a sign of error: how often a wrong cell has a higher one than a right cell.
+
+    Scores are counted by size in steps of 0.1 %, fine at every scale, so memory is bounded however many
+    cells there are; a tie counts half. torchmetrics' AUROC would need 262 144 thresholds for the same, all of which it
+    goes through for each batch.
+    """
+
+    full_state_update = False
+    counts: Tensor
+
+    def __init__(self) -> None:
+        """Starts with no cells."""
+        super().__init__()
+        self.add_state("counts", torch.zeros(2, _PLACES, dtype=torch.int64), dist_reduce_fx="sum")
+
+    def update(self, score: Tensor, wrong: Tensor) -> None:
+        """Adds cells: scores ≥ 0, and whether each is wrongly classified, of one shape."""
+        # The bits of a float ≥ 0, read as an integer, are in the order of the floats.
+        place = score.float().clamp(min=0).abs().view(torch.int32).long() >> _DROPPED_BITS
+        counted = torch.bincount((place + wrong * _PLACES).flatten(), minlength=2 * _PLACES)
+        self.counts += counted.view(2, _PLACES)
+
+    def compute(self) -> Tensor:
+        """The AUROC in [0, 1], 0.5 for a score that tells nothing; not a number where all or none are wrong."""
+        right, wrong = self.counts.double()
+        lower = right.cumsum(0) - right / 2
+        return (wrong * lower).sum() / (right.sum() * wrong.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class LookAlikeQuality:
+    """Quality of class probabilities where classes look alike.
+
+    Args:
+        look_alike_accuracy: share of cells whose most likely class is right, look-alikes merged into one.
+        look_alike_miou: intersection over union, look-alikes merged, averaged over the classes that occur in truth.
+        look_alike_share_error: over the cells of classes with look-alikes, mean distance of the share of the
+            true class within them to that which a perfect classifier says: 1/2 of two.
+        look_alike_share_ece: expected calibration error of the larger share, 15 bins.
+    """
+
+    look_alike_accuracy: float
+    look_alike_miou: float
+    look_alike_share_error: float
+    look_alike_share_ece: float
+
+
+class LookAlikeTally:
+    """Counts of class probabilities over maps, look-alikes merged.
+
+    Args:
+        alike: of each class those that look like it, itself among them.
+        device: where the maps are.
+    """
+
+    def __init__(self, alike: Sequence[tuple[int, ...]], device: torch.device) -> None:
+        """Starts with no cells."""
+        self.groups = sorted({own for own in alike if len(own) > 1})
+        names = sorted({min(own) for own in alike})
+        count = max(2, len(names))  # of fewer there are no scores
+        self.merged = torch.tensor([names.index(min(own)) for own in alike], device=device)
+        self.scores = MetricCollection(
+            {
+                "accuracy": MulticlassAccuracy(count, average="micro"),
+                "miou": MeanIoU(count),
+            }
+        ).to(device)
+        self.curve = ReliabilityCurve().to(device)
+        self.distance, self.cells = 0.0, 0
+
+    def add(self, probabilities: Tensor, class_id: Tensor) -> None:
+        """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
+        size = int(self.merged.max()) + 1
+        shape = (len(probabilities), size, *probabilities.shape[2:])
+        merged = torch.zeros(shape, device=probabilities.device, dtype=probabilities.dtype)
+        merged.index_add_(1, self.merged, probabilities)
+        self.scores.update(merged.argmax(1), self.merged[class_id])
+        for group in self.groups:
+            self._add_shares(probabilities[:, list(group)], class_id, group)
+
+    def _add_shares(self, probabilities: Tensor, class_id: Tensor, group: tuple[int, ...]) -> None:
+        """Adds the shares within one set of look-alikes, [B, G, H, W], of the cells that are of them."""
+        here = torch.isin(class_id, torch.tensor(group, device=class_id.device))
+        if not bool(here.any()):
+            return
+        own = probabilities.movedim(1, -1)[here].double()  # [N, G]
+        total = own.sum(1, keepdim=True)
+        shares = torch.where(total > 0, own / total, 1 / len(group))
+        place = (class_id[here].unsqueeze(1) == torch.tensor(group, device=class_id.device)).int().argmax(1)
+        right = shares.gather(1, place.unsqueeze(1))
+        self.distance += float((right - 1 / len(group)).abs().sum())
+        self.cells += len(shares)
+        self.curve.update(shares.T[None, :, None], place[None, None])
+
+    def quality(self) -> LookAlikeQuality:
+        """What was counted; the shares are not a number where no look-alike occurred."""
+        scores = self.scores.compute()
+        missing = float("nan")
+        return LookAlikeQuality(
+            look_alike_accuracy=float(scores["accuracy"]),
+            look_alike_miou=float(scores["miou"]),
+            look_alike_share_error=self.distance / self.cells if self.cells else missing,
+            look_alike_share_ece=calibration_error(self.curve.compute().cpu()) if self.cells else missing,
+        )

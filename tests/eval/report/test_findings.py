@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.report.findings import findings, p_in_words
+from benchnav.eval.report.findings import findings
 from tests.eval.report import made
 
 NONE = pd.DataFrame({"condition": [], "last_traversability": []})
@@ -148,7 +148,3 @@ def test_each_block_has_its_own_finding() -> None:
     assert [finding.title for finding in found] == ["std, a", "hg, b"]
     assert "90 %" in found[0].sentences[0]
     assert "20 %" in found[1].sentences[0]
-
-
-def test_p_in_words() -> None:
-    assert [p_in_words(p) for p in (0.00001, 0.0123, 1.0)] == ["p ≤ 0.0001", "p = 0.012", "p = 1"]

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from benchnav.eval.experiment.hypotheses import digest_of_tests
-from benchnav.eval.report.charts.forest import forest_figure
+from benchnav.eval.report.charts.conditions import forest_figure
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.write import write_report
 from tests.eval.report import made

@@ -5,9 +5,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from benchnav.core.tables import Table
 from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.page import Drawn, provenance_lines, write_page
-from benchnav.eval.report.tables import ResultTable
 from tests.eval.forged import code_with
 
 EVIL = "<script>alert(1)</script> & \"quoted\" 'too'"
@@ -40,7 +40,7 @@ class Page(HTMLParser):
 def page(tmp_path: Path) -> Page:
     picture = tmp_path / "success.png"
     matplotlib.image.imsave(picture, np.zeros((20, 1000, 3)))
-    table = ResultTable(
+    table = Table(
         headings=("planner", EVIL), labels=1, rows=(("a", "1"), (EVIL, "2")), notes=(EVIL,),
         bold=frozenset({(1, 1)}), bold_note="the best", explained=(("planner", EVIL),),
     )  # fmt: skip

@@ -11,9 +11,8 @@ from benchnav.core import registry
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.cli import main
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality import baseline, map_sheet
-from benchnav.models.quality.baseline import nearest_colour_accuracy
-from benchnav.models.quality.measure import evaluate
+from benchnav.models.quality import map_sheet, measure
+from benchnav.models.quality.measure import evaluate, nearest_colour_accuracy
 from tests.models.stub import ColourModel
 
 
@@ -72,7 +71,7 @@ def test_a_folder_holds_report_page_and_figures(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
     out = tmp_path / "new" / "quality"
     asked = ["colours", "--data", dataset.path, "--out", out, "--maps", 1]
     draw, titles = map_sheet.map_sheet_figure, []
@@ -83,15 +82,13 @@ def test_a_folder_holds_report_page_and_figures(
     assert titles == ["model colours on dataset tiny-v1"] * 2
     assert {path.name for path in out.iterdir()} == {"quality.json", "quality.csv", "quality.md", "figures"}
     figures = {path.name for path in (out / "figures").iterdir()}
-    assert figures == {
-        "confusion.png", "reliability.png", "pit.png", "latent.png",
-        "maps-test-std.png", "maps-test-hs.png",
-    }  # fmt: skip
+    names = {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"}
+    assert figures == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     printed = capfd.readouterr().out
     assert "no series" in printed
     assert printed.splitlines()[-1] == f"what the columns and figures mean: {out}/quality.md"
     page = (out / "quality.md").read_text()
-    assert all(f"(figures/{name})" in page for name in figures)
+    assert all(f"(figures/{name}.png)" in page for name in names)
     assert "nearest colour" in page
     assert len(list(csv.DictReader((out / "quality.csv").open()))) == 2
 
@@ -100,7 +97,7 @@ def test_a_folder_holds_report_page_and_figures(
     assert "--overwrite" in capfd.readouterr().err
     assert json.loads((out / "quality.json").read_text())["model"] == "colours"
     assert call(monkeypatch, "oracle", "--data", dataset.path, "--out", out, "--maps", 0, "--overwrite") == 0
-    assert {path.name for path in (out / "figures").iterdir()} == {"pit.png"}
+    assert {path.name for path in (out / "figures").iterdir()} == {"pit.png", "pit.pdf"}
     said = capfd.readouterr().out
     assert "predicts no classes" in said
     assert "no Gaussian processes" in said
@@ -111,7 +108,7 @@ def test_a_folder_holds_report_page_and_figures(
 def test_a_series_is_drawn_where_there_is_one(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
     held = dict(dataset.manifest["splits"])
     monkeypatch.setattr(
         TerrainDataset, "splits", property(lambda self: {**held, "test/hs-100": held["test/hs"]})
@@ -215,9 +212,9 @@ def test_a_model_that_is_right_less_often_than_the_nearest_colour_is_told_so(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("benchnav.models.quality.figures.DPI", 30)
+    monkeypatch.setattr("benchnav.models.quality.command.DPI", 30)
     shares = {"test/std": 0.999, "test/hs": 0.0}
-    monkeypatch.setattr(baseline, "nearest_colour_accuracy", lambda _, split: shares[split])
+    monkeypatch.setattr(measure, "nearest_colour_accuracy", lambda _, split: shares[split])
     line = "warning: the model is right less often than the nearest colour on test/std"
     out = tmp_path / "quality"
     assert call(monkeypatch, "colours", "--data", dataset.path, "--out", out, "--maps", 0) == 0

@@ -1,7 +1,5 @@
 from dataclasses import replace
-from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 import pytest
 import torch
@@ -20,7 +18,6 @@ from benchnav.models.quality.figures import (
     latent_figure,
     pit_figure,
     reliability_figure,
-    save_figure,
     severity_figure,
 )
 from benchnav.models.quality.measure import Quality, Reliability, evaluate
@@ -185,13 +182,6 @@ def test_a_class_that_was_not_measured_is_shaded_throughout(dataset: TerrainData
     figure = latent_figure(ColourModel().table, classes, [[0] * 90 for _ in classes])
     assert [span.get_x() for span in panel(figure, classes[0].name).patches] == [0, 0]
     assert figure.axes[0].get_xlim()[1] == pytest.approx(10)
-
-
-def test_a_figure_is_written_whole(qualities: Qualities, tmp_path: Path) -> None:
-    path = tmp_path / "new" / "one.png"
-    save_figure(pit_figure({split: quality.traversability for split, quality in qualities.items()}), path)
-    assert matplotlib.image.imread(path).shape[1] == 7.2 * 300
-    assert [one.name for one in path.parent.iterdir()] == ["one.png"]
 
 
 @pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's where a layout does not work out

@@ -9,7 +9,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import class_colours
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.map_sheet import map_sheet_figure, read_sheet, shared_scales
-from benchnav.models.quality.uncertainty import mutual_information, predictive_entropy
+from benchnav.models.quality.scores import mutual_information, predictive_entropy
 from tests.models.stub import ColourModel
 
 

@@ -1,4 +1,7 @@
+import json
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -6,19 +9,34 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import ndtr
+from scipy.stats import entropy, mannwhitneyu
+from torch import Tensor
 from torchmetrics.functional.classification import multiclass_calibration_error
 
+from benchnav.core import registry
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.datagen.files.create import create
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.models.quality.command import evaluate as evaluate_command
+from benchnav.models.quality.measure import evaluate
+from benchnav.models.quality.report import LOOK_ALIKES, quality_csv, quality_json, quality_markdown
 from benchnav.models.quality.scores import (
     BrierScore,
+    ErrorRanking,
+    LookAlikeQuality,
+    LookAlikeTally,
     ReliabilityCurve,
     calibration_error,
     coverage,
     crps,
+    mutual_information,
     pit,
     pit_counts,
+    predictive_entropy,
     tail_rate,
 )
+from tests.models.stub import ColourModel
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -145,3 +163,224 @@ def test_the_brier_score_is_the_squared_distance_to_the_truth() -> None:
         score.update(one, truth)
     there = torch.nn.functional.one_hot(classes, 4).movedim(-1, 1)
     assert float(score.compute()) == pytest.approx(float((probabilities - there).square().sum(1).mean()))
+
+
+def cell(*probabilities: float) -> torch.Tensor:
+    return torch.tensor(probabilities, dtype=torch.float32).view(1, -1, 1, 1)
+
+
+def test_entropy_is_zero_for_certainty_and_greatest_for_none() -> None:
+    assert float(predictive_entropy(cell(0, 1, 0, 0))) == 0
+    assert float(predictive_entropy(cell(0.25, 0.25, 0.25, 0.25))) == pytest.approx(math.log(4))
+
+
+def test_entropy_is_that_of_scipy() -> None:
+    probabilities = torch.randn(2, 5, 3, 4, generator=generator(), dtype=torch.float64).softmax(1)
+    expected = torch.from_numpy(entropy(probabilities.numpy(), axis=1))
+    torch.testing.assert_close(predictive_entropy(probabilities), expected)
+
+
+def test_members_that_agree_share_no_doubt_and_sure_ones_that_differ_have_nothing_else() -> None:
+    unsure = cell(0.5, 0.5, 0)
+    assert float(mutual_information(torch.stack([unsure, unsure]))) == 0
+    differ = torch.stack([cell(1, 0, 0), cell(0, 1, 0), cell(0, 0, 1)])
+    assert float(mutual_information(differ)) == pytest.approx(math.log(3))
+    assert mutual_information(differ).dtype == differ.dtype
+
+
+def test_rounding_makes_no_information_negative() -> None:
+    one = torch.randn(1, 1, 10, 40, 40, generator=generator(), dtype=torch.float64).softmax(2)
+    information = mutual_information(one.expand(7, -1, -1, -1, -1))
+    assert 0 <= float(information.min()) <= float(information.max()) < 1e-12
+
+
+def test_mutual_information_is_the_mean_divergence_from_the_mean() -> None:
+    members = torch.randn(4, 2, 5, 3, 3, generator=generator(), dtype=torch.float64).softmax(2)
+    expected = entropy(members.numpy(), members.mean(0, keepdim=True).numpy(), axis=2).mean(0)
+    torch.testing.assert_close(mutual_information(members), torch.from_numpy(expected))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**31), members=st.integers(1, 4), sharpness=st.floats(0.1, 50))
+def test_mutual_information_lies_between_nothing_and_the_entropy(
+    seed: int, members: int, sharpness: float
+) -> None:
+    drawn = (sharpness * torch.randn(members, 1, 3, 2, 2, generator=generator(seed))).softmax(2)
+    information = mutual_information(drawn)
+    assert bool((information >= 0).all())
+    assert bool((information <= math.log(min(members, 3)) + 1e-6).all())
+    assert bool((information <= predictive_entropy(drawn.mean(0)) + 1e-6).all())
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_the_ranking_of_errors_is_the_statistic_of_mann_and_whitney(scale: float) -> None:
+    wrong = torch.rand(4000, generator=generator()) < 0.2
+    score = scale * (torch.randn(4000, generator=generator(1)) + wrong).exp()
+    score[::7] = 0  # ties
+    ranking = ErrorRanking()
+    for part in (slice(0, 1500), slice(1500, None)):
+        ranking.update(score[part], wrong[part])
+    exact = mannwhitneyu(score[wrong].numpy(), score[~wrong].numpy()).statistic
+    exact /= int(wrong.sum()) * int((~wrong).sum())
+    assert float(ranking.compute()) == pytest.approx(exact, abs=1e-4)
+    assert exact > 0.6
+
+
+def test_a_ranking_is_right_wrong_or_blind() -> None:
+    wrong = torch.tensor([[True, False], [False, True]])
+    for score, expected in (
+        (torch.tensor([[2.0, 1.0], [0.0, 3.0]]), 1.0),
+        (torch.tensor([[0.0, 1.0], [2.0, -0.0]]), 0.0),
+        (torch.ones(2, 2), 0.5),
+    ):
+        ranking = ErrorRanking()
+        ranking.update(score, wrong)
+        assert float(ranking.compute()) == expected
+
+
+def test_a_score_under_zero_by_rounding_is_of_the_surest() -> None:
+    ranking = ErrorRanking()
+    ranking.update(torch.tensor([-1e-6, 1e-8]), torch.tensor([False, True]))
+    assert float(ranking.compute()) == 1
+
+
+def test_without_errors_there_is_no_ranking() -> None:
+    ranking = ErrorRanking()
+    ranking.update(torch.rand(5, generator=generator()), torch.zeros(5, dtype=torch.bool))
+    assert math.isnan(float(ranking.compute()))
+
+
+ALIKE = [(0, 2), (1,), (0, 2), (3,)]  # the first and the third of four classes
+
+
+def tally(probabilities: Tensor, class_id: Tensor, alike: list[tuple[int, ...]] = ALIKE) -> LookAlikeQuality:
+    """Of cells in a row: probabilities [N, C] and classes [N]."""
+    counted = LookAlikeTally(alike, torch.device("cpu"))
+    for part in torch.arange(len(class_id)).tensor_split(3):
+        counted.add(probabilities[part].T[None, :, None], class_id[part][None, None])
+    return counted.quality()
+
+
+def drawn(cells: int, share: Tensor) -> Tensor:
+    """Classes of cells that are the first of two with probability `share` [N], else the third."""
+    first = torch.rand(cells, generator=torch.Generator().manual_seed(0)) < share
+    return torch.where(first, 0, 2)
+
+
+def test_what_is_right_but_for_look_alikes_is_right_when_they_are_merged() -> None:
+    class_id = torch.tensor([0, 2, 0, 1, 3, 3])
+    found = torch.tensor([2, 0, 0, 1, 3, 1])
+    probabilities = torch.nn.functional.one_hot(found, 4).float()
+    quality = tally(probabilities, class_id)
+    assert quality.look_alike_accuracy == pytest.approx(5 / 6)
+    # Intersection over union: look-alikes 3/3, the second 1/2, the fourth 1/2.
+    assert quality.look_alike_miou == pytest.approx((1 + 1 / 2 + 1 / 2) / 3)
+
+
+def test_look_alikes_that_together_weigh_most_are_found() -> None:
+    quality = tally(torch.tensor([[0.3, 0.4, 0.3, 0.0]] * 6), torch.tensor([0, 2, 0, 2, 0, 2]))
+    assert quality.look_alike_accuracy == 1
+
+
+def test_of_two_look_alikes_one_half_each_is_right() -> None:
+    share = torch.full((4000,), 0.5)
+    class_id = drawn(4000, share)
+    fair = torch.tensor([0.35, 0.2, 0.35, 0.1]).expand(4000, -1)
+    quality = tally(fair, class_id)
+    assert quality.look_alike_share_error == pytest.approx(0, abs=1e-6)
+    assert quality.look_alike_share_ece < 0.03
+    sure = torch.tensor([0.7, 0.2, 0.0, 0.1]).expand(4000, -1)
+    quality = tally(sure, class_id)
+    assert quality.look_alike_share_error == pytest.approx(0.5)
+    assert quality.look_alike_share_ece == pytest.approx(0.5, abs=0.03)
+
+
+def test_shares_other_than_one_half_may_be_calibrated() -> None:
+    share = torch.where(torch.arange(20_000) % 2 == 0, 0.8, 0.3)
+    class_id = drawn(20_000, share)
+    told = torch.stack([0.6 * share, torch.full_like(share, 0.4), 0.6 * (1 - share), 0 * share], 1)
+    quality = tally(told, class_id)
+    assert quality.look_alike_share_ece < 0.02
+    assert quality.look_alike_share_error == pytest.approx(0.25, abs=1e-5)
+    assert quality.look_alike_accuracy == 1
+
+
+def test_cells_of_other_classes_and_without_any_share_count_as_nothing_and_as_one_half() -> None:
+    probabilities = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.9, 0.1, 0.0, 0.0]])
+    quality = tally(probabilities, torch.tensor([0, 1]))
+    assert quality.look_alike_share_error == 0
+    none = tally(probabilities, torch.tensor([1, 3]))
+    assert math.isnan(none.look_alike_share_error)
+    assert math.isnan(none.look_alike_share_ece)
+
+
+def test_of_three_look_alikes_a_third_each_is_right() -> None:
+    alike = [(0, 1, 2)] * 3
+    probabilities = torch.full((9, 3), 1 / 3)
+    quality = tally(probabilities, torch.arange(9) % 3, alike)
+    assert quality.look_alike_share_error == pytest.approx(0, abs=1e-6)
+    assert quality.look_alike_accuracy == 1
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
+    """Maps of ten classes of which the first four are of two colours."""
+    recipe = load_recipe("tiny-v1")
+    colours = [item.colour for item in recipe.classes]
+    classes = tuple(
+        replace(item, colour=colours[place // 2 if place < 4 else place])
+        for place, item in enumerate(recipe.classes)
+    )
+    splits = {name: replace(recipe.splits[name], maps=2) for name in ("test/std", "test/hs")}
+    path = tmp_path_factory.mktemp("look_alikes") / "look_alikes.h5"
+    for _ in create(replace(recipe, classes=classes, splits=splits), path):
+        pass
+    return TerrainDataset(path)
+
+
+def test_a_dataset_with_look_alikes_is_measured_with_them_merged(
+    dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = ColourModel()
+    model.colours = torch.tensor([item.colour for item in dataset.recipe.classes]).float()
+    qualities = dict(evaluate(model, dataset))
+    (measured,) = qualities["test/std"].classes
+    assert measured.look_alikes is not None
+    assert measured.look_alikes.look_alike_accuracy > measured.accuracy
+    assert measured.look_alikes.look_alike_share_error == pytest.approx(
+        0, abs=1e-6
+    )  # one colour, one probability
+    row = json.loads(quality_json({}, qualities))["splits"]["test/std"]
+    assert {name: row[name] for name in LOOK_ALIKES} == pytest.approx(vars(measured.look_alikes))
+    assert f"{measured.look_alikes.look_alike_accuracy:.6g}" in quality_csv(qualities)
+    page = quality_markdown("", qualities, [], [])
+    assert "mIoU look-alikes=1" in page
+    assert len({row.count("|") for row in page.splitlines() if row.startswith("|")}) == 1
+
+
+def test_the_command_writes_and_draws_look_alikes(
+    dataset: TerrainDataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    registry.register("model", "colours", ColourModel)
+    evaluate_command("colours", str(dataset.path), out=str(tmp_path / "q"), maps=1)
+    assert "look-alikes=1" in capfd.readouterr().out
+    assert (tmp_path / "q" / "figures" / "confusion.png").is_file()
+    assert "look-alikes=1" in (tmp_path / "q" / "quality.md").read_text()
+
+
+def test_a_dataset_without_look_alikes_has_no_such_numbers(dataset: TerrainDataset, tmp_path: Path) -> None:
+    plain = load_recipe("tiny-v1")
+    splits = {"test/std": replace(plain.splits["test/std"], maps=1)}
+    for _ in create(replace(plain, splits=splits), tmp_path / "plain.h5"):
+        pass
+    qualities = dict(evaluate(ColourModel(), TerrainDataset(tmp_path / "plain.h5")))
+    assert qualities["test/std"].classes[0].look_alikes is None
+    assert "look_alikes" not in quality_markdown("", qualities, [], [])
+    assert not {*LOOK_ALIKES, "look_alikes"} & set(
+        json.loads(quality_json({}, qualities))["splits"]["test/std"]
+    )
+    assert "look-alike" not in quality_csv(qualities)

@@ -5,7 +5,6 @@ met; below, λ as it was where it stayed so, else the λ̂ that the planner was 
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -17,11 +16,12 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from benchnav.eval.report.contenders import contender_names
-from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS, condition_name
+from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map, unit
+from benchnav.eval.report.charts.maps import plan_layer, soft_lines
 from benchnav.eval.report.recorded.drawn_plan import STYLES
-from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, immobilised_at, outline
+from benchnav.eval.report.recorded.ground import field_colours, immobilised_at
 from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.report.words import condition_name, contender_names
 
 # Red, green, blue of the robot, as no λ is coloured.
 ROBOT = (255, 120, 0)
@@ -31,7 +31,7 @@ _PANEL, _GAP, _HEAD, _FOOT = 440, 20, 92, 76  # pixels
 _TALLEST = 2.0  # of a map, over its width
 _ROBOT_M = np.array([(0.9, 0.0), (-0.6, 0.5), (-0.6, -0.5)])
 _CLOSED = 0.25
-_LINE_WIDTH = 0.5
+_MARKS = 1.6  # over those of a printed figure
 
 
 class Frames:
@@ -54,7 +54,11 @@ class Frames:
         self._figure = Figure(figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
         self._columns = []
-        for place, (recording, name) in enumerate(zip(recordings, _names(recordings), strict=True)):
+        if len(recordings) == 1:
+            names = [condition_name(recordings[0].about)]
+        else:
+            names = contender_names([recording.about for recording in recordings])
+        for place, (recording, name) in enumerate(zip(recordings, names, strict=True)):
             left = _GAP + place * (_PANEL + _GAP)
             panels = [
                 self._axes(left, _FOOT + row * (panel_high + _GAP), _PANEL, panel_high) for row in (1, 0)
@@ -110,7 +114,9 @@ class _Column:
         figure.text(left, 1 - 26 / top, name, fontsize=12, weight="bold")
         self._time = figure.text(left, 1 - 52 / top, "", fontsize=11, family="monospace")
         self._outcome = figure.text(left, 1 - 78 / top, "", fontsize=12, weight="bold")
-        self._layers = {name: _layer(panels[0], style) for name, style in STYLES.items()}
+        self._layers = {name: plan_layer(style) for name, style in STYLES.items()}
+        for layer in self._layers.values():
+            panels[0].add_collection(layer)
         self._driven = LineCollection([], cmap=TRAVERSABILITY_COLOURS, linewidths=3.5, capstyle="round")
         self._driven.set_clim(0, 1)
         self._edges = [
@@ -122,11 +128,10 @@ class _Column:
             )
         ]
         panels[0].add_collection(self._driven)
-        robot = [value / 255 for value in ROBOT]
-        self._robots = [Polygon(_ROBOT_M, fc=robot, ec="black", lw=0.8) for _ in panels]
+        self._robots = [Polygon(_ROBOT_M, fc=unit(ROBOT), ec="black", lw=0.8) for _ in panels]
         for panel, body in zip(panels, self._robots, strict=True):
             panel.add_patch(body)
-        self._crosses = [panel.plot([], [], "X", color="black", mec="white", ms=13)[0] for panel in panels]
+        self._crosses = [panel.plot([], [], **MARKS["end"] | {"ms": 13})[0] for panel in panels]
         _draw_ground(panels, recording)
         self.moving: list[Artist] = [
             *self._layers.values(), *self._edges, self._driven, *self._robots, *self._crosses, self._time,
@@ -162,41 +167,22 @@ class _Column:
             cross.set_data(*(([], []) if held is None else ([held[0]], [held[1]])))
 
 
-def _names(recordings: Sequence[Recording]) -> list[str]:
-    if len(recordings) == 1:
-        return [condition_name(recordings[0].about, ())]
-    return contender_names([recording.about for recording in recordings])
-
-
-def _layer(panel: Axes, style: Any) -> LineCollection:
-    red, green, blue, alpha = (value / 255 for value in style.colour)
-    lines = LineCollection(
-        [], colors=[(red, green, blue, alpha)], linewidths=_LINE_WIDTH * style.width,
-        linestyles="dashed" if style.dashed else "solid",
-    )  # fmt: skip
-    panel.add_collection(lines)
-    return lines
-
-
 def _draw_ground(panels: Sequence[Axes], recording: Recording) -> None:
-    wide, high = recording.grid.extent_m
-    panels[0].imshow(np.moveaxis(recording.rgb, 0, -1), origin="lower", extent=(0, wide, 0, high))
-    for lines in (outline, hatching):
-        drawn = list(lines(recording.soft, recording.grid.resolution_m))
-        panels[0].add_collection(
-            LineCollection(drawn, colors=[tuple(value / 255 for value in SOFT)], linewidths=0.5)
-        )
+    extent_m = recording.grid.extent_m
+    show_map(panels[0], np.moveaxis(recording.rgb, 0, -1), extent_m)
+    for lines in soft_lines(recording.soft, recording.grid.resolution_m):
+        panels[0].add_collection(lines)
     if recording.field is not None:
         shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
     else:
         shown = field_colours(recording.predicted, np.zeros_like(recording.free))
         shown[~recording.free] = round(255 * _CLOSED)
         title = "λ̂ given to the planner"
-    panels[1].imshow(shown, origin="lower", extent=(0, wide, 0, high))
+    show_map(panels[1], shown, extent_m)
     for panel, words in zip(panels, ("terrain and plan", title), strict=True):
-        panel.plot(*recording.states[0, :2], "o", color="red", mec="white", ms=8)
-        panel.plot(*recording.goal_m, "X", color="magenta", mec="white", ms=10)
-        panel.set(xlim=(0, wide), ylim=(0, high), aspect="auto", xticks=[], yticks=[])
+        mark(panel, "start", recording.states[0, :2], _MARKS)
+        mark(panel, "goal", recording.goal_m, _MARKS)
+        panel.set(xlim=(0, extent_m[0]), ylim=(0, extent_m[1]), aspect="auto", xticks=[], yticks=[])
         panel.text(
             0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
             bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},

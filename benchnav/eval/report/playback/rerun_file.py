@@ -7,11 +7,14 @@ ended, and time series; and a blueprint that arranges them.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from benchnav.core.figures import bytes_of, condition_colours
 from benchnav.core.store import replacing
-from benchnav.eval.report.contenders import condition_colours, contender_names
-from benchnav.eval.report.playback.blueprint import arrange
+from benchnav.core.tables import Table, to_markdown
+from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.playback.robot import (
+    TIMELINE,
     Driver,
     log_driven,
     log_outcome,
@@ -20,12 +23,13 @@ from benchnav.eval.report.playback.robot import (
     log_series,
 )
 from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
-from benchnav.eval.report.playback.words import describe
 from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
 
 _ALONE = (0, 170, 0)
+_ALL, _PLACES = "/map/overlay/**", "/map/places/**"
 
 
 def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
@@ -63,11 +67,11 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     """Gives each robot a name and a colour; one that is alone needs no name."""
     if len(recordings) == 1:
         return [Driver(recording=recordings[0], name="", colour=_ALONE)]
-    names = contender_names([recording.about for recording in recordings])
-    colours = condition_colours(len(recordings))
+    abouts = [recording.about for recording in recordings]
+    colours = condition_colours([about["planner"] for about in abouts])
     return [
-        Driver(recording=recording, name=name, colour=colour)
-        for recording, name, colour in zip(recordings, names, colours, strict=True)
+        Driver(recording=recording, name=name, colour=bytes_of(colour))
+        for recording, name, colour in zip(recordings, contender_names(abouts), colours, strict=True)
     ]
 
 
@@ -76,3 +80,100 @@ def _title(drivers: Sequence[Driver]) -> str:
         return drivers[0].recording.title
     about = drivers[0].recording.about
     return f"{about['scenario']} {about['map']}: {', '.join(driver.name for driver in drivers)}"
+
+
+def arrange(drivers: Sequence[Driver]) -> Any:
+    """Arranges the views: the terrain and time series to the left, maps to the right."""
+    import rerun.blueprint as rrb
+
+    series = [
+        rrb.TimeSeriesView(
+            name="Observed λ", origin="/series/traversability", axis_y=rrb.ScalarAxis(range=(0, 1))
+        ),
+        rrb.TimeSeriesView(name="Distance to the goal [m]", origin="/series/goal"),
+    ]
+    title = "All conditions"
+    if len(drivers) == 1:
+        title = drivers[0].recording.title
+        series.insert(1, rrb.TimeSeriesView(name="Commanded", origin="/series/command"))
+    flat = [
+        rrb.Spatial2DView(name=name, origin="/map", contents=contents)
+        for name, contents in map_views(drivers).items()
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                rrb.Spatial3DView(name=title, origin="/world"),
+                rrb.Horizontal(*series, rrb.TextDocumentView(name="About", origin="/about")),
+                row_shares=[3, 1],
+            ),
+            rrb.Grid(*flat, grid_columns=2),
+            column_shares=[1, 1],
+        ),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+    )
+
+
+def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
+    """What each view of a map shows, by its name."""
+    recording = drivers[0].recording
+    edges = [driver.entity("/map/closed") for driver in drivers]
+    own = edges if len(drivers) == 1 else []
+    colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
+    views = {
+        colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
+        "Mean λ in truth": ["/map/true_mean", *own, _ALL, _PLACES],
+    }
+    if recording.field is not None:
+        views["λ as it was, dark red: immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
+    for driver in drivers:
+        name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
+        shown = driver.entity("/map/overlay", "**")
+        views[name] = [driver.entity("/map/risk"), shown, _PLACES]
+    return views
+
+
+def describe(drivers: Sequence[Driver]) -> str:
+    """Says in Markdown what is shown, how each episode ended, and which ground was free."""
+    about = drivers[0].recording.about
+    lines = [f"# {about['data']}, {about['scenario']} {about['map']}", ""]
+    lines += [f"Seed {about['seed']}, realisation {about['realisation']}", ""]
+    if len(drivers) == 1:
+        recording = drivers[0].recording
+        lines += [
+            f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s",
+            "",
+        ]
+        lines += [
+            f"observed λ on average: {_mean_observed(recording)}",
+            "",
+            f"Free: {free_rule(recording)}",
+            "",
+        ]
+        used = tuple((name, about[name]) for name in NAMING if about.get(name, NOT_USED) != NOT_USED)
+        return "\n".join([*lines, to_markdown(Table(headings=("", ""), rows=used))])
+    rows = tuple(
+        (
+            driver.name,
+            driver.recording.outcome,
+            f"{driver.recording.end_s:.1f}",
+            _mean_observed(driver.recording),
+            free_rule(driver.recording),
+        )
+        for driver in drivers
+    )
+    headings = ("condition", "outcome", "time [s]", "observed λ", "free")
+    table = Table(headings=headings, rows=rows, bold=frozenset((place, 1) for place in range(len(rows))))
+    return "\n".join([*lines, to_markdown(table)])
+
+
+def free_rule(recording: Recording) -> str:
+    """Which ground was free, in words."""
+    by = "mean λ" if recording.free_by == "mean" else "λ̂"
+    return f"{by} above {recording.free_above:g}"
+
+
+def _mean_observed(recording: Recording) -> str:
+    return f"{recording.traversability.mean():.2f}" if len(recording.traversability) else NOT_USED

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib
 import numpy as np
 
-from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
-from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground
+from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground, shades
 from benchnav.eval.report.recorded.drawn_plan import STYLES, DrawnPlan, drawing_interval, thinned
 from benchnav.eval.report.recorded.ground import immobilised_at
 from benchnav.eval.report.recorded.recording import Recording
@@ -104,8 +102,7 @@ def log_driven(stream: Any, driver: Driver) -> None:
     place = recording.states[:, :2].astype(np.float32)
     lifted, flat = over_ground(recording, place), on_map(recording.grid, place)
     count, every = len(recording.traversability), drawing_interval(recording.dt_s)
-    shades = matplotlib.colormaps[TRAVERSABILITY_COLOURS](recording.traversability)[:, :3]
-    colours = np.round(255 * shades).astype(np.uint8)
+    colours = shades(recording.traversability)
     for piece, first in enumerate(range(0, count, _PIECE * every)):
         last = min(first + _PIECE * every, count)
         for step in [*range(first + every, last, every), last]:

@@ -9,12 +9,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of
 from benchnav.core.grid import Grid
-from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
 from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import Recording
-
-START, GOAL = (230, 30, 30), (255, 0, 255)
 
 _LIFT_M = 0.12
 _CLOSED = (240, 240, 240)
@@ -54,7 +52,7 @@ def log_maps(stream: Any, recording: Recording) -> None:
 
     grid = recording.grid
     log_image(stream, "map/colour", np.moveaxis(recording.rgb, 0, -1))
-    log_image(stream, "map/true_mean", _shades(recording.true_mean))
+    log_image(stream, "map/true_mean", shades(recording.true_mean))
     if recording.field is not None:
         log_image(stream, "map/field", field_colours(recording.field, recording.immobilising))
     if recording.soft.any():
@@ -62,11 +60,8 @@ def log_maps(stream: Any, recording: Recording) -> None:
             drawn = lines(recording.soft, grid.resolution_m)
             flat = on_map(grid, drawn.reshape(-1, 2)).reshape(-1, 2, 2)
             stream.log(f"map/soft/{name}", rr.LineStrips2D(flat, colors=[SOFT], radii=0.06), static=True)
-    for name, position, colour in (
-        ("start", recording.states[0, :2], START),
-        ("goal", recording.goal_m, GOAL),
-    ):
-        place = position[None].astype(np.float32)
+    for name, position in (("start", recording.states[0, :2]), ("goal", recording.goal_m)):
+        place, colour = position[None].astype(np.float32), bytes_of(MARKS[name]["color"])
         stream.log(
             f"world/{name}",
             rr.Points3D(over_ground(recording, place), radii=0.35, colors=[colour]),
@@ -88,9 +83,9 @@ def log_predicted(stream: Any, recording: Recording, risk: str, closed: str) -> 
     """
     import rerun as rr
 
-    shades = _shades(recording.predicted)
-    shades[~recording.free] = 64
-    log_image(stream, risk, shades)
+    image = shades(recording.predicted)
+    image[~recording.free] = 64
+    log_image(stream, risk, image)
     edges = outline(~recording.free, recording.grid.resolution_m)
     flat = on_map(recording.grid, edges.reshape(-1, 2)).reshape(-1, 2, 2)
     stream.log(closed, rr.LineStrips2D(flat, colors=[_CLOSED], radii=0.08), static=True)
@@ -120,6 +115,6 @@ def cells_of(grid: Grid, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cell[:, 1].clip(0, grid.height - 1), cell[:, 0].clip(0, grid.width - 1)
 
 
-def _shades(values: np.ndarray) -> np.ndarray:
-    """Colours λ, uint8 of shape [H, W, 3]."""
+def shades(values: np.ndarray) -> np.ndarray:
+    """Colours of λ, uint8, from any shape to [..., 3]."""
     return np.round(255 * matplotlib.colormaps[TRAVERSABILITY_COLOURS](values)[..., :3]).astype(np.uint8)

@@ -28,7 +28,7 @@ def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:
     """
     import matplotlib  # runs record, and draw nothing
 
-    from benchnav.eval.report.figure_style import TRAVERSABILITY_COLOURS
+    from benchnav.core.figures import TRAVERSABILITY_COLOURS
 
     shades = matplotlib.colormaps[TRAVERSABILITY_COLOURS](field)[..., :3]
     colours = np.round(255 * shades).astype(np.uint8)

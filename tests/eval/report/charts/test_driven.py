@@ -7,14 +7,10 @@ import pytest
 from matplotlib.axes import Axes
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.report.charts.driven import (
-    GROUND,
-    MOST_PATHS,
-    DrivenGround,
-    driven_figure,
-    telling_map,
-    write_driven,
-)
+from benchnav.core.figures import planner_colours, save_twice
+from benchnav.eval.report import write
+from benchnav.eval.report.charts.driven import GROUND, DrivenGround, read_driven, telling_map
+from benchnav.eval.report.charts.maps import driven_figure
 from benchnav.eval.report.recorded.ground import IMMOBILISING
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
@@ -102,6 +98,26 @@ def test_every_path_is_drawn_to_its_end_with_its_outcome() -> None:
     assert len({line.get_color() for line in labelled}) == 3
 
 
+def test_ends_that_coincide_are_all_seen() -> None:
+    rows = episodes({1: [False, False, False]})
+    panel, _ = drawn(driven_figure(ground(), rows, [track(0)] * 3))
+    crosses = [line for line in panel.lines if line.get_marker() == "X"]
+    sizes = [line.get_markersize() for line in crosses]
+    assert sizes == sorted(sizes, reverse=True)
+    assert len(set(sizes)) == 3
+
+
+def test_the_title_and_the_legend_are_apart_and_planners_go_by_their_names() -> None:
+    rows = made.rows(made.row(made.condition(name, world="stakes"), 1) for name in ("astar_dwa", "mppi"))
+    figure = driven_figure(ground(), rows, [track(0), track(1)])
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert not figure.axes[0].title.get_window_extent().overlaps(legend.get_window_extent())
+    assert legend.get_texts()[0].get_text() == "A* + DWA: success, 30 s"
+    colours = [line.get_color() for line in legend.get_lines()[:2]]
+    assert colours == list(planner_colours(["astar_dwa", "mppi"]).values())
+
+
 def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terrain() -> None:
     rows = episodes({1: [True]})
     panel, _ = drawn(driven_figure(ground(), rows, [track(0)]))
@@ -130,35 +146,26 @@ def with_steps(folder: Path, rows: pd.DataFrame) -> None:
             steps.to_parquet(path, index=False)
 
 
-def test_the_figure_is_of_the_stored_steps_of_its_map(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     rows = episodes({0: [True] * 3, 1: [True, False, True]})
     folder = run_folder(tmp_path / "run", rows)
-    assert write_driven(folder, folder) == {}
+    assert read_driven(folder) is None
     with_steps(folder, rows)
-    assert write_driven(folder, folder) == {}
+    assert read_driven(folder) is None
     ground().save(folder / GROUND)
-    shown: list[Any] = []
-
-    def draw(*given: Any) -> Any:
-        shown.append(given)
-        return driven_figure(*given)
-
-    monkeypatch.setattr("benchnav.eval.report.charts.driven.driven_figure", draw)
-    caption = write_driven(folder, folder)
-    assert "std 1, seed 0, realisation 0: of all maps" in caption["driven"]
-    assert (folder / "figures" / "driven.png").stat().st_size > 5000
-    ((_, own, tracks),) = shown
+    ((name, caption, draw, _),) = write._driven(folder)
+    assert name == "driven"
+    assert "std 1, seed 0, realisation 0: of all maps" in caption
+    _, own, tracks = draw.args  # type: ignore[attr-defined]
     assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
+    save_twice(draw(), tmp_path / "driven.png")
+    assert (tmp_path / "driven.png").stat().st_size > 5000
 
 
 @pytest.mark.parametrize(("seed", "realisation"), [(0, 0), (0, 1), (7, 0), (7, 1)])
-def test_the_paths_are_those_of_the_maps_own_noise(
-    seed: int, realisation: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, tmp_path: Path) -> None:
     rows = made.rows(
         made.row(made.condition(risk=risk, world="stakes"), map_index, seed=one, realisation=draw)
         for risk in RISKS for one in (0, 7) for draw in (0, 1) for map_index in (0, 1)
@@ -166,14 +173,9 @@ def test_the_paths_are_those_of_the_maps_own_noise(
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
-    shown: list[Any] = []
-    monkeypatch.setattr(
-        "benchnav.eval.report.charts.driven.driven_figure", lambda *given: shown.append(given)
-    )
-    monkeypatch.setattr("benchnav.eval.report.figure_style.save", lambda *given: None)
-    caption = write_driven(folder, folder)["driven"]
+    ((_, caption, draw, _),) = write._driven(folder)
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
-    ((_, own, tracks),) = shown
+    _, own, tracks = draw.args  # type: ignore[attr-defined]
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
     for place, positions in enumerate(tracks):
@@ -181,16 +183,18 @@ def test_the_paths_are_those_of_the_maps_own_noise(
 
 
 def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_path: Path) -> None:
+    most = write._MOST_PATHS
     rows = made.rows(
         made.row(made.condition(risk=f"cvar:0.{i:02}", world="stakes"), map_index)
         for map_index in range(2)
-        for i in range(MOST_PATHS + 2)
+        for i in range(most + 2)
     )
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    caption = write_driven(folder, folder)["driven"]
-    assert f"on no map did outcomes differ. {MOST_PATHS} of {MOST_PATHS + 2} conditions." in caption
+    ((_, caption, draw, _),) = write._driven(folder)
+    assert f"on no map did outcomes differ. {most} of {most + 2} conditions." in caption
+    assert len(draw().axes[0].lines) >= most
 
 
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:

@@ -1,8 +1,12 @@
 from typing import Any
 
+import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from benchnav.eval.report.charts.sweeps import find_sweeps, flatten
+from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, flatten, sweep_name
+from tests.eval.report import made
 
 
 def condition(split: str = "test/std", level: float | None = None, **options: Any) -> dict[str, Any]:
@@ -53,3 +57,144 @@ def test_scenarios_of_a_series_make_a_line_over_severity_that_std_begins() -> No
 @pytest.mark.parametrize("value", [{"world": {"time_budget_s": 100.0}}])
 def test_conditions_that_say_too_little_of_themselves_make_none(value: dict[str, Any]) -> None:
     assert find_sweeps({str(i): {"value": value} for i in range(4)}) == []
+
+
+LEVELS = (0.5, 0.8, 0.9)
+
+
+def values(labels: dict[str, str], **changes: Any) -> dict[str, Any]:
+    """What `run.json` says of a condition with these labels."""
+    part, _, level = labels["risk"].partition(":")
+    risk = {"part": part, "options": {"level": float(level)} if level else {}}
+    world = {"name": labels["world"], **changes}
+    parts = {name: {"part": labels[name].split(" ")[0], "options": {}} for name in ("model", "planner")}
+    value = {
+        "data": labels["data"],
+        "split": f"test/{labels['scenario']}",
+        "risk": risk,
+        **parts,
+        "world": world,
+    }
+    return {"value": value}
+
+
+def drawn(*conditions: tuple[dict[str, str], int], **changes: Any) -> Figure:
+    rows = made.rows(
+        *(
+            [made.row(labels, i, 20.0 if i < count else None) for i in range(10)]
+            for labels, count in conditions
+        )
+    )
+    known = {
+        "+".join(made.row(labels)["condition"].split("+")): values(labels, **changes)
+        for labels, _ in conditions
+    }
+    (sweep,) = find_sweeps(known)
+    return curve_figure(sweep, made.summarised(rows))
+
+
+def shown(figure: Figure) -> list[Axes]:
+    return [panel for panel in figure.axes if panel.get_visible()]
+
+
+def curves(panel: Axes) -> list[list[float]]:
+    return [list(line.get_ydata()) for line in panel.lines if line.get_marker() not in ("None", None)]
+
+
+def test_success_and_time_stand_at_their_levels_with_their_bands() -> None:
+    figure = drawn(
+        *((made.condition(risk=f"cvar:{level}"), n) for level, n in zip(LEVELS, (2, 6, 4), strict=True))
+    )
+    above, below = shown(figure)
+    assert curves(above) == [pytest.approx([20, 60, 40])]
+    assert curves(below) == [pytest.approx([84, 52, 68])]
+    (line,) = above.lines
+    np.testing.assert_allclose(line.get_xdata(), -np.log(1 - np.array(LEVELS)))
+    assert [label.get_text() for label in below.get_xticklabels()] == ["0.5", "0.8", "0.9"]
+    band = above.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.min() < 20 < 60 < band.max()
+
+
+def test_other_settings_of_the_same_planner_are_lines_across_and_blind_ones_grey() -> None:
+    levels = [(made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS]
+    figure = drawn(
+        *levels,
+        (made.condition(risk="mean"), 3),
+        (made.condition("cl_rrt", "mean"), 9),  # no line of its planner is there
+        (made.condition("straight", "–", model="–"), 1),
+    )
+    above, _ = shown(figure)
+    across = {float(np.asarray(line.get_ydata())[0]) for line in above.lines if line.get_marker() == "None"}
+    assert across == {30, 10}
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["MPPI, cvar", "mean", "straight"]
+
+
+def test_each_setting_is_drawn_in_the_style_that_the_legend_gives_it() -> None:
+    settings = ["mean", "var", "entropic", "chance", "worst", "own", "other", "last"]
+    figure = drawn(
+        *((made.condition(risk=f"cvar:{level}"), 9) for level in LEVELS),
+        *((made.condition(risk=setting), n) for n, setting in enumerate(settings)),
+        (made.condition("straight", "–", model="–"), 8),
+    )
+    names = {10.0 * n: name for n, name in enumerate([*settings, "straight"])}
+    # Matplotlib tells a pattern of dashes by a private name alone: `get_linestyle` gives "--" for each.
+    legend = {line.get_label(): line._dash_pattern for line in figure.legends[0].get_lines()}
+    above, _ = shown(figure)
+    lines = {
+        names[float(np.asarray(line.get_ydata())[0])]: line._dash_pattern
+        for line in above.lines
+        if line.get_marker() == "None"
+    }
+    assert lines == {name: legend[name] for name in names.values()}
+    assert len(set(map(repr, lines.values()))) == len(names)
+
+
+def test_scenarios_worlds_and_models_have_panels_of_their_own() -> None:
+    places: tuple[dict[str, str], ...] = ({"scenario": "hg"}, {"world": "stakes"}, {"model": "mdn"})
+    for other in places:
+        figure = drawn(
+            *((made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS),
+            *((made.condition(risk=f"cvar:{level}", **other), 7) for level in LEVELS),
+        )
+        panels = shown(figure)
+        assert len(panels) == 4
+        titles = [panel.get_title() for panel in panels if panel.get_title()]
+        assert titles[1] == next(iter(other.values()))
+        # One measure has one range, so that heights can be compared.
+        ranges = {tuple(np.round(panel.get_ylim(), 6)) for panel in panels}
+        assert len(ranges) == 2
+
+
+def test_what_looks_at_nothing_stands_beside_every_model_over_all_severities() -> None:
+    blind = {"planner": "straight", "risk": "–", "model": "–"}
+    scenarios = ("std", "hg-050", "hg")
+    models = [made.condition(scenario=name, model=model) for name in scenarios for model in ("a", "b")]
+    figure = drawn(
+        *((made.condition(scenario=name, **blind), 2) for name in scenarios), *((one, 7) for one in models)
+    )
+    success = shown(figure)[:2]
+    assert [panel.get_title() for panel in success] == ["a", "b"]
+    for panel in success:
+        lines = [line for line in panel.lines if len(line.get_xdata()) == 3]
+        assert [list(line.get_xdata()) for line in lines] == [[0, 0.5, 1]] * 2
+        assert sorted(line.get_ydata()[0] for line in lines) == [20, 70]
+
+
+def test_many_lines_are_distinguished_by_panels() -> None:
+    planners = [f"planner_{i}" for i in range(9)]
+    figure = drawn(*((made.condition(p, f"cvar:{level}"), 5) for p in planners for level in LEVELS))
+    assert len(shown(figure)) == 18
+    assert all(len(curves(panel)) == 1 for panel in shown(figure))
+
+
+def test_figures_have_the_width_of_a_column_or_a_page() -> None:
+    one = drawn(*((made.condition(risk=f"cvar:{level}"), 5) for level in LEVELS))
+    assert one.get_figwidth() * 25.4 == pytest.approx(88)
+    two = drawn(*((made.condition(risk=f"cvar:{level}", world=w), 5) for level in LEVELS for w in ("a", "b")))
+    assert two.get_figwidth() * 25.4 == pytest.approx(180)
+
+
+def test_a_number_goes_by_its_last_word() -> None:
+    assert sweep_name("planner.options.dwa.horizon") == "horizon"
+    assert sweep_name("severity") == "severity"

@@ -1,5 +1,3 @@
-"""What the viewer is given, read back from the file."""
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +5,14 @@ import matplotlib
 import numpy as np
 import pytest
 
-from benchnav.eval.report.playback.rerun_file import write_rerun
+from benchnav.eval.report.playback.rerun_file import arrange, describe, drivers_of, map_views, write_rerun
 from benchnav.eval.report.recorded.drawn_plan import MOST_POINTS, DrawnPlan, thinned
 from benchnav.eval.report.recorded.ground import IMMOBILISING, field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
+
+"""What the viewer is given, read back from the file."""
 
 
 def written(folder: Path, *recordings: Recording) -> Path:
@@ -230,3 +230,76 @@ def test_several_conditions_have_paths_colours_and_maps_of_their_own(tmp_path: P
     assert not [
         entity for entity in chunks(path) if entity.startswith(("/world/robot", "/map/overlay/robot"))
     ]
+
+
+OVERLAY = ["/map/overlay/**", "/map/places/**"]
+
+
+def test_each_map_shows_its_own_layer_under_what_is_driven_and_planned() -> None:
+    resampled, frozen = (map_views(drivers_of([r])) for r in (made.recording(10), made.held_recording()))
+    assert list(resampled.values()) == [
+        ["/map/colour", "/map/soft/**", *OVERLAY],
+        ["/map/true_mean", "/map/closed", *OVERLAY],
+        ["/map/risk", *OVERLAY],
+    ]
+    assert list(frozen.values())[2] == ["/map/field", "/map/closed", *OVERLAY]
+    assert list(frozen.values())[3] == list(resampled.values())[2]
+    assert list(resampled)[-1] == "λ̂ given to the planner, free: λ̂ above 0.3"
+
+
+def test_each_planner_is_seen_on_what_it_was_given() -> None:
+    recordings = [
+        made.recording(10, labels=made.condition(risk=risk), free_by="mean", free_above=above)
+        for risk, above in (("cvar:0.9", 0.1), ("mean", 0.2))
+    ]
+    views = map_views(drivers_of(recordings))
+    assert views["λ̂ given to mean, free: mean λ above 0.2"] == [
+        "/map/risk/conditions/mean", "/map/overlay/conditions/mean/**", "/map/places/**"
+    ]  # fmt: skip
+    assert views["λ̂ given to cvar:0.9, free: mean λ above 0.1"][0] == "/map/risk/conditions/cvar\\:0.9"
+    assert views["Colour"] == ["/map/colour", "/map/soft/**", *OVERLAY]
+
+
+def test_hatching_is_named_where_there_is_some() -> None:
+    hard = made.recording(10)
+    soft = replace(hard, soft=np.ones_like(hard.soft))
+    assert [next(iter(map_views(drivers_of([one])))) for one in (hard, soft)] == [
+        "Colour", "Colour, soft ground hatched"
+    ]  # fmt: skip
+
+
+def test_the_blueprint_has_all_of_them() -> None:
+    drivers = drivers_of(
+        [made.held_recording(), replace(made.held_recording(), about=made.recording().about)]
+    )
+    found, queue = [], [arrange(drivers).root_container]
+    while queue:
+        part = queue.pop(0)
+        queue += [inner for inner in getattr(part, "contents", []) if not isinstance(inner, str)]
+        if type(part).__name__ == "Spatial2DView":
+            found.append(part.name)
+    assert found == list(map_views(drivers))
+
+
+def test_an_episode_is_told_with_its_outcome_and_the_threshold() -> None:
+    recording = made.held_recording(43, free_by="mean", free_above=0.1, time_budget_s=90.0)
+    text = describe(drivers_of([recording]))
+    for words in (
+        "**immobilised** after 4.3 s of 90 s",
+        "Free: mean λ above 0.1",
+        "| planner | mppi |",
+        "std 4",
+    ):
+        assert words in text
+
+
+def test_conditions_are_told_side_by_side() -> None:
+    first = made.recording(200, labels=made.condition(risk="cvar:0.9"))
+    about = {**made.recording().about, "risk": "mean", "outcome": "out_of_bounds"}
+    text = describe(drivers_of([first, made.recording(150, about=about)]))
+    assert "| cvar:0.9 | **success** | 20.0 |" in text
+    assert "| mean | **out of bounds** | 15.0 |" in text
+
+
+def test_an_episode_that_ended_at_once_met_nothing() -> None:
+    assert "observed λ on average: –" in describe(drivers_of([made.recording(0)]))

@@ -3,10 +3,9 @@ from dataclasses import replace
 import pytest
 from rich.cells import cell_len
 
-from benchnav.eval.report.rendering import latex, to_latex, to_markdown, to_terminal
-from benchnav.eval.report.tables import ResultTable
+from benchnav.core.tables import Table, latex, to_latex, to_markdown, to_terminal
 
-TABLE = ResultTable(
+TABLE = Table(
     headings=("planner", "λ̄ [%]", "failures"),
     labels=1,
     rows=(("my_planner¹", "5.0 ± 1.0", "2 stuck"), ("[bold] a|b & 50%", "–", "–")),
@@ -40,7 +39,7 @@ def test_latex_escapes(text: str, expected: str) -> None:
 
 
 def test_latex() -> None:
-    assert to_latex(TABLE, "Over λ̄ & more", "mine").splitlines() == [
+    assert to_latex([TABLE], "Over λ̄ & more", "mine").splitlines() == [
         r"\begin{table*}[t]",
         r"  \centering",
         r"  \caption{Over $\bar{\lambda}$ \& more}",
@@ -79,7 +78,7 @@ def test_terminal_shows_brackets_and_notes_and_breaks_only_where_it_has_to() -> 
     narrow = to_terminal(TABLE, width=30)
     assert max(map(cell_len, narrow.splitlines())) <= 30
     assert "…" not in narrow
-    wide = ResultTable(headings=("x" * 150,), labels=1, rows=(("y",),), notes=("n" * 300,))
+    wide = Table(headings=("x" * 150,), labels=1, rows=(("y",),), notes=("n" * 300,))
     assert "n" * 300 in to_terminal(wide)
 
 
@@ -87,7 +86,7 @@ def test_bold_cells_and_what_bold_means() -> None:
     lines = to_markdown(BOLD).splitlines()
     assert lines[3] == r"| [bold] a\|b & 50% | **–** | – |"
     assert lines[-3:] == [r"Bold: the best \| all", "", r"- **failures**: how \<it> ended."]
-    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex(BOLD, "", "")
+    assert r"{[}bold] a\textbar{}b \& 50\% & \textbf{--} & -- \\" in to_latex([BOLD], "", "")
     plain = to_terminal(BOLD)
     assert "–*" in plain
     assert plain.count("*") == 2

@@ -3,10 +3,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.charts.success import success_figure
+from benchnav.eval.report.charts.conditions import (
+    OUTCOME_COLOURS,
+    SUCCESS_COLOUR,
+    distribution_figure,
+    outcome_figure,
+    success_figure,
+)
+from benchnav.planning.world.outcome import FAILURES
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
@@ -131,3 +138,99 @@ def test_figures_have_the_width_of_a_column_or_a_page() -> None:
     assert success_figure(one).get_figwidth() * 25.4 == pytest.approx(88)
     two = made.summarised(made.rows(*(shares(made.condition(scenario=name), 5) for name in ("std", "hg"))))
     assert success_figure(two).get_figwidth() * 25.4 == pytest.approx(180)
+
+
+def bars(panel: Axes) -> dict[float, list[tuple[str, float]]]:
+    """By height what is stacked, from left to right: colour and share."""
+    found: dict[float, list[tuple[str, float]]] = {}
+    for bar in sorted(panel.patches, key=lambda bar: bar.get_x()):  # type: ignore[attr-defined]
+        height = round(bar.get_y() + bar.get_height() / 2, 6)  # type: ignore[attr-defined]
+        if bar.get_width():  # type: ignore[attr-defined]
+            found.setdefault(height, []).append((to_hex(bar.get_facecolor()).upper(), bar.get_width()))  # type: ignore[attr-defined]
+    return found
+
+
+def test_every_failure_has_a_colour_of_its_own() -> None:
+    assert set(OUTCOME_COLOURS) == {outcome.name.lower() for outcome in FAILURES}
+    assert len({*OUTCOME_COLOURS.values(), SUCCESS_COLOUR}) == len(OUTCOME_COLOURS) + 1
+
+
+def test_shares_stand_in_one_order_and_fill_the_bar() -> None:
+    first, second = made.condition("a"), made.condition("b")
+    ends = ["timeout", "immobilised", "immobilised", "timeout", "stuck"]
+    rows = made.rows(
+        (made.row(first, i, None, outcome=name) for i, name in enumerate(ends)),
+        (made.row(first, i) for i in range(5, 10)),
+        (made.row(second, i, None, outcome="stuck") for i in range(1)),
+        (made.row(second, i) for i in range(1, 4)),
+    )
+    figure = outcome_figure(made.summarised(rows))
+    above, below = (drawn for _, drawn in sorted(bars(figure.axes[0]).items()))
+    expected = [("immobilised", 20), ("stuck", 10), ("timeout", 20)]
+    assert above == [
+        *((OUTCOME_COLOURS[name], pytest.approx(share)) for name, share in expected),
+        (SUCCESS_COLOUR, 50),
+    ]
+    assert below == [(OUTCOME_COLOURS["stuck"], 25), (SUCCESS_COLOUR, 75)]
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["immobilised", "stuck", "timeout", "success"]
+
+
+def test_each_scenario_has_its_panel() -> None:
+    rows = made.rows(made.row(made.condition(scenario=name)) for name in ("std", "hg"))
+    figure = outcome_figure(made.summarised(rows))
+    assert [panel.get_title() for panel in figure.axes] == ["std", "hg"]
+    assert figure.get_figwidth() * 25.4 == pytest.approx(180)
+
+
+def medians(panel: Axes) -> list[float]:
+    return [float(x) for x, _ in places(panel)]
+
+
+def places(panel: Axes) -> np.ndarray:
+    """Median and height of each condition."""
+    return np.concatenate([line.get_xydata() for line in panel.lines if line.get_marker() == "|"])
+
+
+def dots(panel: Axes) -> list[np.ndarray]:
+    """Values of each condition, sorted."""
+    (group,) = panel.collections
+    values, up = np.asarray(group.get_offsets()).T
+    return [np.sort(values[np.abs(up - height) < 0.5]) for _, height in places(panel)]
+
+
+def test_every_episode_is_a_dot_under_its_quantity_and_its_condition() -> None:
+    rows = made.rows(
+        (
+            made.row(made.condition("a"), i, time, traversability=0.1 * i)
+            for i, time in enumerate((20.0, 30.0, None))
+        ),
+        (made.row(made.condition("b"), i, 50.0, traversability=0.9) for i in range(2)),
+    )
+    figure = distribution_figure(made.summarised(rows), rows)
+    times, met = figure.axes
+    np.testing.assert_allclose(np.concatenate(dots(times)), [20, 30, 100, 50, 50])
+    np.testing.assert_allclose(np.concatenate(dots(met)), [0, 0.1, 0.2, 0.9, 0.9], atol=1e-12)
+    assert medians(times) == [30, 50]
+    assert medians(met) == pytest.approx([0.1, 0.9])
+    quartiles = next(line for line in times.lines if line.get_marker() == "None")
+    assert list(quartiles.get_xdata()) == [25, 65]
+    # Successes and failures differ in colour.
+    colours = {tuple(colour) for colour in times.collections[0].get_facecolors()}
+    assert len(colours) == 2
+    assert figure.get_figwidth() * 25.4 == pytest.approx(180)
+
+
+def test_each_scenario_has_a_line_of_panels() -> None:
+    rows = made.rows(
+        made.row(made.condition(scenario=name), 0, 20.0 + n) for n, name in enumerate(("std", "hg"))
+    )
+    figure = distribution_figure(made.summarised(rows), rows)
+    assert [panel.get_title() for panel in figure.axes] == ["std", "std", "hg", "hg"]
+    assert [medians(panel) for panel in figure.axes] == [[20], [0.8], [21], [0.8]]
+
+
+def test_an_episode_that_met_nothing_is_no_dot() -> None:
+    rows = made.rows(made.row(made.condition(), 0, None, traversability=np.nan))
+    _, met = distribution_figure(made.summarised(rows), rows).axes
+    assert not met.collections

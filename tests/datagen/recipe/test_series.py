@@ -1,6 +1,6 @@
 import pytest
 
-from benchnav.models.quality.series import find_series
+from benchnav.datagen.recipe.scenario import find_series
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.charts.trajectories import MOST_PANELS, choose, trajectory_figure
-from benchnav.eval.report.figure_style import save
+from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, save_twice
+from benchnav.eval.report.charts.maps import MOST_PANELS, choose_snapshots, trajectory_figure
 from benchnav.eval.report.recorded.ground import field_colours, hatching, outline
 from benchnav.eval.report.recorded.recording import take_snapshot
 from benchnav.eval.report.recorded.snapshot import Snapshot
@@ -20,7 +20,7 @@ def snapshot(condition: str = "t", map_index: int = 0, seed: int = 0, **labels: 
 
 
 def chosen(snapshots: list[Snapshot], conditions: list[str]) -> list[tuple[str, str]]:
-    return [(s.about["condition"], s.about["map"]) for s in choose(snapshots, conditions)]
+    return [(s.about["condition"], s.about["map"]) for s in choose_snapshots(snapshots, conditions)]
 
 
 def test_one_a_condition_on_one_map_in_the_tables_order() -> None:
@@ -71,7 +71,10 @@ def test_every_snapshot_has_two_panels_of_its_map(count: int) -> None:
         assert (axes.get_xlim(), axes.get_ylim()) == ((0, 30), (0, 20))
     figure.draw_without_rendering()
     boxes = [axes.get_window_extent() for axes in shown(figure)]
-    assert all(box.width > 200 and box.height > 130 for box in boxes)
+    assert all(box.width > 180 and box.height > 120 for box in boxes)
+    assert figure.get_figwidth() <= TWO_COLUMNS_IN
+    columns = {axes.get_subplotspec().colspan.start for axes in shown(figure)}
+    assert columns == set(range(min(count, 3))), "a column is empty"
 
 
 def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
@@ -117,9 +120,10 @@ def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended()
         for line in last.lines
         if line.get_marker() != "None"
     }
-    assert marks["X", "black"] == marks["o", "black"] == tuple(taken.track[-1])
-    assert marks["o", "red"] == tuple(taken.track[0])
-    assert marks["X", "magenta"] == tuple(taken.goal_m)
+    marks = {name: marks[looks["marker"], looks["color"]] for name, looks in MARKS.items()}
+    assert marks["end"] == marks["robot"] == tuple(taken.track[-1])
+    assert marks["start"] == tuple(taken.track[0])
+    assert marks["goal"] == tuple(taken.goal_m)
     assert last.get_title() == "driven to the end (17 s), on λ as it was"
     # Where it was by the moment of the plan is told by the panels above.
     for panel in (above, below):
@@ -156,7 +160,7 @@ def test_only_panels_whose_λ_stayed_have_a_third() -> None:
     columns = [
         axes.get_subplotspec().colspan.start for axes in shown(figure) if "as it was" in axes.get_title()
     ]
-    assert columns == [1, 0]
+    assert columns == [1, 1]
 
 
 def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
@@ -219,5 +223,5 @@ def test_whose_map_of_λ_it_is_stands_above_it() -> None:
 
 
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:
-    save(trajectory_figure([take_snapshot(made.recording(0, plans=()))]), tmp_path / "a.png")
+    save_twice(trajectory_figure([take_snapshot(made.recording(0, plans=()))]), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 1000

@@ -1,0 +1,290 @@
+"""One style for the figures of datasets, models and evaluation: sizes, colours, marks, names, and how they are saved.
+
+Sizes are in inches and points as printed. Colours are distinct to every kind of colour vision. Source: Okabe and
+Ito (2008), "Color universal design".
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.transforms import Bbox
+
+from benchnav.core.store import replacing
+
+# Widths of a journal's column and of a page.
+ONE_COLUMN_IN, TWO_COLUMNS_IN = 88 / 25.4, 180 / 25.4
+TEXT, TITLE = 7.0, 8.0
+DPI = 200
+
+_STYLE: dict[Any, Any] = {
+    **dict.fromkeys(("font.size", "axes.titlesize", "figure.titlesize"), TITLE),
+    **dict.fromkeys(("axes.labelsize", "figure.labelsize"), TITLE),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), TEXT),
+    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width", "grid.linewidth"), 0.5),
+    **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 2.0),
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("figure.constrained_layout.h_pad", "figure.constrained_layout.w_pad"), 0.03),
+    "legend.handlelength": 1.6,
+    "legend.columnspacing": 1.4,
+}
+# Type 42 embeds whole fonts, as publishers ask; composed images would be sampled anew in a PDF.
+_SAVED: dict[Any, Any] = {"pdf.fonttype": 42, "image.composite_image": False}
+
+BLUE, ORANGE, GREEN, PINK, AMBER, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+# Yellow, the last, is lost on white: lines on white have the others alone.
+COLOURS = (BLUE, ORANGE, GREEN, PINK, AMBER, SKY, "#000000", "#F0E442")
+LINE_COLOURS = COLOURS[:-1]
+BLIND = "0.45"
+
+TRAVERSABILITY_COLOURS = "viridis"
+# Of cells of which nothing is known.
+LACKING = "0.7"
+
+MARKERS = "osD^vP*X<"
+# What stands at a place on a map, for `Axes.plot`.
+_WHITE_EDGED: dict[str, Any] = {"ls": "none", "mec": "white", "mew": 0.8, "zorder": 3}
+MARKS: dict[str, dict[str, Any]] = {
+    "start": {**_WHITE_EDGED, "marker": "o", "color": "#e61e1e", "ms": 5},
+    "goal": {**_WHITE_EDGED, "marker": "*", "color": "#ff00ff", "ms": 9},
+    "robot": {**_WHITE_EDGED, "marker": "o", "color": "black", "ms": 5},
+    "end": {**_WHITE_EDGED, "marker": "X", "color": "black", "ms": 7, "zorder": 4},
+}
+
+_PLANNERS = {
+    "astar_dwa": ("A* + DWA", BLUE),
+    "astar_mppi": ("A* + MPPI", PINK),
+    "cl_rrt": ("CL-RRT", ORANGE),
+    "mppi": ("MPPI", GREEN),
+    "straight": ("straight", BLIND),
+}
+
+
+def styled() -> Any:
+    """The style of all figures, as a context or as the decorator of a function that draws one."""
+    return matplotlib.rc_context(_STYLE)
+
+
+def planner_name(planner: str) -> str:
+    """What figures call a planner, from its label: the name, and its options as they are."""
+    name = re.split("[ :]", planner)[0]
+    return _PLANNERS[name][0] + planner[len(name) :] if name in _PLANNERS else planner
+
+
+def planner_colours(planners: Sequence[str]) -> dict[str, str]:
+    """Colours of planners by their labels: a shipped planner has the same one in every figure.
+
+    Args:
+        planners: labels; others than the shipped take colours that are left.
+    """
+    own = {planner: _PLANNERS[planner][1] for planner in planners if planner in _PLANNERS}
+    left = [colour for colour in LINE_COLOURS if colour not in own.values()]
+    others = [planner for planner in dict.fromkeys(planners) if planner not in own]
+    return own | {planner: left[place % len(left)] for place, planner in enumerate(others)}
+
+
+def condition_colours(planners: Sequence[str]) -> list[str]:
+    """Colours of conditions that are shown together; beyond eight they begin anew.
+
+    Args:
+        planners: of each condition; where no two are alike, each has its planner's colour.
+    """
+    if len(set(planners)) == len(planners) <= len(LINE_COLOURS):
+        own = planner_colours(planners)
+        return [own[planner] for planner in planners]
+    return [COLOURS[place % len(COLOURS)] for place in range(len(planners))]
+
+
+def bytes_of(colour: Any) -> tuple[int, int, int]:
+    """Red, green and blue of a colour, in [0, 255]."""
+    red, green, blue = (round(255 * value) for value in to_rgb(colour))
+    return red, green, blue
+
+
+def unit(colour: Sequence[int]) -> Any:
+    """A colour of bytes as Matplotlib takes it, in [0, 1]."""
+    return tuple(value / 255 for value in colour)
+
+
+def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> None:
+    """Marks a place on a map.
+
+    Args:
+        panel: in metres.
+        name: of `MARKS`.
+        place: (x, y).
+        scale: of the mark's size.
+        **style: what differs, as in `Axes.plot`.
+    """
+    looks = MARKS[name]
+    panel.plot(*place, **{**looks, "ms": scale * looks["ms"], **style})
+
+
+def mark_handle(name: str, label: str = "", scale: float = 1.0) -> Line2D:
+    """The entry of a legend for a mark, under its own name where none is given."""
+    looks = MARKS[name]
+    return Line2D([], [], **{**looks, "ms": scale * looks["ms"]}, label=label or name)
+
+
+def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **style: Any) -> None:
+    """Draws a path over a map, on a white edge that parts it from any colour.
+
+    Args:
+        panel: in metres.
+        track: positions, shape [N, 2].
+        width: in points.
+        colour: of the path.
+        **style: of the path, as in `Axes.plot`.
+    """
+    panel.plot(*track.T, color="white", lw=width + 1.4, solid_capstyle="round", zorder=1.9)
+    panel.plot(*track.T, color=colour, lw=width, solid_capstyle="round", **style)
+
+
+def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) -> Any:
+    """Draws a map with its first row at the bottom and its axes in metres; gives the image.
+
+    Args:
+        panel: where.
+        values: shape [H, W], or [H, W, 3] of colours.
+        extent_m: width and height.
+        **style: as in `Axes.imshow`.
+    """
+    width, height = map(float, extent_m)
+    return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+
+
+def legend_outside(
+    figure: Figure,
+    handles: Sequence[Artist] = (),
+    columns: int = 4,
+    side: Literal["lower", "upper"] = "lower",
+) -> Legend:
+    """Lays a legend under or over the panels, of what has a label in them, once each, where no handles are given.
+
+    A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
+    """
+    labelled: dict[str, Artist] = {}
+    for panel in figure.axes:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            labelled.setdefault(label, handle)
+    loc: Any = f"outside {side} center"
+    return figure.legend(handles=handles or list(labelled.values()), loc=loc, ncols=columns)
+
+
+def legend_at(
+    figure: Figure,
+    handles: Sequence[Artist],
+    place: tuple[float, float],
+    columns: int,
+    loc: str = "upper left",
+) -> None:
+    """Lays a legend with its corner `loc` at (left, top) in inches from the upper left corner of a figure."""
+    width, height = figure.get_size_inches()
+    legend = figure.legend(
+        handles=handles, loc=loc, ncols=columns, bbox_to_anchor=(place[0] / width, 1 - place[1] / height),
+        bbox_transform=figure.transFigure, fontsize=TEXT, frameon=False, borderpad=0, borderaxespad=0,
+        handlelength=1.1, handletextpad=0.4, columnspacing=1, labelspacing=0.3,
+    )  # fmt: skip
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def add_axes(figure: Figure, place: tuple[float, float, float, float], label: str) -> Axes:
+    """Adds a panel at (left, top, width, height) in inches from the upper left corner."""
+    left, top, wide, high = place
+    width, height = figure.get_size_inches()
+    return figure.add_axes(
+        (left / width, 1 - (top + high) / height, wide / width, high / height), label=label
+    )
+
+
+def add_bar(
+    figure: Figure,
+    image: Any,
+    place: tuple[float, float, float, float],
+    label: str,
+    extend: str = "neither",
+    most: int = 4,
+) -> Axes:
+    """Adds a colour bar that lies at (left, top, width, height) in inches, with at most so many intervals."""
+    bar = add_axes(figure, place, label)
+    drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
+    drawn.outline.set_linewidth(0.5)
+    bar.xaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
+    bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    bar.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
+    return bar
+
+
+def number_map(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
+    """Numbers the axes of a map's panel.
+
+    Args:
+        panel: the map's.
+        size: width and height in inches.
+        left: whether the numbers of the y-axis are shown.
+        bottom: whether those of the x-axis are.
+    """
+    for axis, inches in zip((panel.xaxis, panel.yaxis), size, strict=True):
+        # A tick at the very end is left out, as its number would touch the next panel's first.
+        most = min(max(int(inches / 0.2), 1), 4)
+        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
+    thin_ticks(panel, labelleft=left, labelbottom=bottom)
+
+
+def write(figure: Figure, left: float, top: float, text: str, size: float = TEXT, **style: Any) -> None:
+    """Writes text at a place in inches from the upper left corner."""
+    width, height = figure.get_size_inches()
+    figure.text(left / width, 1 - top / height, text, size=size, parse_math=False, **style)
+
+
+def thin_ticks(panel: Axes, **style: Any) -> None:
+    """Gives a map's panel the small ticks and the thin frame of a printed page."""
+    panel.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5, **style)
+    panel.spines[:].set(linewidth=0.5, visible=True)
+
+
+def save(
+    figure: Figure, path: Path, kind: str, dpi: float | str = "figure", part: Bbox | None = None
+) -> None:
+    """Writes a figure with its fonts embedded.
+
+    Args:
+        figure: what was drawn.
+        path: file to write.
+        kind: png, pdf, svg or jpg.
+        dpi: dots an inch; those of the figure where not given.
+        part: what of it is written, in inches; all where not given.
+    """
+    with matplotlib.rc_context(_SAVED):
+        figure.savefig(path, format=kind, dpi=dpi, bbox_inches=part)
+
+
+def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI) -> None:
+    """Writes a figure as PNG and, beside it, as PDF; each whole or not at all.
+
+    Args:
+        figure: what was drawn.
+        path: of the PNG; its folder is made.
+        trim: cut white borders away; a figure made for a column keeps its width without.
+        dpi: dots an inch.
+    """
+    # Laid out for good, so that both files are drawn alike and no layout is made twice.
+    figure.set_dpi(dpi)
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+    part = Bbox(figure.get_tightbbox()).padded(0.05) if trim else None
+    for suffix in (".png", ".pdf"):
+        with replacing(path.with_suffix(suffix)) as partial:
+            save(figure, partial, suffix[1:], dpi, part)

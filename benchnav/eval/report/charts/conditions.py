@@ -1,0 +1,287 @@
+"""Charts of the conditions of a run: success, outcomes, distributions, and the forest plot of its hypotheses.
+
+All but the last have a panel a block and a row a setting. Any number of planners, models and risk settings fits,
+since their names stand on the left.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from benchnav.core.figures import (
+    AMBER,
+    BLIND,
+    BLUE,
+    GREEN,
+    ONE_COLUMN_IN,
+    ORANGE,
+    PINK,
+    SKY,
+    TWO_COLUMNS_IN,
+    legend_outside,
+    planner_colours,
+    planner_name,
+    styled,
+)
+from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.hypotheses import METRICS
+from benchnav.eval.report.words import blocks, condition_name, outcome_in_words, p_in_words, several_models
+from benchnav.planning.world.outcome import FAILURES
+
+# From what the ground did to what the code did; success is light, each failure has a colour of its own.
+OUTCOME_COLOURS = {
+    "immobilised": ORANGE,
+    "stuck": AMBER,
+    "timeout": BLUE,
+    "stalled": SKY,
+    "out_of_bounds": PINK,
+    "planner_failure": GREEN,
+    "planner_error": "#000000",
+    "model_error": "#7F7F7F",
+}
+SUCCESS_COLOUR = "#E4E4E4"
+assert set(OUTCOME_COLOURS) == {outcome.name.lower() for outcome in FAILURES}
+
+_ROW_IN, _GAP_ROWS = 0.145, 0.6
+_PANELS_A_LINE = 4
+_QUANTITIES = {"total_time_s": "T_total [s], a failure counts as T", "traversability": "λ̄, mean observed λ"}
+_SPREAD = 0.32  # of a row's height, to either side
+_TEST_IN, _METRIC_IN = 0.3, 0.55
+_MARGIN = "0.88"
+
+Setting = tuple[str, str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Where what is drawn.
+
+    Args:
+        figure: with a panel a block.
+        panels: of each block its panel, and its rows of the summary.
+        heights: of each setting (planner, model, risk) its height in a panel.
+    """
+
+    figure: Figure
+    panels: tuple[tuple[Axes, pd.DataFrame], ...]
+    heights: dict[Setting, float]
+
+    def rows(self, summary: pd.DataFrame) -> Iterator[tuple[float, dict[Any, Any]]]:
+        """Rows of a block with their heights."""
+        for row in summary.to_dict("records"):
+            yield self.heights[row["planner"], row["model"], row["risk"]], row
+
+
+def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0) -> Layout:
+    """Makes the panels, with the names of settings at the left of each line of panels.
+
+    Args:
+        summary: from `summary.summarise`.
+        measures: what is drawn of each block, a panel each and side by side; the layout then lists each block as
+            often.
+        legend_in: height kept for a legend.
+    """
+    columns = len(measures)
+    every = [block for block in blocks(summary) for _ in range(columns)]
+    heights = _heights(summary)
+    across = columns if columns > 1 else min(len(every), _PANELS_A_LINE)
+    down = -(-len(every) // across)
+    tall = _ROW_IN * (max(heights.values()) + 1.4) + 0.5
+    width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
+    figure = Figure(figsize=(width, tall * down + 0.2 + legend_in), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False, sharex="all" if columns == 1 else "col", sharey=True)
+    axes = list(axes.flat)
+    panels = tuple((panel, rows) for panel, (_, rows) in zip(axes, every, strict=False))
+    for place, (panel, (title, _)) in enumerate(zip(axes, every, strict=False)):
+        panel.set_title(title)
+        panel.tick_params(axis="y", length=0)
+        panel.grid(axis="x", color="0.9")
+        panel.set_axisbelow(True)
+        if place >= len(every) - across:
+            panel.tick_params(labelbottom=True)
+            panel.set_xlabel(measures[place % columns])
+    for panel in axes[len(every) :]:
+        panel.set_visible(False)
+    several = several_models(summary)
+    names = [
+        condition_name({"planner": planner, "model": model, "risk": risk}, several)
+        for planner, model, risk in heights
+    ]
+    axes[0].set_yticks(list(heights.values()), names)
+    axes[0].set_ylim(max(heights.values()) + 0.7, min(heights.values()) - 0.7)
+    return Layout(figure=figure, panels=panels, heights=heights)
+
+
+def _heights(summary: pd.DataFrame) -> dict[Setting, float]:
+    """Height of each setting, planners a little apart."""
+    planners = list(summary["planner"].unique())
+    rows = summary[["planner", "model", "risk"]].drop_duplicates().itertuples(index=False, name=None)
+    ordered = sorted(rows, key=lambda setting: planners.index(setting[0]))
+    return {setting: place + _GAP_ROWS * planners.index(setting[0]) for place, setting in enumerate(ordered)}
+
+
+@styled()
+def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figure:
+    """Draws the success rate of every condition with its 95 % interval, a panel a block of the run.
+
+    A planner that is blind is drawn as a line through its panel, the baseline that others are seen against.
+
+    Args:
+        summary: from `summary.summarise`.
+        marked: conditions whose points are filled, as `best_marked` of `best.against_best` has them.
+    """
+    layout, colours = lay_out(summary, ["success [%]"]), planner_colours(list(summary["planner"]))
+    for panel, rows in layout.panels:
+        for height, row in layout.rows(rows):
+            # The clairvoyant has a model, and no risk.
+            blind = row["model"] == NOT_USED
+            colour = BLIND if blind else colours[row["planner"]]
+            face = colour if row["condition"] in marked else "white"
+            rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
+            panel.plot([low, high], [height, height], color=colour, lw=1.2, solid_capstyle="butt")
+            panel.plot(rate, height, "o", color=colour, ms=4, mfc=face)
+            if blind:
+                panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
+                panel.axvspan(low, high, color=colour, alpha=0.12, lw=0, zorder=0)
+        panel.set_xticks(np.arange(0, 101, 25))
+    layout.panels[0][0].set_xlim(-4, 104)
+    return layout.figure
+
+
+@styled()
+def outcome_figure(summary: pd.DataFrame) -> Figure:
+    """Draws the shares of outcomes, a bar a condition, in one order for all: failures first, then success.
+
+    Args:
+        summary: from `summary.summarise`.
+    """
+    ended = [name for name in OUTCOME_COLOURS if summary[f"{name}_count"].sum()]
+    layout = lay_out(summary, ["share of episodes [%]"], legend_in=0.15 + 0.15 * (len(ended) // 3))
+    for panel, rows in layout.panels:
+        for height, row in layout.rows(rows):
+            left = 0.0
+            for name in ended:
+                share = 100 * row[f"{name}_count"] / row["n_episodes"]
+                colour, label = OUTCOME_COLOURS[name], outcome_in_words(name)
+                panel.barh(height, share, 0.78, left, color=colour, lw=0, label=label)
+                left += share
+            panel.barh(height, 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
+    layout.panels[0][0].set_xlim(0, 100)
+    legend_outside(layout.figure, columns=3 if layout.figure.get_figwidth() < TWO_COLUMNS_IN else 6)
+    return layout.figure
+
+
+@styled()
+def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure:
+    """Draws a dot an episode, with median and quartiles: T_total on the left, λ̄ on the right, a line a block.
+
+    Args:
+        summary: from `summary.summarise`.
+        episodes: the rows it was made of.
+    """
+    groups = dict(list(episodes.groupby("condition", sort=False)))
+    layout = lay_out(summary, list(_QUANTITIES.values()), legend_in=0.15)
+    for place, (panel, rows) in enumerate(layout.panels):
+        name = list(_QUANTITIES)[place % len(_QUANTITIES)]
+        _draw_dots(panel, [(height, groups[row["condition"]]) for height, row in layout.rows(rows)], name)
+    layout.panels[0][0].set_xlim(left=0)
+    layout.panels[1][0].set_xlim(0, 1)
+    handles = [
+        Line2D([], [], marker="o", ls="none", ms=3, color=colour, label=label)
+        for colour, label in ((BLUE, "success"), (ORANGE, "failure"))
+    ]
+    handles.append(
+        Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label="median and quartiles of all")
+    )
+    legend_outside(layout.figure, handles)
+    return layout.figure
+
+
+def _draw_dots(panel: Axes, rows: Sequence[tuple[float, pd.DataFrame]], name: str) -> None:
+    """Draws a quantity of the episodes of several conditions, each condition at its height; all dots at once."""
+    dots, middles = [], []
+    for height, episodes in rows:
+        values = episodes[name].to_numpy(dtype=float)
+        known = ~np.isnan(values)
+        if not known.any():
+            continue
+        shift = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, len(values))
+        colours = np.where(episodes["success"].to_numpy(dtype=bool), BLUE, ORANGE)
+        dots.append((values[known], height + shift[known], colours[known]))
+        middles.append((height, *np.percentile(values[known], (25, 50, 75))))
+    if not dots:
+        return
+    across, up, colours = (np.concatenate(part) for part in zip(*dots, strict=True))
+    panel.scatter(across, up, s=2.5, c=colours, alpha=0.35, lw=0, rasterized=True)
+    heights, low, median, high = np.transpose(middles)
+    panel.plot([low, high], [heights, heights], color="black", lw=1.2, solid_capstyle="butt")
+    panel.plot(median, heights, "|", color="black", ms=6, mew=1.4)
+
+
+@styled()
+def forest_figure(tests: pd.DataFrame) -> Figure:
+    """Draws each hypothesis as its difference, with the 95 % interval thin and the 90 % interval thick.
+
+    Filled points are of hypotheses that are supported; the band is where a margin wants the difference to lie.
+
+    Args:
+        tests: from `hypotheses.test_hypotheses`.
+    """
+    numbered = tests.assign(number=range(1, len(tests) + 1))
+    panels = [numbered[numbered["metric"] == name] for name in METRICS if (tests["metric"] == name).any()]
+    heights = [_METRIC_IN + _TEST_IN * len(rows) for rows in panels]
+    figure = Figure(figsize=(TWO_COLUMNS_IN, sum(heights) + 0.3), layout="constrained")
+    axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
+    for panel, rows in zip(axes, panels, strict=True):
+        _draw_tests(panel, rows)
+    handles: list[Artist] = [
+        Line2D([], [], color=BLUE, marker="o", ms=4, lw=0, label="supported"),
+        Line2D([], [], color=BLUE, marker="o", ms=4, lw=0, mfc="white", label="not supported"),
+        Line2D([], [], color=BLUE, lw=2.6, label="90 % interval"),
+        Line2D([], [], color=BLUE, lw=0.9, label="95 % interval"),
+    ]
+    if (tests["margin"] > 0).any():
+        handles.append(Patch(color=_MARGIN, label="within the margin"))
+    legend_outside(figure, handles, 5)
+    return figure
+
+
+def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
+    metric = METRICS[rows["metric"].iloc[0]]
+    ends = rows[["low", "high", "difference"]].to_numpy(dtype=float)
+    # Where no episode tells anything, a row has no numbers.
+    reach = np.nanmax([*np.abs(ends).ravel(), rows["margin"].max(), 1e-9]) * 1.08
+    panel.set(xlim=(-reach, reach), ylim=(len(rows) - 0.4, -0.6))
+    panel.axvline(0, color="0.4", lw=0.6, zorder=1)
+    names = []
+    for height, row in enumerate(rows.to_dict("records")):
+        if row["margin"] > 0:
+            low = -reach if row["direction"] == "lower" else -row["margin"]
+            high = reach if row["direction"] == "higher" else row["margin"]
+            panel.fill_between([low, high], height - 0.36, height + 0.36, color=_MARGIN, lw=0, zorder=0)
+        for suffix, width in (("", 0.9), ("_90", 2.6)):
+            span = [row[f"low{suffix}"], row[f"high{suffix}"]]
+            panel.plot(span, [height, height], color=BLUE, lw=width, solid_capstyle="butt", zorder=2)
+        face = BLUE if row["supported"] else "white"
+        panel.plot(row["difference"], height, "o", color=BLUE, ms=4.5, mfc=face, zorder=3)
+        beside = panel.get_yaxis_transform()
+        panel.text(1.01, height, p_in_words(row["p_holm"]), transform=beside, va="center")
+        one, other = (", ".join(map(planner_name, name.split(", "))) for name in row["names"])
+        names.append(f"{row['number']}. {one}\nless {other}")
+    panel.set_yticks(range(len(rows)), names)
+    panel.tick_params(axis="y", length=0)
+    panel.grid(axis="x", color="0.93", zorder=0)
+    panel.set_axisbelow(True)
+    unit = f" [{metric.unit}]" if metric.unit else ""
+    panel.set_xlabel(f"Δ {metric.name}{unit}")
+    # Which way is better, at the end of the axis where it lies.
+    place, side, words = (1, "right", "better →") if metric.better == "higher" else (0, "left", "← better")
+    panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side, color="0.35")

@@ -1,0 +1,135 @@
+"""What tables, sentences and figures of a run call things, and how they write numbers."""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from benchnav.core.figures import planner_name
+from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.stats.best import BLOCK
+from benchnav.planning.world.outcome import FAILURES
+
+# Labels that tell conditions of one map apart.
+NAMING = ("planner", "risk", "model", "robot", "objective", "world")
+
+
+def differ(labels: Iterable[str]) -> bool:
+    """Tells whether labels differ; of a condition that uses none of it, it does not count."""
+    return len(set(labels) - {NOT_USED}) > 1
+
+
+def several_models(summary: pd.DataFrame) -> list[str]:
+    """The label that names a condition beside planner and risk: its model, where those that look at one differ."""
+    return ["model"] if differ(summary["model"]) else []
+
+
+def blocks(summary: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Titles and rows of the blocks of a run: by scenario, and by what else of a block differs."""
+    keys = [name for name in BLOCK if name == "scenario" or summary[name].nunique() > 1]
+    return [(", ".join(map(str, key)), rows) for key, rows in summary.groupby(keys, sort=False)]
+
+
+def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> str:
+    """A condition by its planner and its risk setting, and by what else tells it from others.
+
+    Args:
+        labels: of the condition; what it does not use is `NOT_USED`.
+        several: labels that differ among the conditions shown, of `model` and `world`.
+    """
+    beside = [labels[name] for name in ("model", "world") if name in several]
+    # A planner that is given λ itself has a model and no risk setting; a blind one has neither.
+    if labels["risk"] == NOT_USED and "model" not in several:
+        beside.insert(0, labels["model"])
+    return joined([planner_name(labels["planner"]), *beside, labels["risk"]])
+
+
+def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
+    """Names conditions by those of their labels that tell them apart; by their planner where nothing does.
+
+    Args:
+        labels: of each condition.
+    """
+    differing = [name for name in NAMING if differ(own.get(name, NOT_USED) for own in labels)]
+    names = []
+    for own in labels:
+        shown = {**own, "planner": planner_name(own["planner"])}
+        names.append(joined(shown.get(name, NOT_USED) for name in differing) or shown["planner"])
+    return names
+
+
+def joined(labels: Iterable[str]) -> str:
+    """Labels with commas between, without those that are not used."""
+    return ", ".join(label for label in labels if label != NOT_USED)
+
+
+def maps_in_words(maps: int | str, groups: int | str) -> str:
+    """Says how many maps there are, and in how many groups where they have such."""
+    return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"
+
+
+def rate_in_words(row: Mapping[Any, Any]) -> str:
+    """Writes a success rate in per cent, so that one failure of 200 does not read as none."""
+    return short(100 * row["success_rate"])
+
+
+def failures_in_words(row: Mapping[Any, Any]) -> str:
+    """Says how a condition's failures ended, such as `2 stuck, 1 stalled`; a dash where there are none.
+
+    Args:
+        row: of the summary.
+    """
+    names = [outcome.name.lower() for outcome in FAILURES]
+    counts = {outcome_in_words(name): int(row[f"{name}_count"]) for name in names}
+    return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or NOT_USED
+
+
+def outcome_in_words(outcome: str) -> str:
+    """An outcome without underscores."""
+    return outcome.replace("_", " ")
+
+
+def p_value(p: float) -> str:
+    """Writes a p-value for a table; of drawn sign flips the least there can be is 0.0001."""
+    return "≤ 0.0001" if p <= 1e-4 else f"{p:.2g}"
+
+
+def p_in_words(p: float) -> str:
+    """Writes a p-value for a sentence."""
+    return f"p {p_value(p)}" if p <= 1e-4 else f"p = {p_value(p)}"
+
+
+def count_range(counts: Collection[int]) -> str:
+    """Counts as one number, or from the least to the most."""
+    least, most = min(counts), max(counts)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def short(value: float) -> str:
+    """A number with one decimal place, unless that is 0."""
+    return f"{value:.1f}".removesuffix(".0")
+
+
+def signed(value: float, digits: int = 1) -> str:
+    """A difference with its sign; a dash where there is none."""
+    return (
+        NOT_USED if np.isnan(value) else f"{round(value, digits) + 0.0:+.{digits}f}"
+    )  # no minus before a zero
+
+
+def signed_interval(low: float, high: float) -> str:
+    """The ends of an interval of a difference; a dash where there is none."""
+    return NOT_USED if np.isnan(low) else f"{signed(low)} to {signed(high)}"
+
+
+def mean_and_std(mean: float, std: float) -> str:
+    """A mean with its standard deviation, where there are such."""
+    if np.isnan(mean):
+        return NOT_USED
+    return f"{mean:.1f}" if np.isnan(std) else f"{mean:.1f} ± {std:.1f}"
+
+
+def success_interval_in_words(row: Mapping[Any, Any]) -> str:
+    """The 95 % interval of a success rate, in per cent."""
+    return f"{100 * row['success_low']:.0f}–{100 * row['success_high']:.0f}"
