@@ -3,7 +3,6 @@
 `distributed` is an extra of this package, imported when a cluster is asked for.
 """
 
-import logging
 import os
 import signal
 import threading
@@ -20,7 +19,7 @@ from urllib.parse import urlparse
 
 from joblib.externals.loky import get_reusable_executor
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, quiet
 
 _LOOK_S = 0.5
 _REACH_S = 5
@@ -140,7 +139,7 @@ def connected(scheduler: str) -> Iterator[Any]:
         ) from error
     _check_address(scheduler)
     with ExitStack() as stack:
-        stack.enter_context(_quiet())
+        stack.enter_context(quiet("distributed", "distributed.client"))
         try:
             client = stack.enter_context(Client(scheduler, timeout=_REACH_S, set_as_default=False))
         except (OSError, ValueError) as error:
@@ -166,16 +165,3 @@ def _check_address(scheduler: str) -> None:
         known = False
     if not known:
         raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps the library's own log off the terminal; what a user has to know is raised."""
-    levels = {name: logging.getLogger(name).level for name in ("distributed", "distributed.client")}
-    for name in levels:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)

@@ -221,13 +221,13 @@ def _classes(dataset: TerrainDataset) -> dict[str, Any]:
         rows.append({f"classes/{key}": value for key, value in row.items()})
     kinds = {"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"}
     fields = [_node("Field", key, dataType=kinds.get(key.rpartition("/")[2], "sc:Float")) for key in rows[0]]
-    description = (
+    meaning = (
         "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "
         "offset), clipped to [0, 1], and standard deviation noise; with probability soft_weight it is normal with "
         "soft_mean and soft_std instead. It is clipped to [0, 1]."
     )
-    key = {"@id": "classes/id"}
-    return _node("RecordSet", "classes", description=description, key=key, field=fields, data=rows)
+    identity = {"@id": "classes/id"}
+    return _node("RecordSet", "classes", description=meaning, key=identity, field=fields, data=rows)
 
 
 def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publication) -> str:

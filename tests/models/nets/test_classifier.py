@@ -1,3 +1,4 @@
+import logging
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
+from benchnav.models.nets.network import build_network
 from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network, measure
@@ -352,3 +354,20 @@ def test_losses_of_validation_are_weighed_by_labelled_cells() -> None:
     loader = torch.utils.data.DataLoader(batches, batch_size=None)  # type: ignore[arg-type]
     (logged,) = trainer.validate(model, loader, verbose=False)
     assert logged["valid_loss"] == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_what_a_hub_says_of_its_trials_does_not_bury_the_error(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    hub = logging.getLogger("huggingface_hub.utils._http")
+
+    def unreachable(*given: object, **named: object) -> None:
+        hub.warning("Retrying in 1s [Retry 1/5].")
+        raise OSError("no connection")
+
+    monkeypatch.setattr("segmentation_models_pytorch.create_model", unreachable)
+    with pytest.raises(ConfigError, match="ImageNet weights of resnet18"):
+        build_network(ClassifierConfig(pretrained=True), 3, 0)
+    assert caplog.records == []
+    hub.warning("seen again")
+    assert len(caplog.records) == 1
