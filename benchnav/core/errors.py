@@ -3,6 +3,10 @@
 A message names the argument, what was expected, what came, and what to do.
 """
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class BenchnavError(Exception):
     """Base of every error that a user can mend."""
@@ -18,3 +22,16 @@ class DatasetError(BenchnavError):
 
 class CheckpointError(BenchnavError):
     """A model checkpoint is missing, damaged, or does not fit the data."""
+
+
+@contextmanager
+def quiet(*loggers: str) -> Iterator[None]:
+    """Keeps what libraries log off the terminal; what a user has to know is raised."""
+    levels = {name: logging.getLogger(name).level for name in loggers}
+    for name in loggers:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)

@@ -3,24 +3,25 @@
 `distributed` is an extra of this package, imported when a cluster is asked for.
 """
 
-import logging
 import os
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from itertools import islice
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 from urllib.parse import urlparse
 
 from joblib.externals.loky import get_reusable_executor
+from joblib.externals.loky.backend.utils import kill_process_tree
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, ConfigError, quiet
 
 _LOOK_S = 0.5
 _REACH_S = 5
@@ -74,16 +75,14 @@ def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Itera
     # Processes that share the processors should not each take all of them.
     threads = {name: os.environ.get(name, "1") for name in _THREADS}
     executor = get_reusable_executor(
-        jobs, timeout=300, initializer=_start_worker, initargs=(os.getpid(),), env=threads
+        jobs, timeout=300, initializer=end_with, initargs=(os.getpid(),), env=threads
     )
     # A worker whose memory has grown is replaced; that is no concern of a user's.
     warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
     waiting, pending = iter(calls), set[Future[Result]]()
     try:
-        # Few at a time: the library cannot undo at an interruption what has not reached its processes.
-        while pending := pending | {
-            executor.submit(call) for call in islice(waiting, jobs + 1 - len(pending))
-        }:
+        # Few at a time, so that results do not pile up.
+        while pending := pending | _submit(executor, islice(waiting, jobs + 1 - len(pending))):
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
@@ -93,14 +92,25 @@ def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Itera
             "if need be with fewer `jobs`."
         ) from error
     finally:
-        if pending:  # nobody waits for them
-            executor.shutdown(kill_workers=True)
+        if (
+            pending
+        ):  # nobody waits for them; the library's own way to end them fails while it hands a call over
+            for process in list(executor._processes.values()):
+                kill_process_tree(process)
+            executor.shutdown()
 
 
-def _start_worker(parent: int) -> None:
-    # An interrupt is for the parent to act on; and a parent that is killed takes its workers along.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with(parent)
+def _submit(executor: Any, calls: Iterable[Callable[[], Result]]) -> set[Future[Result]]:
+    """Hands calls over; processes that are started for them inherit that they hear no interruption.
+
+    An interruption is for this process to act on, and would find them in the middle of their imports.
+    """
+    resource_tracker.ensure_running()  # its start, which the first process would need, ends the blocking
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return {executor.submit(call) for call in calls}
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run_on_cluster(calls: Sequence[Callable[[], Result]], scheduler: str) -> Iterator[Result]:
@@ -140,7 +150,7 @@ def connected(scheduler: str) -> Iterator[Any]:
         ) from error
     _check_address(scheduler)
     with ExitStack() as stack:
-        stack.enter_context(_quiet())
+        stack.enter_context(quiet("distributed", "distributed.client"))
         try:
             client = stack.enter_context(Client(scheduler, timeout=_REACH_S, set_as_default=False))
         except (OSError, ValueError) as error:
@@ -166,16 +176,3 @@ def _check_address(scheduler: str) -> None:
         known = False
     if not known:
         raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps the library's own log off the terminal; what a user has to know is raised."""
-    levels = {name: logging.getLogger(name).level for name in ("distributed", "distributed.client")}
-    for name in levels:
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for name, level in levels.items():
-            logging.getLogger(name).setLevel(level)

@@ -23,7 +23,16 @@ from torch import Tensor
 
 import benchnav
 from benchnav.core.errors import BenchnavError, CheckpointError
-from benchnav.core.store import building, refuse_taken, restore, seal, sole_writer, take_place, unseal
+from benchnav.core.store import (
+    building,
+    real_place,
+    refuse_taken,
+    restore,
+    seal,
+    sole_writer,
+    take_place,
+    unseal,
+)
 
 FORMAT = "benchnav-checkpoint"
 FORMAT_VERSION = (2, 2)
@@ -161,7 +170,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         ConfigError: the name is that of something else.
         BenchnavError: another process is writing it.
     """
-    folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
+    folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
     try:
         with sole_writer(folder, str(folder)):
             restore(folder)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from benchnav.core.errors import BenchnavError
-from benchnav.core.store import replacing, sole_writer, write_text
+from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.store import building, refuse_taken, replacing, sole_writer, take_place, write_text
 
 HOLD = """
 import sys, time
@@ -154,3 +154,44 @@ def test_folders_that_were_made_for_nothing_are_removed(tmp_path: Path) -> None:
     with sole_writer(tmp_path / "a" / "b" / "run", "x"):
         (tmp_path / "a" / "b" / "run").mkdir()
     assert (tmp_path / "a" / "b" / "run").is_dir()
+
+
+def test_a_place_is_taken_by_what_is_no_output_always_and_else_unless_it_is_to_be_replaced(
+    tmp_path: Path,
+) -> None:
+    def foreign(place: Path) -> str:
+        return "holds notes" if (place / "notes").exists() else ""
+
+    out = tmp_path / "out"
+    for overwrite in (False, True):
+        refuse_taken(out, overwrite, foreign)
+    out.mkdir()
+    refuse_taken(out, False, foreign)  # an empty folder is no loss
+    (out / "made").touch()
+    refuse_taken(out, True, foreign)
+    with pytest.raises(ConfigError, match=r"exists\. Pass --overwrite"):
+        refuse_taken(out, False, foreign)
+    (out / "notes").touch()
+    for overwrite in (False, True):
+        with pytest.raises(ConfigError, match=r"out holds notes\. Choose another"):
+            refuse_taken(out, overwrite, foreign)
+
+
+def test_a_folder_that_is_built_takes_its_place_or_goes(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def stopped() -> None:
+        with building(out) as folder:
+            (folder / "half").touch()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped()
+    assert list(tmp_path.iterdir()) == []
+    with building(out) as folder:
+        (folder / "left by a kill").touch()
+        with building(out) as again:
+            assert list(again.iterdir()) == []
+            (again / "whole").touch()
+            take_place(again, out)
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "whole"]

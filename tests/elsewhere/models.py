@@ -23,8 +23,8 @@ from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperatu
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
-from benchnav.models.training import classifiers, networks
 from benchnav.models.training import fit as fit_module
+from benchnav.models.training import networks
 from benchnav.models.training.data import VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network, measure
@@ -227,13 +227,15 @@ def test_a_pool_is_calibrated_on_the_device(
         given.append(device)
         return 1.5
 
-    monkeypatch.setattr(classifiers, "fit_pool_temperature", fit_pool)
-    monkeypatch.setattr(classifiers, "member_names", lambda checkpoint: ("classifier", "classifier-1"))
+    monkeypatch.setattr(networks, "fit_pool_temperature", fit_pool)
+    monkeypatch.setattr(networks, "member_names", lambda checkpoint: ("classifier", "classifier-1"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     target = SimpleNamespace(
         checkpoint=both, holds=lambda *words: True, set_pool_temperature=lambda value: None
     )
     for device in ("cpu", "cuda"):
         options = FitOptions(device=device)
-        classifiers.train_members(target, ClassifierConfig(), dataset, 2, 0, options, True)  # type: ignore[arg-type]
+        networks.train_parts(
+            target, ClassifierConfig(), dataset, ["classifier", "classifier-2"], 0, options, True
+        )  # type: ignore[arg-type]
     assert [place.type for place in given] == ["cpu", "cuda"]

@@ -17,16 +17,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> TerrainDataset:
 @pytest.fixture(scope="session")
 def checkpoint_path(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint with both halves, trained for a moment."""
-    from benchnav.models.cli import train_all
+    from benchnav.models.cli import TrainOptions, train_all
     from benchnav.models.config import ClassifierConfig, LatentGPConfig
 
     out = tmp_path_factory.mktemp("checkpoints") / "tiny"
     train_all(
+        TrainOptions(device="cpu", trainer={"precision": "32-true"}),
         str(dataset.path),
         str(out),
         ClassifierConfig(max_epochs=1, batch_size=5),
         LatentGPConfig(epochs=2, epoch_steps=10),
-        device="cpu",
-        trainer={"precision": "32-true"},
     )
     return out

@@ -160,53 +160,41 @@ def metadata(
         "distribution": [item for name, own in files.items() for item in _distribution(name, own, folder)],
         "recordSet": [
             _classes(dataset),
-            *(_maps(dataset, split, name, fields, len(files[name])) for split, name in names.items()),
+            *(_maps(dataset, split, name, fields) for split, name in names.items()),
         ],
     }
 
 
+def _node(kind: str, node_id: str, **about: Any) -> dict[str, Any]:
+    """A node of Croissant's own, named by the last part of its id."""
+    return {"@type": f"cr:{kind}", "@id": node_id, "name": node_id.rpartition("/")[2], **about}
+
+
 def _distribution(name: str, files: Sequence[Path], folder: Path) -> Iterator[dict[str, Any]]:
+    """The files of a split, and all of them as a set."""
     for path in files:
         with open(path, "rb") as opened:
             digest = hashlib.file_digest(opened, "sha256").hexdigest()
-        yield {
-            "@type": "cr:FileObject",
-            "@id": path.name,
-            "name": path.name,
-            "contentUrl": path.relative_to(folder).as_posix(),
-            "contentSize": f"{path.stat().st_size} B",
-            "encodingFormat": "application/x-parquet",
-            "sha256": digest,
-        }
-    if len(files) > 1:
-        yield {
-            "@type": "cr:FileSet",
-            "@id": f"{name}-files",
-            "name": f"{name}-files",
-            "encodingFormat": "application/x-parquet",
-            "includes": f"{FOLDER}/{name}-*-of-*.parquet",
-        }
+        yield _node(
+            "FileObject",
+            path.name,
+            contentUrl=path.relative_to(folder).as_posix(),
+            contentSize=f"{path.stat().st_size} B",
+            encodingFormat="application/x-parquet",
+            sha256=digest,
+        )
+    pattern = f"{FOLDER}/{name}-*-of-*.parquet"
+    yield _node("FileSet", f"{name}-files", encodingFormat="application/x-parquet", includes=pattern)
 
 
-def _maps(
-    dataset: TerrainDataset, split: str, name: str, fields: Sequence[str], files: int
-) -> dict[str, Any]:
+def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]) -> dict[str, Any]:
     """The rows of a split, and what its columns are."""
-    file = f"{name}-00000-of-00001.parquet"
-    source = {"fileObject": {"@id": file}} if files == 1 else {"fileSet": {"@id": f"{name}-files"}}
 
-    def column(of: str, kind: str, description: str, repeated: bool = False) -> dict[str, Any]:
-        return {
-            "@type": "cr:Field",
-            "@id": f"{name}/{of}",
-            "name": of,
-            "description": description,
-            "dataType": kind,
-            **({"repeated": True} if repeated else {}),
-            "source": {**source, "extract": {"column": of}},
-        }
+    def column(of: str, kind: str, description: str, **more: Any) -> dict[str, Any]:
+        source = {"fileSet": {"@id": f"{name}-files"}, "extract": {"column": of}}
+        about = {"description": description, "dataType": kind, **more, "source": source}
+        return _node("Field", f"{name}/{of}", **about)
 
-    about = dataset.splits[split]
     columns = [column(MAP, "sc:Integer", "number of the map in its split")]
     for of in fields:
         field = dataset.fields[of]
@@ -214,51 +202,32 @@ def _maps(
         words = [field.meaning] + ([f"in {field.unit}"] if field.unit != "1" else [])
         words += [f"nested lists of shape {list(shape)}"] if shape else []
         kind = "sc:Float" if "f" in field.dtype else "sc:Integer"
-        columns.append(column(of, kind, "; ".join(words), bool(shape)))
-    return {
-        "@type": "cr:RecordSet",
-        "@id": name,
-        "name": name,
-        "description": f"Split {split}: {about['maps']} maps of scenario {about['scenario']}.",
-        "key": {"@id": f"{name}/{MAP}"},
-        "field": columns,
-    }
+        columns.append(column(of, kind, "; ".join(words), **({"repeated": True} if shape else {})))
+    about = dataset.splits[split]
+    description = f"Split {split}: {about['maps']} maps of scenario {about['scenario']}."
+    key = {"@id": f"{name}/{MAP}"}
+    return _node("RecordSet", name, description=description, key=key, field=columns)
 
 
 def _classes(dataset: TerrainDataset) -> dict[str, Any]:
     """The class table, whose numbers give the latent traversability of a cell."""
-    kinds = {
-        **{"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"},
-        **dict.fromkeys(("scale", "exponent", "offset", "noise"), "sc:Float"),
-        **dict.fromkeys(("soft_weight", "soft_mean", "soft_std"), "sc:Float"),
-    }
-    rows = []
+    rows: list[dict[str, Any]] = []
     for number, item in enumerate(dataset.recipe.classes):
-        soft = item.soft
-        row = {
-            "id": number,
-            "name": item.name,
-            "colour": "#" + "".join(f"{value:02x}" for value in item.colour),
-        }
+        colour = "#" + "".join(f"{value:02x}" for value in item.colour)
+        row = {"id": number, "name": item.name, "colour": colour}
         row |= {key: getattr(item, key) for key in ("scale", "exponent", "offset", "noise")}
-        row |= {f"soft_{key}": getattr(soft, key) if soft else 0.0 for key in ("weight", "mean", "std")}
+        for key in ("weight", "mean", "std"):
+            row[f"soft_{key}"] = getattr(item.soft, key) if item.soft else 0.0
         rows.append({f"classes/{key}": value for key, value in row.items()})
-    return {
-        "@type": "cr:RecordSet",
-        "@id": "classes",
-        "name": "classes",
-        "description": (
-            "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "
-            "offset), clipped to [0, 1], and standard deviation noise; with probability soft_weight it is normal with "
-            "soft_mean and soft_std instead. It is clipped to [0, 1]."
-        ),
-        "key": {"@id": "classes/id"},
-        "field": [
-            {"@type": "cr:Field", "@id": f"classes/{key}", "name": key, "dataType": kind}
-            for key, kind in kinds.items()
-        ],
-        "data": rows,
-    }
+    kinds = {"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"}
+    fields = [_node("Field", key, dataType=kinds.get(key.rpartition("/")[2], "sc:Float")) for key in rows[0]]
+    meaning = (
+        "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "
+        "offset), clipped to [0, 1], and standard deviation noise; with probability soft_weight it is normal with "
+        "soft_mean and soft_std instead. It is clipped to [0, 1]."
+    )
+    identity = {"@id": "classes/id"}
+    return _node("RecordSet", "classes", description=meaning, key=identity, field=fields, data=rows)
 
 
 def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publication) -> str:
@@ -272,19 +241,13 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
     is_url = publication.license.startswith("http")
     ours = is_ours(dataset, list(names))
     title = f"BenchNav {dataset.id}" if ours else dataset.id
+    files = [{"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"} for name in names.values()]
     head = {
         "pretty_name": title,
         "license": "other" if is_url else publication.license.lower(),
         **({"license_link": publication.license} if is_url else {}),
         "tags": ["robotics", "off-road-navigation", "traversability", "terrain"],
-        "configs": [
-            {
-                "config_name": "default",
-                "data_files": [
-                    {"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"} for name in names.values()
-                ],
-            }
-        ],
+        "configs": [{"config_name": "default", "data_files": files}],
     }
     rows = [
         f"| `{name}` | `{split}` | {dataset.map_count(split)} | `{dataset.splits[split]['digest']}` |"

@@ -36,10 +36,9 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
     ) -> None:
         """Checks split and fields, and reads the maps where that is asked for."""
         self.dataset = TerrainDataset(find_dataset(path).resolve(), keep_open=True)
-        self.split, self.fields = split, tuple(fields)
+        self.split, self.fields = split, self.dataset.check_fields(tuple(fields))
         if not fields:
             raise DatasetError(f"Expected `fields` among {list(self.dataset.field_names)}, got none.")
-        self.dataset.read(split, [], self.fields)
         self._maps = self.dataset.map_count(split)
         self._memory: dict[str, Tensor] | None = None
         if in_memory:

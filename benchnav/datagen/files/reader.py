@@ -170,10 +170,7 @@ class TerrainDataset:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
         size = self.map_count(split)
-        names = self.field_names if fields is None else tuple(fields)
-        unknown = [name for name in names if name not in self.fields]
-        if unknown:
-            raise DatasetError(f"Expected `fields` among {list(self.fields)}, got {unknown}.")
+        names = self.field_names if fields is None else self.check_fields(tuple(fields))
         chosen = range(size) if indices is None else np.asarray(indices).tolist()
         if indices is not None and not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
@@ -215,6 +212,17 @@ class TerrainDataset:
 
         for _, maps in self.chunks(split, schema.MAP_FIELDS, cells):
             yield terrain_of(maps, self.recipe)
+
+    def check_fields(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Gives names of fields back.
+
+        Raises:
+            DatasetError: maps have no such field.
+        """
+        unknown = [name for name in names if name not in self.fields]
+        if unknown:
+            raise DatasetError(f"Expected `fields` among {list(self.fields)}, got {unknown}.")
+        return names
 
     def pieces(self, split: str) -> list[Piece]:
         """The files that hold a split's maps, in their order."""

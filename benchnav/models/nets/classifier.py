@@ -106,8 +106,8 @@ class TerrainClassifier(TrainableNetwork):
     @classmethod
     def untrained(cls, config: Any, class_count: int, data: Any = None, seed: int = 0) -> Self:
         """Builds it with fresh weights, for images of the colours of `data`."""
-        colours = data.colour_statistics() if data else (torch.zeros(3), torch.ones(3))
-        return cls(config, class_count, *colours, seed)
+        mean, std = data.colour_statistics() if data else (torch.zeros(3), torch.ones(3))
+        return cls(config, class_count, mean, std, seed)
 
     def configure_network(self, seed: int) -> nn.Module:
         """Builds the network; leaves PyTorch's global generator as it was.

@@ -119,7 +119,8 @@ class MixtureDensityNetwork(TrainableNetwork):
         cells = len(data.train) * data.train.shape[0] * data.train.shape[1]
         # Flat ground alone would have no scale.
         scale = (torch.as_tensor(squares) / cells).sqrt().clamp(min=1).float()
-        return cls(config, *data.colour_statistics(), scale, seed)
+        mean, std = data.colour_statistics()
+        return cls(config, mean, std, scale, seed)
 
     def configure_metrics(self) -> dict[str, Metric]:
         """The error of the expectation, in root mean square over the observed cells."""
@@ -162,12 +163,12 @@ class MixtureDensityNetwork(TrainableNetwork):
 
     def assess(self, batch: dict[str, Tensor]) -> tuple[Tensor, int]:
         """Computes the loss of a batch, and how many of its cells were observed; in evaluation updates `metrics`."""
-        parameters, observed = self(batch["rgb"], batch["slope_deg"]), batch["traversability"]
+        log_weights, means, stds = self(batch["rgb"], batch["slope_deg"])
+        observed = batch["traversability"]
         seen = observed.isfinite()
         with torch.autocast(observed.device.type, enabled=False):
-            loss = censored_nll(*parameters, observed)
+            loss = censored_nll(log_weights, means, stds, observed)
         if not self.training:
-            log_weights, means, stds = parameters
             expected = TraversabilityMixture(log_weights.exp(), means, stds).mean()
             self.metrics["rmse"].update(expected[seen], observed[seen])
         return loss, int(seen.sum())

@@ -12,7 +12,7 @@ import timm
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, quiet
 from benchnav.core.options import hint, one_line
 from benchnav.models.config import DEEPEST, ClassifierConfig
 
@@ -59,7 +59,8 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
     """
     _check_names(config)
     size = _size(config)
-    with torch.random.fork_rng(devices=[]):
+    # The hub's own lines on each trial to reach it would bury the error.
+    with torch.random.fork_rng(devices=[]), quiet("huggingface_hub"):
         torch.default_generator.manual_seed(seed)
         try:
             network = smp.create_model(

@@ -34,7 +34,10 @@ class TrainableNetwork(lightning.LightningModule):
         super().__init__()
         self.config: Any = config
         # A loss that is no number is to be seen, not left out.
-        metrics = {"loss": MeanMetric(nan_strategy=math.nan), **self.configure_metrics()}
+        metrics: dict[str, Metric | MetricCollection] = {
+            "loss": MeanMetric(nan_strategy=math.nan),
+            **self.configure_metrics(),
+        }
         self.metrics = MetricCollection(metrics, prefix="valid_", compute_groups=False)
 
     @classmethod

@@ -8,7 +8,6 @@ what a batch holds depends on seed and epoch alone.
 
 import inspect
 import json
-import logging
 import os
 import pickle
 import signal
@@ -27,7 +26,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from benchnav.core.device import find_device
-from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.errors import CheckpointError, ConfigError, quiet
 from benchnav.core.options import one_line
 from benchnav.core.store import sole_writer, write_text
 from benchnav.models.training.callbacks import History, WholeFiles, measured, progress
@@ -138,7 +137,7 @@ def fit(
     held = sole_writer(folder, str(folder)) if folder and is_first_process() else nullcontext()
     callbacks, state = [*callbacks, progress(part)], None
     kept: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
-    with quiet(), held:
+    with quietly(), held:
         if folder:
             trainers = {f"trainer.{name}": value for name, value in options.trainer_settings.items()}
             state = _prepare(folder, options.resume, {**settings, **trainers})
@@ -253,16 +252,8 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def quietly() -> Iterator[None]:
     """Keeps Lightning's hints to its developers out of a user's terminal."""
-    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"lightning\..*")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+    with quiet("lightning.pytorch", "lightning.fabric"), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"lightning\..*")
+        yield

@@ -27,7 +27,7 @@ from benchnav.models.training.data import (
     read_maps,
     training_digest,
 )
-from benchnav.models.training.fit import FitOptions, fit, is_first_process, make_trainer, quiet, say
+from benchnav.models.training.fit import FitOptions, fit, is_first_process, make_trainer, quietly, say
 from benchnav.models.training.target import Target
 
 _DEFAULT = FitOptions()
@@ -106,7 +106,7 @@ def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) 
     check_maps(dataset)
     check_known(dataset, kind.fields[-1])
     network = kind.untrained(config, len(dataset.recipe.classes))
-    with quiet():
+    with quietly():
         chosen = options.chosen(max_epochs=config.max_epochs)
         trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
     every = trainer.check_val_every_n_epoch

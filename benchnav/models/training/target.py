@@ -15,7 +15,7 @@ from typing import Any
 from rich.filesize import decimal
 
 from benchnav.core.errors import CheckpointError
-from benchnav.core.store import building, refuse_taken, restore
+from benchnav.core.store import building, real_place, refuse_taken, restore
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     Checkpoint,
@@ -135,7 +135,7 @@ def open_target(
         CheckpointError: what is there would be lost or does not fit.
         ConfigError: the folder is something else.
     """
-    folder = Path(os.path.normpath(folder))  # a/../b is b, whether or not there is an a
+    folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
     left = interrupted(options.folder, parts) if options.folder else []
     if left and not (options.resume or overwrite) and is_first_process():
         raise CheckpointError(
@@ -156,7 +156,8 @@ def open_target(
         resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
         raise CheckpointError(
             f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
-            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it{resume}."
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
+            f"{resume}."
         )
     elif trained and not options.resume:
         checkpoint = fresh

@@ -1,3 +1,4 @@
+import logging
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +12,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.nets.classifier import LabelledLoss, MeanIoU, TerrainClassifier
+from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
+from benchnav.models.nets.network import build_network
 from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network, measure
@@ -266,11 +268,9 @@ def test_cells_without_a_class_are_no_part_of_the_loss_and_the_measures(dice: fl
     (gradient,) = torch.autograd.grad(loss, logits)
     assert bool((gradient[..., 5:] == 0).all())
     assert bool((gradient[..., :5] != 0).any())
-    found, wanted = (
-        model.metrics(logits.argmax(1), holed),
-        model.metrics(logits[..., :5].argmax(1), class_id[..., :5]),
-    )
-    assert found == wanted
+    for metric in model.configure_metrics().values():
+        found, wanted = metric(logits.argmax(1), holed), metric(logits[..., :5].argmax(1), class_id[..., :5])
+        assert found == wanted
 
 
 @pytest.mark.parametrize("dice", [0.0, 0.7])
@@ -319,17 +319,12 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
         def chunks(self, device: torch.device) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
             return [([0, 1], self.some)]
 
-    class Colour(torch.nn.Module):
-        class_count, device = 4, torch.device("cpu")
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.loss = LabelledLoss(0.0, 0.0)
-
+    class Colour(TerrainClassifier):
         def forward(self, seen: torch.Tensor) -> torch.Tensor:
             return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
 
-    found, wanted = (measure(Colour(), maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
+    colour = Colour(ClassifierConfig(encoder="mobilenet_v2"), 4, torch.zeros(3), torch.ones(3)).eval()
+    found, wanted = (measure(colour, maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     assert 0 < found["valid_accuracy"] < 1
 
@@ -359,3 +354,20 @@ def test_losses_of_validation_are_weighed_by_labelled_cells() -> None:
     loader = torch.utils.data.DataLoader(batches, batch_size=None)  # type: ignore[arg-type]
     (logged,) = trainer.validate(model, loader, verbose=False)
     assert logged["valid_loss"] == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_what_a_hub_says_of_its_trials_does_not_bury_the_error(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    hub = logging.getLogger("huggingface_hub.utils._http")
+
+    def unreachable(*given: object, **named: object) -> None:
+        hub.warning("Retrying in 1s [Retry 1/5].")
+        raise OSError("no connection")
+
+    monkeypatch.setattr("segmentation_models_pytorch.create_model", unreachable)
+    with pytest.raises(ConfigError, match="ImageNet weights of resnet18"):
+        build_network(ClassifierConfig(pretrained=True), 3, 0)
+    assert caplog.records == []
+    hub.warning("seen again")
+    assert len(caplog.records) == 1

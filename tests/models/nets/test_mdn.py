@@ -355,7 +355,7 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
 
 def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: TerrainDataset) -> None:
     network, metrics = fit_network(
-        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT), True
+        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT), half_precision=True
     )
     whole, before = fit_network(
         replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
