@@ -1,9 +1,7 @@
-"""A robot F and an objective J of one's own.
+"""A robot F and an objective J of one's own, which `check_robot` and `check_objective` of `benchnav.testing` try.
 
 benchnav-eval run --robots '[examples/own_robot.py:Tracked]' --objectives '[examples/own_robot.py:Energy]' \
   --planners '[straight,astar_dwa,mppi]' --risks '[mean]' --out runs/tracked
-
-Their tests need a line each: `check_robot` and `check_objective` of `benchnav.testing`.
 """
 
 from dataclasses import dataclass

@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchnav.testing.planner import check_planner
+from benchnav.testing import check_objective, check_planner, check_risk, check_robot
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -67,6 +67,8 @@ def test_a_planner_and_a_risk_measure_of_ones_own_by_file(dataset_path: Path, tm
     assert dict(cells) == {("straight", "–"): 2, ("Fan", "mean"): 2, ("Fan", "worst"): 2}
     assert rows["success"].all()
     check_planner(f"{EXAMPLES / 'own_planner.py'}:Fan")
+    for name in ("worst", "cautious"):
+        check_risk(f"{EXAMPLES / 'own_risk.py'}:{name}")
 
 
 def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_path: Path) -> None:
@@ -81,6 +83,8 @@ def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_pa
     assert rows["success"].all()
     # 0.8 m/s at most.
     assert (rows["path_length_m"] / rows["end_time_s"]).max() < 0.81
+    check_robot(f"{path}:Tracked")
+    check_objective(f"{path}:Energy", f"{path}:Tracked")
 
 
 @pytest.mark.parametrize("name", ["own_planner.py", "own_risk.py", "own_robot.py"])

@@ -228,10 +228,9 @@ def _with_other_prediction(problem: Problem) -> Problem:
 
 def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
     """The step of a number; of the ended robots one has left the map, the others have arrived."""
-    places = problem.goal_m.clone()
-    places[0] = -0.3
+    places = problem.goal_m.index_fill(0, ended.nonzero()[:1, 0], -0.3)
     state = step.state.clone()
-    state[:, :2] = torch.where(ended[:, None], places, state[:, :2])
+    state[ended, :2] = places[ended]
     return replace(step, state=state, time_s=number * problem.dt_s, draw=number % 2 == 1)
 
 

@@ -64,13 +64,12 @@ def _drive(
     generator, expect = torch.Generator().manual_seed(_SEED), breaches.expect
     pose = draw((0, 0, -3), (9, 9, 3), (math.prod(leading),), like, generator)
     state = breaches.watch("initial_state", lambda: robot.initial_state(pose), pose=pose)
-    size = max(state.shape[-1], 3) if isinstance(state, Tensor) and state.ndim == 2 else 3
-    if state is NOTHING or not breaches.expect_tensor("initial states", state, pose, (len(pose), size)):
+    begins = isinstance(state, Tensor) and same(state[..., :3], pose)
+    if not expect(
+        begins, f"Expected initial states in {like.dtype} that begin with the pose (x, y, θ), got others."
+    ):
         return
-    expect(
-        same(state[:, :3], pose), "Expected initial states that begin with the pose (x, y, θ), got others."
-    )
-    state = state.reshape(*leading, size)
+    state = state.reshape(*leading, -1)
     for _ in range(3):
         action = draw(robot.action_low, robot.action_high, leading, like, generator)
         ground = draw([0], [1], leading, like, generator)[..., 0]

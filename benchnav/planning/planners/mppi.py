@@ -32,7 +32,7 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step, check_finite
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise
 
@@ -73,14 +73,10 @@ class MPPIConfig:
 
     def __post_init__(self) -> None:
         """Refuses settings that sample nothing."""
-        for name in ("horizon_s", "samples", "noise_share", "temperature_share", "temperature"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0 for MPPI, got {value}.")
+        above = "horizon_s", "samples", "noise_share", "temperature_share", "temperature"
+        check_finite("MPPI", self, above, ("control_cost",))
         if self.noise is not None and not (self.noise and all(0 < scale < math.inf for scale in self.noise)):
             raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
-        if not 0 <= self.control_cost < math.inf:
-            raise ConfigError(f"Expected `control_cost` ≥ 0 for MPPI, got {self.control_cost}.")
 
     def steps(self, dt_s: float) -> int:
         """Steps T of the horizon for a time step."""

@@ -5,6 +5,7 @@ pure: the same arguments give the same result. Letters in shapes: B episodes, N 
 S state and A action dimensions.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from enum import IntEnum
@@ -173,6 +174,24 @@ class LocalPlanner(ABC, Generic[State]):
     @abstractmethod
     def select(self, plan_state: State, members: Tensor) -> State:
         """Keeps some episodes; see `Planner`."""
+
+
+def check_finite(owner: str, settings: Any, above: tuple[str, ...], least: tuple[str, ...] = ()) -> None:
+    """Refuses settings that are not finite, or under 0; None stands for a setting that is not given.
+
+    Args:
+        owner: whose settings they are, for the message.
+        settings: a dataclass.
+        above: fields that may not be 0 either.
+        least: fields that may.
+
+    Raises:
+        ConfigError: there are such.
+    """
+    for name in (*above, *least):
+        value, sign = getattr(settings, name), ">" if name in above else "≥"
+        if value is not None and not (0 <= value < math.inf and (value or sign == "≥")):
+            raise ConfigError(f"Expected `{name}` {sign} 0 and finite for {owner}, got {value}.")
 
 
 def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:

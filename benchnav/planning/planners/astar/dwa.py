@@ -18,11 +18,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite
 from benchnav.planning.problem import (
     Problem,
     motion_traversability,
@@ -70,12 +69,7 @@ class DWAConfig:
 
     def __post_init__(self) -> None:
         """Refuses an empty window, and weights that mean nothing."""
-        for name in ("speeds", "turn_rates", "horizon_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0 and finite for DWA, got {getattr(self, name)}.")
-        for name in ("heading_weight", "arrival_m"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` ≥ 0 and finite for DWA, got {getattr(self, name)}.")
+        check_finite("DWA", self, ("speeds", "turn_rates", "horizon_s"), ("heading_weight", "arrival_m"))
 
     def steps(self, dt_s: float) -> int:
         """The horizon in steps T of so many seconds."""

@@ -11,12 +11,11 @@ from typing import ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, has_path_cost, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step, check_finite
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem, Task, with_tensors
 
@@ -38,8 +37,7 @@ class GuideConfig:
 
     def __post_init__(self) -> None:
         """Refuses a look-ahead that looks nowhere."""
-        if not 0 < self.lookahead_m < float("inf"):
-            raise ConfigError(f"Expected `lookahead_m` > 0 and finite for A*, got {self.lookahead_m}.")
+        check_finite("A*", self, ("lookahead_m",))
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt.edges import SPACING_M, ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
 from benchnav.planning.planners.cl_rrt.tree import Route, map_tensors, no_route, search
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
-from benchnav.planning.problem import Problem, Task
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step, check_finite
+from benchnav.planning.problem import Problem, Task, with_tensors
 from benchnav.planning.robots import SPEED, TURN_RATE
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
@@ -85,12 +85,8 @@ class CLRRTConfig:
 
     def __post_init__(self) -> None:
         """Refuses settings that grow no tree."""
-        for name in (
-            *("expansions", "expansions_per_round", "step_m", "edge_time_s", "turning_radius_m"),
-            *("replan_distance_m", "stall_s", "most_failures"),
-        ):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0 for CL-RRT, got {getattr(self, name)}.")
+        above = "expansions", "expansions_per_round", "step_m", "edge_time_s", "turning_radius_m"
+        check_finite("CL-RRT", self, (*above, "replan_distance_m", "stall_s", "most_failures"))
         if self.expansions % self.expansions_per_round:
             raise ConfigError(
                 f"Expected `expansions` as a multiple of `expansions_per_round` = {self.expansions_per_round} "
@@ -217,20 +213,7 @@ class CLRRT(Planner[CLRRTState]):
 
     def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
         """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
-
-        def keep(values: Tensor) -> Tensor:
-            return values[members]
-
-        return replace(
-            plan_state,
-            problem=plan_state.problem.select(members),
-            route=map_tensors(keep, plan_state.route),
-            tracking=map_tensors(keep, plan_state.tracking),
-            edge=keep(plan_state.edge),
-            failures=keep(plan_state.failures),
-            mark_m=keep(plan_state.mark_m),
-            mark_step=keep(plan_state.mark_step),
-        )
+        return with_tensors(plan_state, lambda values: values[members])
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
         """Moves the progress to where the robots are, on to the next edge where one is done."""

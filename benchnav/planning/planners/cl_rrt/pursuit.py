@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
+from benchnav.planning.planners.planner import check_finite
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
 _LEAST_CURVATURE = 1e-6
@@ -49,13 +50,8 @@ class FollowerConfig:
 
     def __post_init__(self) -> None:
         """Refuses settings that lead nowhere."""
-        for name in ("lookahead_m", "speed_mps"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0 for a path follower, got {value}.")
-        for name in ("lookahead_s", "speed_kp", "speed_ki", "speed_kd"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` ≥ 0 for a path follower, got {getattr(self, name)}.")
+        least = "lookahead_s", "speed_kp", "speed_ki", "speed_kd"
+        check_finite("a path follower", self, ("lookahead_m", "speed_mps"), least)
 
 
 @dataclass(frozen=True)
