@@ -168,7 +168,7 @@ def legend_outside(
     columns: int = 4,
     side: Literal["lower", "upper"] = "lower",
 ) -> Legend:
-    """Lays a legend under or over the panels, of what has a label in them, once each, where no handles are given.
+    """Lays a legend under or over the panels: what has a label in them, once each, then the handles.
 
     A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
     """
@@ -177,7 +177,7 @@ def legend_outside(
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
     loc: Any = f"outside {side} center"
-    return figure.legend(handles=handles or list(labelled.values()), loc=loc, ncols=columns)
+    return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
 
 
 def legend_at(

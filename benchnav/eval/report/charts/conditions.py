@@ -194,10 +194,8 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
         _draw_dots(panel, [(height, groups[row["condition"]]) for height, row in layout.rows(rows)], name)
     layout.panels[0][0].set_xlim(left=0)
     layout.panels[1][0].set_xlim(0, 1)
-    handles = [
-        Line2D([], [], marker="o", ls="none", ms=3, color=colour, label=label)
-        for colour, label in ((BLUE, "success"), (ORANGE, "failure"))
-    ]
+    handles = [Line2D([], [], marker="o", ls="none", ms=3, color=BLUE, label="success")]
+    handles.append(Line2D([], [], marker="o", ls="none", ms=3, color=ORANGE, label="failure"))
     handles.append(
         Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label="median and quartiles of all")
     )
