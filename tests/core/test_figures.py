@@ -42,6 +42,7 @@ def test_conditions_have_their_planners_colours_where_these_tell_them_apart() ->
     own = planner_colours(planners)
     assert condition_colours(planners) == [own[planner] for planner in planners]
     assert condition_colours(["mppi"] * 3) == list(LINE_COLOURS[:3])
+    assert condition_colours(["mppi", "straight", "mppi"]) == [LINE_COLOURS[0], BLIND, LINE_COLOURS[1]]
 
 
 def test_eight_conditions_have_eight_colours() -> None:

@@ -16,8 +16,8 @@ from benchnav.core.figures import (
     MARKERS,
     ONE_COLUMN_IN,
     TWO_COLUMNS_IN,
+    condition_colours,
     legend_outside,
-    planner_colours,
     planner_name,
     styled,
 )
@@ -167,11 +167,7 @@ class _Curves:
         self.sweep = sweep
         self.rows: dict[str, Labels] = {row["condition"]: row for row in summary.to_dict("records")}
         names = {self.name(line): self.first(line)["planner"] for line in sweep.lines}
-        if len(set(names.values())) == len(names):
-            own = planner_colours(list(names.values()))
-            colours = [own[planner] for planner in names.values()]
-        else:
-            colours = [LINE_COLOURS[place % len(LINE_COLOURS)] for place in range(len(names))]
+        colours = condition_colours(list(names.values()), LINE_COLOURS)
         markers = [MARKERS[place // len(LINE_COLOURS) % len(MARKERS)] for place in range(len(names))]
         self.looks = dict(zip(names, zip(colours, markers, strict=True), strict=True))
         self.references: dict[str, Line2D] = {}
