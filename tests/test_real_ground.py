@@ -11,6 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from benchnav.core import figures
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.cli import main as datagen
 from benchnav.datagen.files.reader import TerrainDataset
@@ -18,7 +19,6 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.eval.cli import main as evaluate
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.cli import main as train
-from benchnav.models.quality import figures
 from tests.datagen.dem.rasters import rough, write
 
 rasterio = pytest.importorskip("rasterio")
@@ -124,11 +124,11 @@ def test_nothing_is_scored_against_a_truth_that_is_unknown(
     assert metrics["valid_nll"] < -1
     drawn: dict[str, list[object]] = {}
 
-    def save(figure: Figure, path: Path) -> None:
+    def save(figure: Figure, path: Path, dpi: float) -> None:
         texts = [text.get_text() for text in figure.findobj(Text)]
         drawn[path.stem] = [texts, [panel.get_label() for panel in figure.axes]]
 
-    monkeypatch.setattr(figures, "save_figure", save)
+    monkeypatch.setattr(figures, "save_twice", save)
     for model in ("mine", "oracle"):
         out = ("--out", tmp_path / model, "--maps", 1)
         assert call(monkeypatch, train, "evaluate", model, "--data", "real.h5", *out) == 0

@@ -4,6 +4,7 @@ Sizes are in inches and points as printed. Colours are distinct to every kind of
 Ito (2008), "Color universal design".
 """
 
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -92,16 +93,17 @@ def planner_colours(planners: Sequence[str]) -> dict[str, str]:
     return own | {planner: left[place % len(left)] for place, planner in enumerate(others)}
 
 
-def condition_colours(planners: Sequence[str]) -> list[str]:
-    """Colours of conditions that are shown together; beyond eight they begin anew.
+def condition_colours(planners: Sequence[str], palette: Sequence[str] = COLOURS) -> list[str]:
+    """Colours of conditions that are shown together.
 
     Args:
-        planners: of each condition; where no two are alike, each has its planner's colour.
+        planners: of each condition; where no two are alike, each has its planner's colour. Else the conditions take
+            those of the palette in turn, but for the blind baseline, which is grey.
+        palette: begun anew where it is used up.
     """
-    if len(set(planners)) == len(planners) <= len(LINE_COLOURS):
-        own = planner_colours(planners)
-        return [own[planner] for planner in planners]
-    return [COLOURS[place % len(COLOURS)] for place in range(len(planners))]
+    own, turn = planner_colours(planners), itertools.cycle(palette)
+    alike = len(own) < len(planners)
+    return [own[planner] if not alike or own[planner] == BLIND else next(turn) for planner in planners]
 
 
 def bytes_of(colour: Any) -> tuple[int, int, int]:
@@ -168,7 +170,7 @@ def legend_outside(
     columns: int = 4,
     side: Literal["lower", "upper"] = "lower",
 ) -> Legend:
-    """Lays a legend under or over the panels, of what has a label in them, once each, where no handles are given.
+    """Lays a legend under or over the panels: what has a label in them, once each, then the handles.
 
     A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
     """
@@ -177,7 +179,7 @@ def legend_outside(
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
     loc: Any = f"outside {side} center"
-    return figure.legend(handles=handles or list(labelled.values()), loc=loc, ncols=columns)
+    return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
 
 
 def legend_at(
@@ -185,7 +187,7 @@ def legend_at(
     handles: Sequence[Artist],
     place: tuple[float, float],
     columns: int,
-    loc: str = "upper left",
+    loc: Any = "upper left",
 ) -> None:
     """Lays a legend with its corner `loc` at (left, top) in inches from the upper left corner of a figure."""
     width, height = figure.get_size_inches()

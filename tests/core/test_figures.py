@@ -22,6 +22,8 @@ def test_a_planner_has_one_colour_in_whatever_company() -> None:
     assert alone["mppi"] == others["mppi"]
     assert len(set(others.values())) == 4
     assert others["straight"] == BLIND
+    shipped = planner_colours(["astar_dwa", "astar_mppi", "cl_rrt", "mppi", "straight"])
+    assert len(set(shipped.values())) == len(shipped)
 
 
 @pytest.mark.parametrize(
@@ -42,6 +44,7 @@ def test_conditions_have_their_planners_colours_where_these_tell_them_apart() ->
     own = planner_colours(planners)
     assert condition_colours(planners) == [own[planner] for planner in planners]
     assert condition_colours(["mppi"] * 3) == list(LINE_COLOURS[:3])
+    assert condition_colours(["mppi", "straight", "mppi"]) == [LINE_COLOURS[0], BLIND, LINE_COLOURS[1]]
 
 
 def test_eight_conditions_have_eight_colours() -> None:

@@ -398,9 +398,9 @@ def test_a_dataset_with_stakes_from_making_to_mending(datagen: Call, tmp_path: P
     assert datagen("create", "stakes-v1", *changes, "--out", "d.h5") == 0
     made = capsys.readouterr().out
     assert "λ_stuck 0.1" in made
-    last = made.rstrip().splitlines()[-7:]
+    last = made.rstrip().splitlines()[-6:]
     assert last[0].split()[0] == "test/hg"
-    assert [line.partition(":")[0].strip() for line in last[2:]] == [
+    assert [line.partition(":")[0].strip() for line in last[1:]] == [
         "stuck %", "soft ground %", "soft spots %", "time s", "straight free"
     ]  # fmt: skip
     assert datagen("show", "d.h5") == 0

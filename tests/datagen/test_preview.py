@@ -164,7 +164,11 @@ def test_tables_of_any_size_have_colours(count: int) -> None:
 def test_texts_are_legible(dataset: TerrainDataset, indices: list[int]) -> None:
     figure = preview_figure(dataset, "train", indices)
     check_texts(figure)
-    assert figure.get_figwidth() == pytest.approx(TWO_COLUMNS_IN) if len(indices) < 5 else figure.get_figheight() < 9.7
+    assert (
+        figure.get_figwidth() == pytest.approx(TWO_COLUMNS_IN)
+        if len(indices) < 5
+        else figure.get_figheight() < 9.7
+    )
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 16), (12, 96), (48, 12), (20, 30)])

@@ -235,6 +235,10 @@ def test_settings_stand_down_and_scenarios_across() -> None:
     assert rows[1][3] == r"80.0 $\pm$ 35.1"
     assert rows[0][5:] == ["--"] * 3
     assert rows[2][5].startswith("50 {")
+    # A line parts the planners, as it parts the heading from the first.
+    lines = [line.strip() for line in text.splitlines()]
+    under = [lines[place + 1].split(" &")[0] for place, line in enumerate(lines) if line == r"\midrule"]
+    assert under == ["A* + DWA", "MPPI"]
 
 
 def test_it_is_a_whole_table_for_booktabs_alone() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
+from benchnav.core.tables import to_terminal
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder.folder import open_run
@@ -49,7 +50,9 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     report = write_report(folder)
     print_report(report)
     printed = capsys.readouterr().out
-    table, _, below = printed.partition("└")
+    table = to_terminal(report.table).rstrip()
+    below = printed.partition(table)[2]
+    assert below
     text, page = (folder / "summary.md").read_text(), (folder / "report.html").read_text()
     for line in (LINE, WARNING):
         assert line not in table

@@ -6,7 +6,7 @@ since their names stand on the left.
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -97,8 +97,8 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     tall = _ROW_IN * (max(heights.values()) + 1.4) + 0.5
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     figure = Figure(figsize=(width, tall * down + 0.2 + legend_in), layout="constrained")
-    axes = figure.subplots(down, across, squeeze=False, sharex="all" if columns == 1 else "col", sharey=True)
-    axes = list(axes.flat)
+    shared: Literal["all", "col"] = "all" if columns == 1 else "col"
+    axes = list(figure.subplots(down, across, squeeze=False, sharex=shared, sharey=True).flat)
     panels = tuple((panel, rows) for panel, (_, rows) in zip(axes, every, strict=False))
     for place, (panel, (title, _)) in enumerate(zip(axes, every, strict=False)):
         panel.set_title(title)
@@ -194,10 +194,8 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
         _draw_dots(panel, [(height, groups[row["condition"]]) for height, row in layout.rows(rows)], name)
     layout.panels[0][0].set_xlim(left=0)
     layout.panels[1][0].set_xlim(0, 1)
-    handles = [
-        Line2D([], [], marker="o", ls="none", ms=3, color=colour, label=label)
-        for colour, label in ((BLUE, "success"), (ORANGE, "failure"))
-    ]
+    handles = [Line2D([], [], marker="o", ls="none", ms=3, color=BLUE, label="success")]
+    handles.append(Line2D([], [], marker="o", ls="none", ms=3, color=ORANGE, label="failure"))
     handles.append(
         Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label="median and quartiles of all")
     )

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from benchnav.core.figures import (
@@ -120,7 +119,8 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
         _draw_predicted(below, snapshot, letters)
         for panel in (above, below):
             for name, style in STYLES.items():
-                panel.add_collection(plan_layer(style, snapshot.plan.lines.get(name, ())))
+                if len(snapshot.plan.lines.get(name, ())):
+                    panel.add_collection(plan_layer(style, snapshot.plan.lines[name]))
             _mark_places(panel, snapshot, snapshot.track[snapshot.now])
         if snapshot.field is not None:
             _draw_field(last[0], snapshot, snapshot.field, letters)
@@ -129,7 +129,7 @@ def trajectory_figure(snapshots: Sequence[Snapshot]) -> Figure:
             panel.tick_params(labelleft=place % across == 0)
     for panel in panels[:, 0]:
         panel.set_ylabel("y [m]")
-    legend_outside(figure, _legend(snapshots), 1 if across == 1 else 4)
+    legend_outside(figure, _ground_entries(snapshots), 1 if across == 1 else 4)
     shrink = min(1.0, 4 / figure.get_figheight())
     figure.colorbar(
         driven, ax=panels, fraction=0.03, aspect=40, shrink=shrink, anchor=(0, 1), label="traversability λ"
@@ -168,7 +168,8 @@ def _draw_predicted(panel: Axes, snapshot: Snapshot, letters: int) -> None:
     blind = snapshot.about["model"] == NOT_USED
     words = "E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner"
     _name_panel(panel, letters, words)
-    draw_edged(panel, snapshot.track[: snapshot.now + 1], 1.4)
+    words = "driven; above in the colour of the observed λ"
+    draw_edged(panel, snapshot.track[: snapshot.now + 1], 1.4, label=words)
 
 
 def _draw_field(panel: Axes, snapshot: Snapshot, field: np.ndarray, letters: int) -> None:
@@ -177,7 +178,7 @@ def _draw_field(panel: Axes, snapshot: Snapshot, field: np.ndarray, letters: int
     draw_edged(panel, snapshot.track, 1.4)
     _mark_places(panel, snapshot, snapshot.track[-1])
     if immobilised_at(snapshot.about, snapshot.track) is not None:
-        mark(panel, "end", snapshot.track[-1])
+        mark(panel, "end", snapshot.track[-1], label="immobilised")
     end_s = len(snapshot.traversability) * snapshot.dt_s
     _name_panel(panel, letters, f"driven to the end ({end_s:g} s), on λ as it was")
 
@@ -186,7 +187,7 @@ def _mark_places(panel: Axes, snapshot: Snapshot, robot: np.ndarray) -> None:
     """Marks start, goal and robot, and gives the panel its axes."""
     panel.set_visible(True)
     for name, place in (("start", snapshot.track[0]), ("goal", snapshot.goal_m), ("robot", robot)):
-        mark(panel, name, place)
+        mark(panel, name, place, label=name)
     panel.set(xlim=(0, snapshot.extent_m[0]), ylim=(0, snapshot.extent_m[1]), aspect="equal")
     thin_ticks(panel)
 
@@ -198,6 +199,7 @@ def plan_layer(style: LayerStyle, lines: Sequence[np.ndarray] = ()) -> LineColle
         colors=[unit(style.colour)],
         linewidths=_LINE_WIDTH * style.width,
         linestyles="dashed" if style.dashed else "solid",
+        label=style.label,
     )
 
 
@@ -207,14 +209,10 @@ def soft_lines(soft: np.ndarray, resolution_m: float) -> Iterator[LineCollection
         yield LineCollection(list(lines(soft, resolution_m)), colors=[unit(SOFT)], linewidths=0.4)
 
 
-def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
-    """Marks, and what is drawn of grounds and plans."""
+def _ground_entries(snapshots: Sequence[Snapshot]) -> list[Artist]:
+    """Entries of the legend for what is drawn of the ground."""
     known = [snapshot for snapshot in snapshots if snapshot.field is not None]
-    planned = {name for snapshot in snapshots for name, lines in snapshot.plan.lines.items() if len(lines)}
-    entries: list[Artist] = [mark_handle(name) for name in ("start", "goal", "robot")]
-    entries.append(
-        Line2D([], [], color="black", lw=1.4, label="driven; above in the colour of the observed λ")
-    )
+    entries: list[Artist] = []
     if not all(snapshot.free.all() for snapshot in snapshots):
         entries.append(Patch(color=_CLOSED, label="not free"))
     if any(snapshot.soft.any() for snapshot in known):
@@ -223,13 +221,6 @@ def _legend(snapshots: Sequence[Snapshot]) -> list[Artist]:
         )
     if any(snapshot.immobilising.any() for snapshot in known):
         entries.append(Patch(color=unit(IMMOBILISING), label="immobilises a robot"))
-    if any(immobilised_at(snapshot.about, snapshot.track) is not None for snapshot in known):
-        entries.append(mark_handle("end", "immobilised"))
-    for name, style in STYLES.items():
-        if name in planned:
-            dashes = "--" if style.dashed else "-"
-            width = max(_LINE_WIDTH * style.width, 0.8)
-            entries.append(Line2D([], [], color=unit(style.colour), lw=width, ls=dashes, label=style.label))
     return entries
 
 
@@ -250,27 +241,25 @@ def driven_figure(ground: DrivenGround, rows: pd.DataFrame, tracks: Sequence[np.
     show_map(panel, _backdrop(ground), (wide, high))
     names = contender_names(rows[list(NAMING)].to_dict("records"))
     colours = condition_colours(list(rows["planner"]))
-    handles: list[Artist] = []
     for place, (row, track) in enumerate(zip(rows.to_dict("records"), tracks, strict=True)):
         # Later ones are smaller, so that paths and ends that coincide are all seen.
         smaller = 1 - place / max(len(rows), 2)
         style = _PATH_STYLES[place // len(set(colours)) % len(_PATH_STYLES)]
         label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
         draw_edged(panel, track, 0.9 + 2.2 * smaller, colours[place], ls=style, label=label)
-        handles.append(panel.lines[-1])
         if not row["success"]:
             mark(panel, "end", track[-1], 0.6 + smaller, color=colours[place])
     mark(panel, "start", tracks[0][0], label="start")
     mark(panel, "goal", ground.goal_m, label="goal")
-    handles += [mark_handle("start"), mark_handle("goal")]
+    more: list[Artist] = []
     if not rows["success"].all():
-        handles.append(mark_handle("end", "end of a failure, in the colour of its path"))
+        more.append(mark_handle("end", "end of a failure, in the colour of its path"))
     if ground.immobilising.any():
-        handles.append(Patch(color=unit(IMMOBILISING), label="immobilises a robot"))
+        more.append(Patch(color=unit(IMMOBILISING), label="immobilises a robot"))
     title = "terrain, faded" if ground.field is None else "λ as it was: the lighter the faster"
     panel.set(xlim=(0, wide), ylim=(0, high), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
     thin_ticks(panel)
-    figure.legend(handles=handles, loc="outside right upper")
+    figure.legend(handles=[*panel.get_legend_handles_labels()[0], *more], loc="outside right upper")
     return figure
 
 
@@ -312,11 +301,10 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
             f"{line.name}\n({len(line.failures)} of {line.among} failures)", fontsize="small"
         )
     figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")
-    handles: list[Artist] = [mark_handle(name) for name in ("start", "goal", "end")]
-    handles.append(Line2D([], [], color="black", lw=1.1, label="driven"))
+    more: list[Artist] = []
     if any(line.ground.immobilising.any() for line in lines):
-        handles.append(Patch(color=unit(IMMOBILISING), label="ground that immobilises a robot"))
-    legend_outside(figure, handles, 5 if across > 2 else 3)
+        more.append(Patch(color=unit(IMMOBILISING), label="ground that immobilises a robot"))
+    legend_outside(figure, more, 5 if across > 2 else 3)
     return figure
 
 
@@ -329,8 +317,8 @@ def _draw_failure(panel: Axes, line: FailedLine, place: int) -> None:
         immobilising = np.zeros((*ground.immobilising.shape[1:], 4))
         immobilising[ground.immobilising[place]] = [*unit(IMMOBILISING), 0.75]
         show_map(panel, immobilising, (width, height))
-    draw_edged(panel, track, 1.1)
+    draw_edged(panel, track, 1.1, label="driven")
     for name, position in (("start", track[0]), ("goal", ground.goal_m[place]), ("end", track[-1])):
-        mark(panel, name, position, 0.9)
+        mark(panel, name, position, 0.9, label=name)
     panel.spines[:].set_visible(False)
     panel.set(xlim=(0, width), ylim=(0, height), xticks=[], yticks=[], aspect="equal")

@@ -16,8 +16,8 @@ from benchnav.core.figures import (
     MARKERS,
     ONE_COLUMN_IN,
     TWO_COLUMNS_IN,
+    condition_colours,
     legend_outside,
-    planner_colours,
     planner_name,
     styled,
 )
@@ -167,11 +167,7 @@ class _Curves:
         self.sweep = sweep
         self.rows: dict[str, Labels] = {row["condition"]: row for row in summary.to_dict("records")}
         names = {self.name(line): self.first(line)["planner"] for line in sweep.lines}
-        if len(set(names.values())) == len(names):
-            own = planner_colours(list(names.values()))
-            colours = [own[planner] for planner in names.values()]
-        else:
-            colours = [LINE_COLOURS[place % len(LINE_COLOURS)] for place in range(len(names))]
+        colours = condition_colours(list(names.values()), LINE_COLOURS)
         markers = [MARKERS[place // len(LINE_COLOURS) % len(MARKERS)] for place in range(len(names))]
         self.looks = dict(zip(names, zip(colours, markers, strict=True), strict=True))
         self.references: dict[str, Line2D] = {}
@@ -204,11 +200,7 @@ class _Curves:
             below.set_xticks(self.places(values), [f"{value:g}" for value in values])
         for first in range(2):
             _share_heights(list(axes[first::2].flat))
-        lines_drawn = [
-            Line2D([], [], color=colour, marker=marker, ms=3.5, lw=1.2, label=name)
-            for name, (colour, marker) in self.looks.items()
-        ]
-        legend_outside(figure, [*lines_drawn, *self.references.values()], 2 if across == 1 else 4)
+        legend_outside(figure, list(self.references.values()), 2 if across == 1 else 4)
         return figure
 
     def panels(self) -> list[tuple[str, list[Line]]]:
@@ -261,9 +253,10 @@ class _Curves:
         rate, low, high = (
             [columns[3] * self.rows[condition][name] for condition in line.conditions] for name in columns[:3]
         )
-        places, (colour, marker) = self.places(line.values), self.looks[self.name(line)]
+        name, places = self.name(line), self.places(line.values)
+        colour, marker = self.looks[name]
         panel.fill_between(places, low, high, color=colour, alpha=0.15, lw=0)
-        panel.plot(places, rate, color=colour, marker=marker, ms=3.5, lw=1.2)
+        panel.plot(places, rate, color=colour, marker=marker, ms=3.5, lw=1.2, label=name)
 
     def draw_references(self, panel: Axes, lines: Sequence[Line], columns: Columns) -> None:
         """Draws the settings that have no such number, each in the colour of its planner's line."""

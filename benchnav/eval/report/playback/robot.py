@@ -1,12 +1,13 @@
 """What belongs to one robot of a recording in the Rerun viewer: where it is, what it planned, drove and met."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground, shades
-from benchnav.eval.report.recorded.drawn_plan import STYLES, DrawnPlan, drawing_interval, thinned
+from benchnav.eval.report.recorded.drawn_plan import STYLES, drawing_interval, thinned
 from benchnav.eval.report.recorded.ground import immobilised_at
 from benchnav.eval.report.recorded.recording import Recording
 
@@ -96,54 +97,53 @@ def log_series(stream: Any, driver: Driver) -> None:
 
 def log_driven(stream: Any, driver: Driver) -> None:
     """Logs the path driven so far, coloured by the observed λ, or in the robot's colour where it is not alone."""
-    import rerun as rr
-
     recording = driver.recording
     place = recording.states[:, :2].astype(np.float32)
-    lifted, flat = over_ground(recording, place), on_map(recording.grid, place)
     count, every = len(recording.traversability), drawing_interval(recording.dt_s)
     colours = shades(recording.traversability)
     for piece, first in enumerate(range(0, count, _PIECE * every)):
         last = min(first + _PIECE * every, count)
         for step in [*range(first + every, last, every), last]:
             stream.set_time(TIMELINE, duration=step * recording.dt_s)
-            for root, points, kind, radius in (
-                ("world", lifted, rr.LineStrips3D, 0.08),
-                ("map/overlay", flat, rr.LineStrips2D, 0.25),
-            ):
-                if driver.name:
-                    strips = kind([points[first : step + 1]], colors=[driver.colour], radii=radius)
-                else:
-                    segments = np.stack((points[first:step], points[first + 1 : step + 1]), axis=1)
-                    strips = kind(segments, colors=colours[first:step], radii=radius)
-                stream.log(driver.entity(root, f"driven/{piece:03}"), strips)
+            lines = [place[first : step + 1]]
+            if not driver.name:
+                lines = [place[k : k + 2] for k in range(first, step)]
+            shown = [driver.colour] if driver.name else colours[first:step]
+            _log_strips(stream, driver, f"driven/{piece:03}", lines, shown, (0.08, 0.25))
 
 
 def log_plans(stream: Any, driver: Driver) -> None:
     """Logs what was planned, when it was planned; of a robot that is not alone, the path alone."""
     known: dict[str, list[np.ndarray]] = {}
-    for plan in driver.recording.own_plans:
-        _log_plan(stream, driver, thinned(plan), known)
+    for plan in map(thinned, driver.recording.own_plans):
+        stream.set_time(TIMELINE, duration=plan.step * driver.recording.dt_s)
+        for name, style in STYLES.items():
+            lines = list(plan.lines.get(name, ()))
+            # A layer without lines is logged too: it wipes out the earlier plan's. One that stays is not.
+            if (driver.name and name != "path") or (name in known and _same(known[name], lines)):
+                continue
+            known[name] = lines
+            colours = [(*driver.colour, 160) if driver.name else style.colour]
+            radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
+            _log_strips(stream, driver, f"plan/{name}", lines, colours, radii)
 
 
-def _log_plan(stream: Any, driver: Driver, plan: DrawnPlan, known: dict[str, list[np.ndarray]]) -> None:
+def _log_strips(
+    stream: Any,
+    driver: Driver,
+    leaf: str,
+    lines: Sequence[np.ndarray],
+    colours: Any,
+    radii: tuple[float, float],
+) -> None:
+    """Logs lines, each of shape [N, 2], over the ground and on the maps; the radii are in metres and in cells."""
     import rerun as rr
 
     recording = driver.recording
-    stream.set_time(TIMELINE, duration=plan.step * recording.dt_s)
-    for name, style in STYLES.items():
-        lines = list(plan.lines.get(name, ()))
-        # A layer without lines is logged too: it wipes out the earlier plan's. One that stays is not.
-        if (driver.name and name != "path") or (name in known and _same(known[name], lines)):
-            continue
-        known[name] = lines
-        colours = [(*driver.colour, 160) if driver.name else style.colour]
-        lifted = [over_ground(recording, line) for line in lines]
-        flat = [on_map(recording.grid, line) for line in lines]
-        thick, thick_flat = _RADIUS_M * style.width, _RADIUS_CELLS * style.width
-        world, overlay = driver.entity("world", f"plan/{name}"), driver.entity("map/overlay", f"plan/{name}")
-        stream.log(world, rr.LineStrips3D(lifted, colors=colours, radii=thick))
-        stream.log(overlay, rr.LineStrips2D(flat, colors=colours, radii=thick_flat))
+    lifted = [over_ground(recording, line) for line in lines]
+    flat = [on_map(recording.grid, line) for line in lines]
+    stream.log(driver.entity("world", leaf), rr.LineStrips3D(lifted, colors=colours, radii=radii[0]))
+    stream.log(driver.entity("map/overlay", leaf), rr.LineStrips2D(flat, colors=colours, radii=radii[1]))
 
 
 def _same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:

@@ -82,6 +82,6 @@ def test_ground_that_immobilises_a_robot_is_drawn_and_named_where_there_is_such(
     alpha = np.asarray(figure.axes[0].images[1].get_array())[..., 3]
     assert (alpha > 0).tolist() == immobilising[0].tolist()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["start", "goal", "end", "driven", "ground that immobilises a robot"]
+    assert names == ["driven", "start", "goal", "end", "ground that immobilises a robot"]
     plain = failure_figure([shown(rows)])
     assert "ground that immobilises a robot" not in [text.get_text() for text in plain.legends[0].get_texts()]
