@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.core.options import hint, one_line
+from benchnav.core.settings import hint, one_line
 
 
 def attribute(module: ModuleType, place: str, name: str) -> Any:

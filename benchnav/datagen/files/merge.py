@@ -21,8 +21,7 @@ from benchnav.datagen.files.create import check_place, join
 from benchnav.datagen.files.folder import Contents, whole, write_manifest
 from benchnav.datagen.files.hdf5 import is_one_file, named_errors
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
-from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
-from benchnav.datagen.recipe.rules import check_name
+from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (

@@ -23,6 +23,7 @@ import torch
 
 from benchnav.core.device import find_device, gpu_name
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.settings import plain
 from benchnav.core.store import Shard, sole_writer
 from benchnav.core.workers import end_with
 from benchnav.eval.experiment.condition import Condition, check_labels
@@ -150,7 +151,7 @@ def run_suite(
         for line in caveats({"warnings": checked.warnings, "dropped": checked.dropped}):
             say(line)
         work = Work(
-            suite=suite.to_dict(),
+            suite=plain(suite),
             conditions=checked.conditions,
             dropped=checked.dropped,
             warnings=checked.warnings,

@@ -17,8 +17,9 @@ from torchmetrics import MetricCollection
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import of, read
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.config import ClassifierConfig, rebuild
+from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.network import build_network
 from benchnav.models.nets.schedule import one_cycle
 
@@ -177,7 +178,7 @@ class TerrainClassifier(lightning.LightningModule):
             RuntimeError: the tensors do not fit them.
         """
         settings = {name: value for name, value in config.items() if name != "temperature"}
-        built = rebuild(ClassifierConfig, {**settings, "pretrained": False})
+        built = read(ClassifierConfig, {**settings, "pretrained": False}, of("ClassifierConfig"))
         temperature = config.get("temperature", 1.0)
         if not isinstance(temperature, int | float) or not 0 < temperature < math.inf:
             raise ConfigError(f"Expected a `temperature` > 0, got {temperature!r}.")

@@ -18,9 +18,10 @@ from torchmetrics import MeanSquaredError
 
 from benchnav.core.errors import BenchnavError, CheckpointError
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.settings import of, read
 from benchnav.core.terrain import Observation
 from benchnav.models.checkpoint import Checkpoint
-from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
+from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.schedule import one_cycle
 
@@ -184,7 +185,7 @@ class MixtureDensityNetwork(lightning.LightningModule):
             ConfigError: the settings are not those of a mixture-density network.
             RuntimeError: the tensors do not fit them.
         """
-        built = rebuild(MDNConfig, {**config, "pretrained": False})
+        built = read(MDNConfig, {**config, "pretrained": False}, of("MDNConfig"))
         network = cls(built, torch.zeros(3), torch.ones(3), torch.ones(()))
         network.load_state_dict(tensors)
         return network.eval()

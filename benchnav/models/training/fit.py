@@ -29,7 +29,7 @@ from torch import Tensor
 
 from benchnav.core.device import find_device
 from benchnav.core.errors import CheckpointError, ConfigError
-from benchnav.core.options import one_line
+from benchnav.core.settings import one_line
 from benchnav.core.store import sole_writer, write_text
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import as_stored
