@@ -12,11 +12,11 @@ import os
 import sys
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, get_origin
 
 from benchnav.core.errors import BenchnavError, ConfigError
@@ -31,12 +31,15 @@ from benchnav.core.settings import (
     list_options,
     load_yaml,
     members_of,
+    of,
     plain,
-    read,
+    read_options,
     read_yaml,
 )
 
 INTERRUPTED = 130
+
+_Flag = tuple[list[str], str]  # the option that a flag stands for, keys within its value; and its text
 
 Device = Literal["auto", "cpu", "cuda"]  # of the flag --device; see `benchnav.core.device`
 
@@ -69,9 +72,13 @@ class Command:
         return options
 
     @cached_property
-    def kinds(self) -> dict[str, Any]:
-        """Types by name of what can be given; names of fields of a dataclass have dots."""
-        return {"config": str, "print_config": bool} | dict(_with_fields(self.options))
+    def flags(self) -> dict[str, Any]:
+        """Types by flag; flags for the fields of a dataclass have a dot."""
+        kinds = {name: option.kind for name, option in self.options.items() if name not in self.positionals}
+        for name, kind in tuple(kinds.items()):
+            within = list_options(dataclass_in(kind)) if dataclass_in(kind) else {}
+            kinds |= {f"{name}.{field}": option.kind for field, option in within.items()}
+        return kinds | {"config": str, "print_config": bool}
 
     @cached_property
     def shipped(self) -> dict[str, Path]:
@@ -105,16 +112,7 @@ def run(
             raise ConfigError(
                 f"Expected a command among {', '.join(commands)}, got {asked!r}.{hint(asked, commands)}"
             )
-        if {"-h", "--help"} & set(words):
-            _print_help_of(f"{program} {asked}", command)
-            return 0
-        arguments = _read_arguments(f"{program} {asked}", command, words)
-        if arguments is None:
-            return 0
-        if command.settings is None:
-            return command.function(**arguments) or 0
-        own = {name: arguments.pop(name) for name in list_options(command.settings) if name in arguments}
-        return command.function(command.settings(**own), **arguments) or 0
+        return _call(f"{program} {asked}", command, words) or 0
     except (BenchnavError, UnicodeDecodeError) as error:
         return _refuse(program, str(error))
     except BrokenPipeError:
@@ -161,63 +159,63 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
             tell(f"{what}: {done}/{total}")
 
 
-def _read_arguments(program: str, command: Command, words: Sequence[str]) -> dict[str, Any] | None:
-    """Reads a subcommand's words to arguments by name; None where `--print_config` had them printed.
+def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
+    """Calls the function of a subcommand with what its words say, or prints its help or settings."""
+    import yaml
+
+    if {"-h", "--help"} & set(words):
+        return _print_help_of(program, command)
+    flags, places = _read_words(program, command, words)
+    arguments = _read_arguments(program, command, flags, places)
+    known = {
+        name: option.default for name, option in command.options.items() if option.default is not NO_DEFAULT
+    }
+    if printed := [value for path, value in flags if path == ["print_config"]]:
+        settings = plain(arguments if "skip_default" in printed else known | arguments)
+        print(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True), end="")
+        return 0
+    if lacking := [name for name in command.options if name not in known | arguments]:
+        named = [name.upper() if name in command.positionals else f"--{name}" for name in lacking]
+        raise ConfigError(f"Expected {' and '.join(named)}, got none. See `{program} --help`.")
+    if command.settings is None:
+        return command.function(**arguments)
+    own = {name: arguments.pop(name) for name in list_options(command.settings) if name in arguments}
+    return command.function(command.settings(**own), **arguments)
+
+
+def _read_arguments(
+    program: str, command: Command, flags: Sequence[_Flag], places: Sequence[str]
+) -> dict[str, Any]:
+    """Makes arguments by name of flags and of what is given by place.
 
     YAML files come first, then flags, then keys within the value of a flag, wherever they stand.
 
     Raises:
-        ConfigError: something given is unknown, missing or of another type.
+        ConfigError: something given is unknown or of another type.
     """
-    flags, places = _read_words(program, command, words)
-    entries = [
-        (file, _path_of(program, command, key, file), value)
-        for path, file in flags
-        if path == ["config"]
-        for key, value in _read_config(command, file).items()
-    ]
-    entries += [("", path, value) for path, value in sorted(flags, key=lambda flag: len(flag[0]))]
+    options, arguments = command.options, SimpleNamespace()  # by name, which later ones begin from
+    for file in [value for path, value in flags if path == ["config"]]:
+        settings = read_options(options, _read_config(command, file), of(file), base=arguments)
+        vars(arguments).update(settings)
     given: dict[str, Any] = {}
-    files: dict[str, str] = {}  # that keys stand in; empty for flags
-    for file, path, value in entries:
-        files[".".join(path)] = file
-        given[path[0]] = _merged(command, given, path, value)
+    for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
+        if name in options:
+            now = given.get(name, getattr(arguments, name, options[name].default))
+            given[name] = _merged(name, options[name].kind, now, keys, value)
     for name in command.positionals:
-        if command.options[name].kind == list[str]:
-            given[name], places = places or given.get(name, []), []
+        if options[name].kind == list[str] and (places or not hasattr(arguments, name)):
+            given[name], places = list(places), []
         elif places:
-            given[name] = places.pop(0)
+            given[name], *places = places
     if places:
         raise ConfigError(f"Expected nothing more, got {' '.join(places)!r}. See `{program} --help`.")
-
-    def known_as(key: str) -> str:
-        around = [name for name in accumulate(key.split("."), "{}.{}".format) if name in files]
-        file = files[around[-1]] if around else ""
-        return f"`{key}` of {file}" if file else f"--{key}"
-
-    arguments = {
-        name: read(option.kind, given[name], known_as, name, option.default)
-        for name, option in command.options.items()
-        if name in given
-    }
-    if "print_config" in given:
-        _print_config(command, arguments, given["print_config"])
-        return None
-    missing = [
-        name.upper() if name in command.positionals else f"--{name}"
-        for name, option in command.options.items()
-        if option.default is NO_DEFAULT and name not in given
-    ]
-    if missing:
-        raise ConfigError(f"Expected {' and '.join(missing)}, got none. See `{program} --help`.")
-    return arguments
+    vars(arguments).update(read_options(options, given, "--{}".format, base=arguments))
+    return vars(arguments)
 
 
-def _read_words(
-    program: str, command: Command, words: Sequence[str]
-) -> tuple[list[tuple[list[str], Any]], list[str]]:
+def _read_words(program: str, command: Command, words: Sequence[str]) -> tuple[list[_Flag], list[str]]:
     """Reads words as flags, each with the keys that it stands for and its value; and what is given by place."""
-    flags: list[tuple[list[str], Any]] = []
+    flags: list[_Flag] = []
     places: list[str] = []
     rest = deque(words)
     while rest:
@@ -227,46 +225,43 @@ def _read_words(
             continue
         flag, equals, value = word.partition("=")
         path = _path_of(program, command, flag)
-        kind = command.kinds.get(".".join(path), Any)
-        if not equals and kind is bool:
-            value = rest.popleft() if rest and rest[0].lower() in ("true", "false", "yes", "no") else "true"
-        elif not equals:
-            if not rest or rest[0].startswith("--"):
-                expected = "" if kind is Any else f" ({in_words(kind)})"
-                raise ConfigError(f"Expected a value after {flag}{expected}, got none.")
-            value = rest.popleft()
-        is_yaml = (
-            kind is Any or dataclass_in(kind) or (_takes_mapping(kind) and value.lstrip().startswith("{"))
-        )
-        flags.append((path, load_yaml(value) if is_yaml else value))
+        kind = command.flags.get(".".join(path), Any)
+        has_value = bool(rest) and not rest[0].startswith("--")
+        if kind is bool:
+            has_value = has_value and rest[0].lower() in ("true", "false", "yes", "no")
+        if not equals and not has_value and kind is not bool:
+            raise ConfigError(f"Expected a value after {flag} ({in_words(kind)}), got none.")
+        if not equals:
+            value = rest.popleft() if has_value else "true"
+        flags.append((path, value))
     return flags, places
 
 
-def _path_of(program: str, command: Command, name: str, file: str = "") -> list[str]:
-    """The option that a flag or a key of a file stands for, and keys within its value, which stay as they are.
+def _path_of(program: str, command: Command, flag: str) -> list[str]:
+    """The option that a flag stands for, and keys within its value.
 
     Raises:
         ConfigError: there is no such option.
     """
-    parts = name.removeprefix("--").split(".")
-    for count in range(len(parts), 0, -1):
-        head = ".".join(parts[:count]).replace("-", "_")
-        is_whole = count == len(parts) and (file or head not in command.positionals)
-        if head in command.kinds and (is_whole or _takes_mapping(command.kinds[head])):
-            return [*head.split("."), *parts[count:]]
-    near = hint(name.lstrip("-").replace("-", "_"), command.kinds, "" if file else "--")
-    where = f"{name!r} in {file}" if file else name
-    raise ConfigError(f"Expected settings of `{program}`, got {where}.{near} See `{program} --help`.")
+    name, *keys = flag.removeprefix("--").split(".")
+    name, whole = name.replace("-", "_"), flag.removeprefix("--").replace("-", "_")
+    if whole in command.flags:
+        return whole.split(".")
+    if keys and _takes_mapping(command.flags.get(name)):
+        return [name, *keys]  # which stay as they are
+    near = hint(whole, command.flags, "--")
+    raise ConfigError(f"Expected flags that `{program}` has, got {flag}.{near} See `{program} --help`.")
 
 
-def _merged(command: Command, given: Mapping[str, Any], path: Sequence[str], value: Any) -> Any:
-    """The value of an option when one more value, of it or of a key in it, is given."""
-    name, *keys = path
-    kind = command.kinds[name]
-    is_group = dataclass_in(kind) is not None
-    now = given.get(name, None if is_group or name not in command.options else command.options[name].default)
+def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> Any:
+    """The value of an option when the text of a flag is added to it: of the whole, or of a key in it."""
+    is_group, value = dataclass_in(kind) is not None, text
+    if (keys and not is_group) or (text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))):
+        value = load_yaml(text)
+    if is_group and not isinstance(now, dict):
+        now = {}  # what is not given stays as it is
     if not keys:
-        return now | value if is_group and isinstance(now, dict) and isinstance(value, dict) else value
+        return now | value if is_group and isinstance(value, dict) else value
     if isinstance(now, str) and str in members_of(kind):
         now = {"part" if name in KINDS else "preset": now}
     return changed(now, keys, value)
@@ -286,32 +281,20 @@ def _read_config(command: Command, value: str) -> dict[str, Any]:
     content = read_yaml(path)
     if not isinstance(content, dict | None):
         raise ConfigError(f"Expected {path} to hold settings as `name: value`, got {type(content).__name__}.")
-    return {str(key): item for key, item in (content or {}).items()}
-
-
-def _print_config(command: Command, arguments: Mapping[str, Any], how: str) -> None:
-    """Prints settings as YAML, as far as they are known; with `skip_default` those that are given alone."""
-    import yaml
-
-    settings = {
-        name: plain(arguments.get(name, option.default))
-        for name, option in command.options.items()
-        if name in arguments or (option.default is not NO_DEFAULT and how != "skip_default")
-    }
-    print(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True), end="")
+    settings: dict[str, Any] = {}
+    for key, item in (content or {}).items():
+        settings = changed(settings, str(key).split("."), item)
+    return settings
 
 
 def _print_help(program: str, description: str, commands: Mapping[str, Command]) -> None:
-    from jsonargparse import ArgumentParser
-
-    parser = ArgumentParser(prog=program, description=description)
-    subcommands = parser.add_subcommands(metavar="COMMAND")
+    print(f"usage: {program} COMMAND …\n\n{description}\n\ncommands, each with a --help of its own:")
+    width = max(map(len, commands))
     for name, command in commands.items():
-        subcommands.add_subcommand(name, ArgumentParser(), help=_summary(command.function))
-    parser.print_help()
+        print(f"  {name:{width}}  {_summary(command.function)}")
 
 
-def _print_help_of(program: str, command: Command) -> None:
+def _print_help_of(program: str, command: Command) -> int:
     from docstring_parser import parse
     from jsonargparse import ArgumentParser
 
@@ -321,7 +304,7 @@ def _print_help_of(program: str, command: Command) -> None:
     parser.add_argument("--config", action="config", help=about)
     documented = {p.arg_name: p.description for p in parse(inspect.getdoc(command.function) or "").params}
     for name in command.positionals:
-        many = {"nargs": "*"} if command.options[name].kind == list[str] else {}
+        many: dict[str, Any] = {"nargs": "*"} if command.options[name].kind == list[str] else {}
         parser.add_argument(name, type=str, help=documented.get(name), **many)
     skip: set[str | int] = set(command.positionals)
     if command.settings:
@@ -329,17 +312,11 @@ def _print_help_of(program: str, command: Command) -> None:
         skip.add(next(iter(inspect.signature(command.function).parameters)))
     parser.add_function_arguments(command.function, as_group=False, skip=skip)
     parser.print_help()
-
-
-def _with_fields(options: Mapping[str, Option], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, option in options.items():
-        yield prefix + name, option.kind
-        if config := dataclass_in(option.kind):
-            yield from _with_fields(list_options(config), f"{prefix}{name}.")
+    return 0
 
 
 def _takes_mapping(kind: Any) -> bool:
-    return any(member in (Any, dict) or get_origin(member) is dict for member in members_of(kind))
+    return any(get_origin(member) is dict for member in members_of(kind))
 
 
 def _refuse(program: str, message: str) -> int:
@@ -356,7 +333,7 @@ def _unusable(error: OSError, command: Command | None) -> str:
     if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"could not use {path}: {reason}"
     existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
-    remedy = "Choose another place with --out, or change" if command and "out" in command.kinds else "Change"
+    remedy = "Choose another place with --out, or change" if command and "out" in command.flags else "Change"
     return f"could not use {path.absolute()}: {reason}. {remedy} the permissions of {existing}."
 
 

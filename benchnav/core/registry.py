@@ -37,6 +37,7 @@ from benchnav.core.settings import (
     Option,
     call,
     config_class,
+    gone_options,
     hint,
     list_options,
     load_yaml,
@@ -304,7 +305,8 @@ def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
 
 
 def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
-    return read_options(target, part.options, of(f"{kind} {part.part!r}"), skipped=_skipped(kind, target))
+    gone = gone_options(target, _skipped(kind, target))
+    return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"), gone=gone)
 
 
 def _skipped(kind: str, target: Any) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replac
 from enum import Enum
 from functools import cache, partial
 from pathlib import Path, PurePath
-from types import NoneType, SimpleNamespace, UnionType
+from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from benchnav.core.errors import BenchnavError, ConfigError
@@ -66,7 +66,7 @@ def list_options(target: Callable[..., Any], skipped: Iterable[str] = ()) -> dic
     """
     target = config_class(target, skipped) or target
     types = _types(target)
-    made = {f.name: f.default_factory for f in fields(target)} if is_dataclass(target) else {}
+    made: dict[str, Any] = {f.name: f.default_factory for f in fields(target)} if is_dataclass(target) else {}
     return {
         name: Option(
             kind=types.get(name, Any),
@@ -82,6 +82,11 @@ def config_class(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Any
     if [name for name in parameters(target) if name not in set(skipped)] != ["config"]:
         return None
     return dataclass_in(_types(target).get("config"))
+
+
+def gone_options(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Mapping[str, str]:
+    """Options that were once there and what does their work now: `gone` of a class or of its `config`."""
+    return getattr(config_class(target, skipped) or target, "gone", {})
 
 
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
@@ -146,7 +151,7 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
     if config and isinstance(value, Mapping):
         base = now if isinstance(now, config) else None
-        given = read_options(config, value, name, key, base=base)
+        given = read_options(list_options(config), value, name, key, base, gone_options(config))
         return call(name(key), partial(replace, base) if base else config, given)
     if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):
         if not all(isinstance(inner, str) for inner in value):
@@ -166,32 +171,31 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
 
 
 def read_options(
-    target: Callable[..., Any],
+    known: Mapping[str, Option],
     given: Mapping[str, Any],
     name: Naming,
     key: str = "",
-    skipped: Iterable[str] = (),
     base: Any = None,
+    gone: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Gives options of their types, by name.
 
     Args:
-        target: whose options they are: a class or a function.
+        known: what there is.
         given: plain data by option.
         name: what users call a key.
         key: where they stand, with dots; empty for the whole.
-        skipped: names of parameters that are no options.
-        base: a value of the target that has all that is not given.
+        base: a value whose attributes are what is not given.
+        gone: options that were once there, with what does their work now.
 
     Raises:
         ConfigError: as of `read`.
     """
-    known, inner = list_options(target, skipped), f"{key}." if key else ""
+    inner = f"{key}." if key else ""
     for option in map(str, given):
         if option not in known:
-            gone = getattr(config_class(target, skipped) or target, "gone", {})
-            remedy = f" {gone[option]}" if option in gone else hint(option, known)
             among = f"among {', '.join(known)}" if known else "none: it has none"
+            remedy = f" {gone[option]}" if option in gone else hint(option, known)
             raise ConfigError(f"Expected keys of {name(key)} {among}, got {option!r}.{remedy}")
     for option, about in known.items():
         if about.default is NO_DEFAULT and option not in given and base is None:
