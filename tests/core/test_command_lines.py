@@ -16,6 +16,8 @@ import benchnav.datagen.cli
 import benchnav.eval.cli
 import benchnav.models.cli
 from benchnav.core import command
+from benchnav.core.errors import ConfigError
+from benchnav.datagen.recipe.recipe import Recipe, load_recipe
 
 CLIS = {"datagen": benchnav.datagen.cli, "train": benchnav.models.cli, "eval": benchnav.eval.cli}
 
@@ -262,6 +264,62 @@ def test_a_bad_line_ends_in_one_line(
     assert (out, err) == ("", f"benchnav-{line.split()[0]}: error: {message}\n")
 
 
+OVERRIDES: list[tuple[str, Callable[[Recipe], Any], Any]] = [
+    ("seed=3", lambda recipe: recipe.seed, 3),
+    ("splits.train.maps=50", lambda recipe: recipe.splits["train"].maps, 50),
+    ("splits.new={scenario: std, maps: 1}", lambda recipe: recipe.splits["new"].maps, 1),
+    ("classes.dune_sand.soft.weight=0.2", lambda recipe: recipe.classes[9].soft.weight, 0.2),
+    ("classes.dune_sand.soft=null", lambda recipe: recipe.classes[9].soft, None),
+    ("classes.gravel.noise=3e-1", lambda recipe: recipe.classes[4].noise, 0.3),
+    ("scenarios.hs.severity=0", lambda recipe: recipe.scenarios["hs"].light_height, (0.8, 1.0)),
+    ("scenarios.low={preset: hs, ambient: 0.5}", lambda recipe: recipe.scenarios["low"].ambient, 0.5),
+    ("places.margin_m=4", lambda recipe: recipe.places.margin_m, 4.0),
+]
+
+
+@pytest.mark.parametrize(("text", "value", "expected"), OVERRIDES, ids=[row[0] for row in OVERRIDES])
+def test_an_override_reaches_the_recipe(
+    text: str, value: Callable[[Recipe], Any], expected: Any, received: list[dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    assert ended(f"datagen create stakes-v1 id=mine '{text}'", monkeypatch) == 0
+    assert value(load_recipe(received[0]["recipe"], received[0]["overrides"])) == expected
+
+
+BAD_OVERRIDES = [
+    ("height", "Expected an override such as splits.train.maps=50, got 'height'."),
+    ("a..b=3", "Expected an override such as splits.train.maps=50, got 'a..b=3'."),
+    ("height=[1", "Expected YAML, got '[1': did not find expected ',' or ']'."),
+    ("height=tall", "Recipe stakes-v1: Expected `height` as a whole number, got 'tall'."),
+    ("height.x=3", "Expected a mapping in which 'x' can be set, got 64."),
+    ("seed=null", "Recipe stakes-v1: Expected `seed` as a whole number, got null."),
+    ("start_m=[1]", "Recipe stakes-v1: Expected `start_m` as a list [a number, a number] or null, got [1]."),
+    ("splits=3", "Recipe stakes-v1: Expected `splits` as a mapping, got 3."),
+    ("splits={3: {scenario: std, maps: 1}}", "Recipe stakes-v1: Expected names in `splits`, got [3]. Quote numbers."),
+    ("splits.train=null", "Recipe stakes-v1: Expected `splits.train` as a mapping, got null."),
+    ("splits.train.maps=ten", "Recipe stakes-v1: Expected `splits.train.maps` as a whole number, got 'ten'."),
+    ("splits.train.mpas=5", "Recipe stakes-v1: Expected keys of `splits.train` among scenario, maps, solvable, got 'mpas'. Did you mean 'maps'?"),
+    ("splits.trian.maps=5", "Recipe stakes-v1: Expected `splits.trian.scenario` as text, got none."),
+    ("classes=[1]", "Recipe stakes-v1: Expected `classes.0` as a mapping, got 1."),
+    ("classes.dune_snad.scale=3", "Expected a name among basalt, wet_clay, packed_soil, loose_soil, gravel, scree, sandstone, fine_sand, firm_sand, dune_sand, crusted_soil, drift_sand, got 'dune_snad'. Did you mean 'dune_sand'?"),
+    ("classes.gravel.colour=[1,2]", "Recipe stakes-v1: Expected `classes.gravel.colour` as a list [a whole number, a whole number, a whole number], got [1, 2]."),
+    ("classes.dune_sand.soft.weight=x", "Recipe stakes-v1: Expected `classes.dune_sand.soft.weight` as a number, got 'x'."),
+    ("classes.dune_sand.soft.wieght=1", "Recipe stakes-v1: Expected keys of `classes.dune_sand.soft` among weight, mean, std, got 'wieght'. Did you mean 'weight'?"),
+    ("classes.basalt.soft.weight=0.2", "Recipe stakes-v1: Expected `classes.basalt.soft.mean` as a number, got none."),
+    ("scenarios.hs=3", "Recipe stakes-v1: Expected `scenarios.hs` as a mapping, got 3."),
+    ("scenarios.hs.severity=x", "Expected `severity` of scenario 'hs' to be a finite number, got 'x'."),
+    ("scenarios.hs.ambeint=1", "Recipe stakes-v1: Expected keys of `scenarios.hs` among relief_m, roughness, crater_count, crater_radius_m, crater_depth_ratio, light_height, ambient, got 'ambeint'. Did you mean 'ambient'?"),
+    ("places=3", "Recipe stakes-v1: Expected `places` as a mapping or null, got 3."),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_OVERRIDES, ids=[text for text, _ in BAD_OVERRIDES])
+def test_a_bad_override_ends_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_recipe("stakes-v1", ["id=mine", text])
+    assert str(caught.value) == message
+
+
 SHOWN = [
     ("eval -h", "usage: benchnav-eval"),
     ("eval run -h", "one of demo, full, paper, risk, severity"),
@@ -271,6 +329,7 @@ SHOWN = [
     ("eval run --world stakes --world.correlation_m 2 --print_config", "correlation_m: 2"),
     ("train classifier --config train.yaml --print_config", "encoder: resnet18"),
     ("train mdn --mdn.hidden 8 --print_config", "hidden: 8"),
+    ("eval run --maps 3 --print-config=skip_default", "maps: 3"),
 ]
 
 
