@@ -261,7 +261,7 @@ def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> A
     if is_group and not isinstance(now, dict):
         now = {}  # what is not given stays as it is
     if not keys:
-        return now | value if is_group and isinstance(value, dict) else value
+        return value
     if isinstance(now, str) and str in members_of(kind):
         now = {"part" if name in KINDS else "preset": now}
     return changed(now, keys, value)

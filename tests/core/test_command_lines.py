@@ -329,8 +329,19 @@ SHOWN = [
     ("eval run --world stakes --world.correlation_m 2 --print_config", "correlation_m: 2"),
     ("train classifier --config train.yaml --print_config", "encoder: resnet18"),
     ("train mdn --mdn.hidden 8 --print_config", "hidden: 8"),
-    ("eval run --maps 3 --print-config=skip_default", "maps: 3"),
+    ("eval run --maps 3 --print-config", "maps: 3"),
 ]
+
+
+def test_settings_may_be_printed_without_those_that_are_as_they_were(
+    received: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ended("eval run --maps 3 --print_config=skip_default", monkeypatch) == 0
+    assert capsys.readouterr().out == "maps: 3\n"
+    assert ended("eval run --config s.yaml --world.noise stored --print_config", monkeypatch) == 0
+    Path("printed.yaml").write_text(capsys.readouterr().out)
+    assert ended("eval run --config printed.yaml", monkeypatch) == 0
+    assert received == [{"suite": {"world": {"preset": "stakes", "noise": "stored"}, "maps": 3}}]
 
 
 @pytest.mark.parametrize(("line", "expected"), SHOWN, ids=[line for line, _ in SHOWN])

@@ -11,7 +11,18 @@ from typing import Any, Literal
 import pytest
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.settings import changed, hint, in_words, load_yaml, of, plain, read, read_yaml
+from benchnav.core.settings import (
+    changed,
+    hint,
+    in_words,
+    list_options,
+    load_yaml,
+    of,
+    plain,
+    read,
+    read_options,
+    read_yaml,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +109,15 @@ def test_a_message_names_the_key_what_was_expected_and_what_came(
     with pytest.raises(ConfigError) as caught:
         rover(FULL | change)
     assert str(caught.value) == message
+
+
+def test_a_default_of_none_may_be_given_whatever_the_type_says() -> None:
+    def part(limit: float = None, count: int = 1) -> None:  # type: ignore[assignment]
+        pass
+
+    assert read_options(list_options(part), {"limit": None}, of("part")) == {"limit": None}
+    with pytest.raises(ConfigError, match="Expected `count` of part as a whole number, got null"):
+        read_options(list_options(part), {"count": None}, of("part"))
 
 
 def test_a_value_is_set_in_a_copy_of_plain_data() -> None:
