@@ -112,7 +112,7 @@ def test_a_message_names_the_key_what_was_expected_and_what_came(
 
 
 def test_a_default_of_none_may_be_given_whatever_the_type_says() -> None:
-    def part(limit: float = None, count: int = 1) -> None:  # type: ignore[assignment]
+    def part(limit: float = None, count: int = 1) -> None:  # type: ignore[assignment]  # noqa: RUF013 - as users write it
         pass
 
     assert read_options(list_options(part), {"limit": None}, of("part")) == {"limit": None}
