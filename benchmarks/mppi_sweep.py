@@ -23,7 +23,7 @@ from benchnav.core.terrain import Observation
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.run.episode import build, simulate
+from benchnav.eval.run.unit import Settings, build, simulate
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.planner import Planner, Step
 from benchnav.planning.problem import Rules, Task, pose_problem
@@ -65,7 +65,7 @@ def on_maps(options: dict[str, object], objective: str, scenario: str, seed: int
     times = []
     for condition in conditions_of(suite, lambda data: [scenario]):
         unit = Unit(condition=condition, seed=seed, realisation=0, maps=tuple(range(maps)))
-        problem, simulation = build(unit, "sweep")
+        problem, simulation = build(unit, Settings().origins().of(unit))
         episodes, _ = simulate(unit, problem, simulation)
         arrived = episodes.outcome == int(Outcome.SUCCESS)
         times.append(torch.where(arrived, episodes.steps * problem.dt_s, BUDGET_S).mean())

@@ -21,10 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchnav.eval.experiment.condition import conditions_of
-from benchnav.eval.experiment.keep import Keep
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, units
-from benchnav.eval.run import runner
+from benchnav.eval.run import unit as units_of_run
 
 SCENARIOS, PLANNERS, SEEDS, MAPS = ("std", "hg", "hs"), ("straight", "astar_dwa"), 6, 200
 
@@ -37,7 +36,7 @@ def main() -> None:
         condition.id: (condition, extent) for condition in conditions_of(suite, lambda data: list(SCENARIOS))
     }
     driving: list[float] = []
-    simulate = runner.simulate
+    settings, simulate = units_of_run.Settings(), units_of_run.simulate
 
     def timed(*given: Any, **options: Any) -> Any:
         start = time.perf_counter()
@@ -45,13 +44,13 @@ def main() -> None:
         driving.append(time.perf_counter() - start)
         return answer
 
-    runner.simulate = timed
+    units_of_run.simulate = timed
     whole: dict[str, list[float]] = {}
     overhead: dict[str, list[float]] = {}
     with TemporaryDirectory() as folder:
-        for unit in units(conditions, Keep(record="none")):
+        for unit in units(conditions):
             start = time.perf_counter()
-            runner.run_unit(unit, Path(folder), "benchmark")
+            units_of_run.run_unit(unit, Path(folder), settings.origins().of(unit), settings)
             took, label = time.perf_counter() - start, unit.condition.labels["planner"]
             whole.setdefault(label, []).append(took)
             overhead.setdefault(label, []).append(took - driving[-1])

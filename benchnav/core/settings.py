@@ -24,8 +24,13 @@ NO_DEFAULT = inspect.Parameter.empty
 
 # Names of earlier versions, with those of today.
 RENAMED = {
-    **{"instances": "maps", "instance": "map", "trials": "conditions", "slowest": "min_traversability"},
-    **{"recorded": "record", "split": "splits"},
+    "instance": "map",
+    "instances": "maps",
+    "recorded": "record",
+    "slowest": "min_traversability",
+    "split": "splits",
+    "steps": "record",
+    "trials": "conditions",
 }
 
 Naming = Callable[[str], str]  # what users call a key; of an empty one, the whole

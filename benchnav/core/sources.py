@@ -19,6 +19,7 @@ from typing import Any
 
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.settings import hint, one_line
+from benchnav.core.shipped import PACKAGE
 
 
 def attribute(module: ModuleType, place: str, name: str) -> Any:
@@ -150,6 +151,42 @@ def digest_of_modules(names: Iterable[str]) -> str:
             within = getattr(module, "__package__", "") or ""
             found |= imported_sources(file.parent, [(within, file.read_bytes())])
     return _digest_of_sources(found)
+
+
+def package_modules(names: Iterable[str]) -> dict[str, str]:
+    """Digests of modules of this package, and of all of it that they import, wherever in the code an import stands.
+
+    A digest is of the syntax tree without docstrings: comments, layout and documentation do not change it. What a
+    process has once read stays, as what it has imported does. Packages' own faces are left out: they hand names on.
+
+    Args:
+        names: of the modules to begin with.
+
+    Returns:
+        12 hexadecimal digits by name, in alphabetical order.
+    """
+    found: dict[str, str] = {}
+    todo = list(names)
+    while todo:
+        name = todo.pop()
+        path = PACKAGE.parent.joinpath(*name.split(".")).with_suffix(".py")
+        if name.partition(".")[0] == PACKAGE.name and name not in found and path.is_file():
+            found[name], imported = _module(path)
+            todo += imported
+    return dict(sorted(found.items()))
+
+
+@cache
+def _module(path: Path) -> tuple[str, tuple[str, ...]]:
+    """The digest of a module, and what it imports."""
+    content = path.read_bytes()
+    tree = ast.parse(content)
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12], _imports(content, "")
 
 
 def _digest_of_sources(found: Mapping[str, bytes]) -> str:

@@ -1,11 +1,56 @@
-"""Worker processes that end with the command that they work for."""
+"""Calls made elsewhere: in processes of this machine, or on a Dask cluster.
 
+`distributed` is an extra of this package, imported when a cluster is asked for.
+"""
+
+import logging
 import os
+import signal
 import threading
 import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
 from functools import cache
+from itertools import islice
+from typing import Any, TypeVar
+from urllib.parse import urlparse
+
+from joblib.externals.loky import get_reusable_executor
+
+from benchnav.core.errors import BenchnavError, ConfigError
 
 _LOOK_S = 0.5
+_REACH_S = 5
+_WORKERS_S = 10
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+Result = TypeVar("Result")
+
+
+def run_calls(calls: Sequence[Callable[[], Result]], jobs: int = 1, scheduler: str = "") -> Iterator[Result]:
+    """Makes calls and yields what they return, each as it is done, in any order; the first error ends it.
+
+    Worker processes outlive the calls for some minutes, so that the next ones find them ready. So what they need to
+    know of this process, such as its folder, belongs into the calls.
+
+    Args:
+        calls: what is done, such as `functools.partial` of a function; sent to other processes with cloudpickle.
+        jobs: processes of this machine; 1 makes the calls in this one, one after the other.
+        scheduler: address of a Dask cluster's scheduler, whose workers take their place; empty for none.
+
+    Raises:
+        ConfigError: the cluster cannot be reached, or has no worker.
+        BenchnavError: a worker was killed, or the cluster was lost.
+    """
+    if scheduler:
+        yield from _run_on_cluster(calls, scheduler)
+    elif jobs == 1 or not calls:
+        yield from (call() for call in calls)
+    else:
+        yield from _run_in_processes(calls, min(jobs, len(calls)))
 
 
 @cache
@@ -23,3 +68,114 @@ def end_with(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Iterator[Result]:
+    # Processes that share the processors should not each take all of them.
+    threads = {name: os.environ.get(name, "1") for name in _THREADS}
+    executor = get_reusable_executor(
+        jobs, timeout=300, initializer=_start_worker, initargs=(os.getpid(),), env=threads
+    )
+    # A worker whose memory has grown is replaced; that is no concern of a user's.
+    warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
+    waiting, pending = iter(calls), set[Future[Result]]()
+    try:
+        # A few at a time, so that few are to be undone at an interruption.
+        while pending := pending | {
+            executor.submit(call) for call in islice(waiting, 2 * jobs - len(pending))
+        }:
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+    except BrokenProcessPool as error:
+        raise BenchnavError(
+            "A worker was killed, perhaps for want of memory. What was finished is kept: give the same command again, "
+            "if need be with fewer `jobs`."
+        ) from error
+    finally:
+        if pending:  # nobody waits for them
+            executor.shutdown(kill_workers=True)
+
+
+def _start_worker(parent: int) -> None:
+    # An interrupt is for the parent to act on; and a parent that is killed takes its workers along.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with(parent)
+
+
+def _run_on_cluster(calls: Sequence[Callable[[], Result]], scheduler: str) -> Iterator[Result]:
+    with connected(scheduler) as client:
+        from distributed import CancelledError, KilledWorker, as_completed
+
+        try:
+            # All at once, so that workers that join later have their share.
+            for future in as_completed((client.submit(call, pure=False) for call in calls), client.loop):
+                yield future.result()
+        except CancelledError as error:
+            raise BenchnavError(
+                f"The scheduler at {scheduler} was lost. What was finished is kept: give the same command again."
+            ) from error
+        except KilledWorker as error:
+            raise BenchnavError(
+                f"Some work was given up, since several workers died over it, the last at {error.last_worker.address}: "
+                "see their logs, perhaps for want of memory. What was finished is kept."
+            ) from error
+
+
+@contextmanager
+def connected(scheduler: str) -> Iterator[Any]:
+    """A client of a cluster that has workers.
+
+    Args:
+        scheduler: address, such as tcp://127.0.0.1:8786.
+
+    Raises:
+        ConfigError: the scheduler cannot be reached, or has no worker.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigError(
+            f"Expected Dask for a cluster, got: {error}. Install it: pip install 'benchnav[dask]'"
+        ) from error
+    _check_address(scheduler)
+    with ExitStack() as stack:
+        stack.enter_context(_quiet())
+        try:
+            client = stack.enter_context(Client(scheduler, timeout=_REACH_S, set_as_default=False))
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f"Expected `scheduler` to be the address of a running Dask scheduler, got {scheduler}, which gave "
+                f"no answer within {_REACH_S} s. Start one with `dask scheduler`."
+            ) from error
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError as error:
+            raise ConfigError(
+                f"Expected a cluster with workers, got {scheduler} with none for {_WORKERS_S} s. Start some with "
+                f"`dask worker {scheduler} --nworkers N --nthreads 1`."
+            ) from error
+        yield client
+
+
+def _check_address(scheduler: str) -> None:
+    place = urlparse(scheduler)
+    try:
+        known = place.scheme in ("tcp", "tls") and place.hostname and place.port
+    except ValueError:  # a port that is no number
+        known = False
+    if not known:
+        raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps the library's own log off the terminal; what a user has to know is raised."""
+    levels = {name: logging.getLogger(name).level for name in ("distributed", "distributed.client")}
+    for name in levels:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)

@@ -13,7 +13,6 @@ from benchnav.eval.replay import other_folder, program, replay
 
 if TYPE_CHECKING:
     from benchnav.eval.report.write import Report
-    from benchnav.eval.run.runner import Workers
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -28,6 +27,7 @@ def run_command(
     backend: Literal["local", "dask"] = "local",
     scheduler: str = "",
     device: Device = "auto",
+    reuse_code: bool = False,
 ) -> int:
     """Run a suite into a folder, going on with or extending the run that is there.
 
@@ -38,31 +38,32 @@ def run_command(
         overwrite: Drop a run that is there.
         planner_limit_s: Seconds that a planner may take for one answer; planners then run in processes of
             their own. 0 sets no limit.
-        shard: I/N runs the I-th of N shares of the run alone; `merge` makes one run of them.
+        shard: I/N runs the I-th of N shards of the run alone; `merge` makes one run of them.
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
+        reuse_code: Take finished units that other code has made, and mark their rows; they are not used otherwise.
     """
     from benchnav.core.command import show_progress
     from benchnav.core.errors import ConfigError
     from benchnav.core.store import read_shard
     from benchnav.eval.run.runner import run_suite
 
-    workers = _workers(jobs, backend, scheduler)
-    share = read_shard(shard)
+    _check_workers(jobs, backend, scheduler)
+    own = read_shard(shard)
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = _own_folder(out)
     for planner, options in suite.planner_options.items():
         _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     steps = run_suite(
-        suite, folder, workers.jobs, overwrite, planner_limit_s, _say, share, workers.scheduler, device
+        suite, folder, jobs, overwrite, planner_limit_s, _say, own, scheduler, device, reuse_code
     )
     show_progress(steps, "units")
-    if share is None:
+    if own is None:
         return _finish(folder)
-    print(f"shard {share} is finished in {folder}")
-    print(f"merge:   {program('benchnav-eval')} merge OUT PART …, when all {share.of} are")
+    print(f"shard {own} is finished in {folder}")
+    print(f"merge:   {program('benchnav-eval')} merge OUT PART …, when all {own.of} are")
     return _failed_shard(folder)
 
 
@@ -103,10 +104,10 @@ def rerun(
     from benchnav.eval.run.rerun import compare
     from benchnav.eval.run.rerun import rerun as rerun_all
 
-    workers = _workers(jobs, backend, scheduler)
+    _check_workers(jobs, backend, scheduler)
     original = _own_folder(folder)
     repeated = _own_folder(out or f"{original.resolve()}-rerun")
-    show_progress(rerun_all(original, repeated, workers, overwrite, _say), "units")
+    show_progress(rerun_all(original, repeated, jobs, scheduler, overwrite, _say), "units")
     comparison = compare(original, repeated)
     print("\n".join(comparison.lines))
     return 0 if comparison.same else 1
@@ -198,9 +199,8 @@ def _own_folder(path: str) -> Path:
     return Path(path)
 
 
-def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
+def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
     from benchnav.core.errors import ConfigError
-    from benchnav.eval.run.runner import Workers
 
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
@@ -210,14 +210,15 @@ def _workers(jobs: int, backend: str, scheduler: str) -> "Workers":
         raise ConfigError(
             f"Expected no `jobs` with `backend` dask, whose cluster has its own workers, got {jobs}."
         )
-    return Workers(jobs=jobs, scheduler=scheduler)
 
 
 def _finish(folder: Path) -> int:
     """Reports on a finished run; gives the exit status."""
     from benchnav.eval.failed_ground import ground_of_run
+    from benchnav.eval.report.playback.files import write_viewer_files
     from benchnav.eval.report.write import write_report
 
+    write_viewer_files(folder)
     _print(write_report(folder, ground_of_run(folder)), folder)
     _print_recorded(folder)
     _print_replay(folder)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -16,7 +17,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import write_text
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
-from benchnav.eval.folder.provenance import code_differences, code_of
+from benchnav.eval.folder.provenance import code_differences
 from benchnav.eval.folder.sameness import differences
 from benchnav.eval.report.comparison import comparison_table
 from benchnav.eval.report.rendering import to_latex, to_markdown, to_terminal
@@ -143,10 +144,18 @@ def read_conditions(runs: Sequence[Run]) -> list[Compared]:
                     value=value,
                     maps=run.about["datasets"][labels["data"]]["maps"][value["split"]],
                     episodes=rows.assign(time_budget_s=time_budgets(rows, value["world"])),
-                    code={name: code_of(run.about, run.conditions[condition][0])},
+                    code=_codes(run.about, name, rows["code"].unique()),
                 )
             )
     return found
+
+
+def _codes(about: Mapping[str, Any], run: str, digests: Iterable[str]) -> dict[str, Any]:
+    """The code of some rows of a run, by the run's name, and by digests too where it holds rows of other code."""
+    if about["reused"]:
+        return {f"{run} (code {digest})": about["codes"][digest] for digest in digests}
+    (digest,) = digests
+    return {run: about["codes"][digest]}
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
@@ -176,7 +185,7 @@ def _unlike_code(
 ) -> dict[tuple[str, str], list[str]]:
     """What of the code that made conditions differs, by the two runs; of parts and our own sources alone, or of all."""
     held = [
-        (run, {name: value for name, value in code.items() if isinstance(value, Mapping) or not parts_alone})
+        (run, {**code, "environment": {}} if parts_alone else code)
         for condition in conditions
         for run, code in condition.code.items()
     ]

@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from benchnav.core.errors import BenchnavError
-from benchnav.core.sources import digest_of
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit
@@ -16,7 +14,7 @@ from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import Run, open_run
 from benchnav.eval.report.charts.failure_sheet import FailedGround
 from benchnav.eval.report.failure_choice import GroundOf
-from benchnav.eval.run.episode import build, one_thread
+from benchnav.eval.run.unit import Settings, build, one_thread
 
 
 def ground_of_run(folder: Path) -> GroundOf:
@@ -51,11 +49,12 @@ def ground_of_run(folder: Path) -> GroundOf:
 def _ground(run: Run, rows: pd.DataFrame) -> FailedGround:
     """The ground under one seed and realisation."""
     condition_id = rows["condition"].iloc[0]
-    condition, extent = run.conditions[condition_id]
+    condition, _ = run.conditions[condition_id]
     maps = tuple(int(i) for i in rows["map"])
     _check_maps(run, condition, maps)
-    for part, about in provenance.describe_parts({condition_id: (condition, extent)}).items():
-        if _identity(run.about["parts"].get(part)) != _identity(about):
+    made = run.about["codes"][rows["code"].iloc[0]]
+    for part, digest in provenance.describe_parts(condition)["parts"].items():
+        if made["parts"].get(part) != digest:
             raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
     unit = Unit(
         condition=condition,
@@ -64,7 +63,7 @@ def _ground(run: Run, rows: pd.DataFrame) -> FailedGround:
         maps=maps,
     )
     with one_thread():
-        problem, simulation = build(unit, run.about["run_id"])
+        problem, simulation = build(unit, Settings().origins().of(unit))
     return FailedGround(
         predicted=problem.risk_map.cpu().numpy(),
         immobilising=simulation.immobilising.cpu().numpy(),
@@ -83,11 +82,6 @@ def _check_maps(run: Run, condition: Condition, maps: Sequence[int]) -> None:
             f"on, got {count}. Make them with `benchnav-datagen create`."
         )
     digests = run.about["datasets"][condition.data]["maps"][condition.split]
-    now = [digest_of([entry.tobytes()])[:16] for entry in dataset.entry_digests(condition.split, maps)]
-    if now != [digests[i] for i in maps]:
+    now = provenance.map_digests(dataset, condition.split, max(maps) + 1)
+    if any(now[i] != digests[i] for i in maps):
         raise BenchnavError(f"Expected {condition.data} with the maps that {run.folder} was on, got others.")
-
-
-def _identity(about: Any) -> Any:
-    """What is known of a part, without the version of ours that it came with."""
-    return {k: v for k, v in about.items() if k != "origin"} if isinstance(about, dict) else about

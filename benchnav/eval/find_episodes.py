@@ -7,7 +7,6 @@ from pathlib import Path
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
 from benchnav.eval.experiment.condition import NOT_USED, Condition
-from benchnav.eval.experiment.keep import Keep
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.folder.folder import open_run
 
@@ -70,7 +69,7 @@ def _find(
             if any(labels[n] != v and not (unused_fits and labels[n] == NOT_USED) for n, v in asked.items()):
                 continue
             wanted = entry[1].seeds[0] if seed is None else seed
-            for unit in units({condition_id: entry}, Keep()):
+            for unit in units({condition_id: entry}):
                 if (unit.seed, unit.realisation) == (wanted, realisation) and map_index in unit.maps:
                     return unit
     return None

@@ -130,32 +130,22 @@ def other_folder(run: str, out: str) -> Path:
 
 
 def _recordings(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> "list[Recording]":
-    from benchnav.eval.run.recorder import find_recording
+    from benchnav.eval.run.again import find_recording
 
     return [find_recording(folder, unit, member, out) for unit, member in found]
 
 
 def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Path:
     """The viewer's file of the episodes, which is made in a folder where it is not there."""
-    from benchnav.eval.report.playback.files import playback_path
     from benchnav.eval.report.playback.rerun_file import write_rerun
 
     unit, member = found[0]
-    stem = unit.stem(member)
+    path = out / unit.recording_path(member, ".rrd")
     if len(found) > 1:
-        conditions = hashlib.sha256("".join(other.condition.id for other, _ in found).encode()).hexdigest()[
-            :8
-        ]
-        words = (
-            "together",
-            unit.condition.scenario,
-            conditions,
-            unit.seed,
-            unit.realisation,
-            f"{unit.maps[member]:05d}",
-        )
-        stem = "+".join(map(str, words))
-    path = playback_path(out, stem)
+        conditions = "".join(other.condition.id for other, _ in found)
+        digest = hashlib.sha256(conditions.encode()).hexdigest()[:8]
+        words = (unit.condition.scenario, digest, unit.seed, unit.realisation, f"{unit.maps[member]:05d}")
+        path = path.with_name(f"together-{'-'.join(map(str, words))}.rrd")
     if len(found) > 1 or not path.exists():
         write_rerun(_recordings(folder, found, out), path)
     return path

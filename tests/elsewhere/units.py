@@ -17,13 +17,14 @@ from benchnav.core.device import DeviceError, find_device, gpu_failed
 from benchnav.core.errors import ConfigError
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.condition import conditions_of
-from benchnav.eval.experiment.keep import Keep
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder.folder import open_run, write_run
-from benchnav.eval.run import episode, recorder, runner
+from benchnav.eval.run import again
+from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.rollout import run_episodes
-from benchnav.eval.run.runner import run_suite, run_unit
+from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings, run_unit
 from benchnav.models.predictor import Oracle, predict
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem
@@ -51,7 +52,12 @@ def unit_of(data: Path | str, **changes: Any) -> Unit:
         "scenarios": ("std",), "time_budget_s": 1.2,
     } | changes  # fmt: skip
     (condition,) = conditions_of(Suite(**given), lambda data: ["std"])
-    return Unit(condition=condition, seed=0, realisation=0, maps=(0, 1), keep=Keep(record="all", steps="all"))
+    return Unit(condition=condition, seed=0, realisation=0, maps=(0, 1), record="all", leads=True)
+
+
+def run_here(unit: Unit, folder: Path, **settings: Any) -> None:
+    asked = Settings(**settings)
+    run_unit(unit, folder, asked.origins().of(unit), asked)
 
 
 def made(folder: Path) -> dict[str, Any]:
@@ -95,13 +101,14 @@ def test_a_unit_is_the_same_on_another_device(
 
     def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any) -> Any:
         used.update(value.device for value in (problem.start, problem.risk_map, simulation.steps))
-        return episode.simulate(unit, problem, simulation, *given)
+        return simulate_here(unit, problem, simulation, *given)
 
-    monkeypatch.setattr(runner, "simulate", simulate)
-    run_unit(unit, tmp_path / "here", "one")
+    simulate_here = units_of_run.simulate
+    monkeypatch.setattr(units_of_run, "simulate", simulate)
+    run_here(unit, tmp_path / "here")
     with elsewhere() as device:
         used.clear()
-        run_unit(unit, tmp_path / "there", "one", 0.0, device)
+        run_here(unit, tmp_path / "there", device=device)
         assert used <= {device}
         assert waits, "nothing was computed there"
     here, there = made(tmp_path / "here"), made(tmp_path / "there")
@@ -128,9 +135,9 @@ def test_nothing_waits_for_a_device_at_every_step(
     counted = []
     for budget_s in (0.8, 2.4):  # neither is enough to arrive
         unit = unit_of(dataset_path, planners=(planner,), robots=(robot,), time_budget_s=budget_s)
-        unit = replace(unit, keep=Keep(record="none"))
+        unit = replace(unit, record="steps")
         with elsewhere() as device:
-            run_unit(unit, tmp_path / f"{budget_s:g}", "one", 0.0, device)
+            run_here(unit, tmp_path / f"{budget_s:g}", device=device)
             counted.append(len(waits))
         (path,) = tmp_path.glob(f"{budget_s:g}/units/**/*.parquet")
         assert pd.read_parquet(path)["end_time_s"].to_list() == pytest.approx([budget_s] * 2)
@@ -176,7 +183,7 @@ def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
     changes: dict[str, Any], limit_s: float, said: str, dataset_path: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(DeviceError, match=said):
-        run_unit(unit_of(dataset_path, **changes), tmp_path, "one", limit_s)
+        run_here(unit_of(dataset_path, **changes), tmp_path, planner_limit_s=limit_s)
     assert not list(tmp_path.rglob("*.parquet"))
 
 
@@ -191,19 +198,19 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=("straight",), risks=("mean",), scenarios=("std",),
-        maps=1, time_budget_s=2.0, record="none",
+        maps=1, time_budget_s=2.0, record="steps",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     about = json.loads((tmp_path / "run" / "run.json").read_text())
     write_run(tmp_path / "run", {**about, "device": "cuda"})
-    (unit,) = units(open_run(tmp_path / "run").conditions, Keep())
+    (unit,) = units(open_run(tmp_path / "run").conditions)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU, on which this run was computed"):
-        recorder.find_recording(tmp_path / "run", unit, 0)
+        again.find_recording(tmp_path / "run", unit, 0)
     with elsewhere() as device:
-        monkeypatch.setattr(recorder, "device_of_run", lambda about: device)
-        assert recorder.find_recording(tmp_path / "run", unit, 0).about["map"] == "0"
+        monkeypatch.setattr(again, "device_of_run", lambda about: device)
+        assert again.find_recording(tmp_path / "run", unit, 0).about["map"] == "0"
         assert waits
 
 

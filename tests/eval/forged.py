@@ -9,8 +9,20 @@ from typing import Any
 import pandas as pd
 
 from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, open_run, write_run
+from benchnav.eval.folder.provenance import Origin
 
-CODE = {"sources": "s", "versions": {"torch": "2.1"}, "processor": "AVX2", "compiles": True}
+CODE: dict[str, dict[str, Any]] = {
+    "modules": {"benchnav.eval.run.unit": "s"},
+    "environment": {
+        "torch": "2.1", "processor": "AVX2", "compiles": True, "device": "cpu", "planner_limit_s": 0.0,
+    },
+    "parts": {},
+}  # fmt: skip
+
+
+def code_with(**changes: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """`CODE` with other entries in its groups."""
+    return {group: {**known, **changes.get(group, {})} for group, known in CODE.items()}
 
 
 def forge_rows(folder: Path, rows: pd.DataFrame) -> None:
@@ -21,16 +33,22 @@ def forge_rows(folder: Path, rows: pd.DataFrame) -> None:
 def forge_run(
     folder: Path, rows: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]], **changes: Any
 ) -> Path:
-    """Makes a finished run of a table; `conditions` are as `run.json` has them, and `changes` other keys."""
+    """Makes a finished run of a table by one code.
+
+    `conditions` are as `run.json` has them, and `changes` other keys, or `code`, which made the rows.
+    """
+    code = changes.pop("code", CODE)
+    digest = Origin(code=code, maps=()).code_digest
     notes: dict[str, Any] = {"follows": "", "remarks": [], "changed": []}
     about: dict[str, Any] = {
-        "format": "benchnav-run", "format_version": FORMAT_VERSION, "run_id": "r", "suite": {}, "commands": [],
-        "conditions": {name: notes | dict(entry) for name, entry in conditions.items()}, "datasets": {}, "code": CODE,
-        "planner_limit_s": 0.0, "device": "cpu", "gpu": None, "parts": {}, "warnings": [], "dropped": [],
+        "format": "benchnav-run", "format_version": FORMAT_VERSION, "suite": {}, "commands": [],
+        "conditions": {name: notes | dict(entry) for name, entry in conditions.items()}, "datasets": {},
+        "codes": {digest: code}, "reused": "",
+        "planner_limit_s": 0.0, "device": "cpu", "gpu": None, "warnings": [], "dropped": [],
         "history": [], "machine": {"processor": "AMD", "cores": 2, "host": "here"},
     }  # fmt: skip
     folder.mkdir(parents=True)
-    _write_rows(folder, rows, json.loads(json.dumps(about | changes)))
+    _write_rows(folder, rows.assign(code=digest), json.loads(json.dumps(about | changes)))
     return folder
 
 

@@ -14,7 +14,7 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.rendering import latex
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import Compared, find_pairs
-from tests.eval.forged import CODE, forge_run
+from tests.eval.forged import code_with, forge_run
 from tests.eval.report.made import condition, row, rows
 from tests.eval.stats.test_pairing import value_of
 
@@ -35,6 +35,7 @@ def settings(shift: int = 0) -> pd.DataFrame:
     return rows(*made)
 
 
+OTHER_MODULE = code_with(modules={"benchnav.eval.run.unit": "t"})
 PAPER = {"noise": "resampled", "time_budget_s": 100.0}
 
 
@@ -62,9 +63,9 @@ def run_folder(
         "datasets": {
             "paper-v1": {"id": "paper-v1", "maps": {"test/std": [f"{i:x}" for i in range(MAPS)]}, "about": {}}
         },
-        "parts": {"planner mppi": {"origin": "file mppi.py", "digest": "1"}},
     }
-    return forge_run(folder, episodes, known, **(about | changes))
+    given = {"code": code_with(parts={"planner mppi": "1"})} | about | changes
+    return forge_run(folder, episodes, known, **given)
 
 
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -113,26 +114,26 @@ def test_what_is_looked_at_can_be_narrowed(tmp_path: Path) -> None:
 
 def test_two_runs_are_compared_condition_by_condition(tmp_path: Path) -> None:
     before = run_folder(tmp_path / "a" / "run", settings())
-    after = run_folder(tmp_path / "b" / "run", settings(shift=2), code={**CODE, "sources": "t"})
+    after = run_folder(tmp_path / "b" / "run", settings(shift=2), code=OTHER_MODULE)
     table, shown = compare_runs([before, after], "", "", {}, 0.05)
     assert len(table) == 7
     assert set(table["one"]) == {"b/run"}
     assert set(table["other"]) == {"a/run"}
     assert (table["arrival_time_difference_s"].dropna() == 2).all()
     # What differs between runs is what is asked here, so that it is said and not refused.
-    assert "Different code: b/run differs from a/run in benchnav's own sources." in shown.notes
-    assert set(table["different_code"]) == {"b/run differs from a/run in benchnav's own sources"}
+    assert "Different code: b/run differs from a/run in benchnav.eval.run.unit." in shown.notes
+    assert set(table["different_code"]) == {"b/run differs from a/run in benchnav.eval.run.unit"}
 
 
 # What made the second run, and how it is told.
 OTHER_CODE = {
-    "part": ({"parts": {"planner mppi": {"origin": "file mppi.py", "digest": "2"}}}, "planner mppi"),
-    "sources": ({"code": {**CODE, "sources": "t"}}, "benchnav's own sources"),
-    "version": ({"code": {**CODE, "versions": {"torch": "2.2"}}}, "torch (2.1 to 2.2)"),
-    "processor": ({"code": {**CODE, "processor": "AVX512"}}, "processor (AVX2 to AVX512)"),
-    "compiles": ({"code": {**CODE, "compiles": False}}, "compiles (True to False)"),
-    "limit": ({"planner_limit_s": 5.0}, "planner_limit_s (0.0 to 5.0)"),
-    "GPU": ({"device": "cuda", "gpu": "H100"}, "device (cpu to H100)"),
+    "part": (code_with(parts={"planner mppi": "2"}), "planner mppi"),
+    "module": (OTHER_MODULE, "benchnav.eval.run.unit"),
+    "version": (code_with(environment={"torch": "2.2"}), "torch (2.1 to 2.2)"),
+    "processor": (code_with(environment={"processor": "AVX512"}), "processor (AVX2 to AVX512)"),
+    "compiles": (code_with(environment={"compiles": False}), "compiles (True to False)"),
+    "limit": (code_with(environment={"planner_limit_s": 5.0}), "planner_limit_s (0.0 to 5.0)"),
+    "GPU": (code_with(environment={"device": "H100"}), "device (cpu to H100)"),
 }
 
 
@@ -140,10 +141,10 @@ OTHER_CODE = {
 def test_what_other_code_made_is_compared_only_when_asked_and_then_said_in_every_table(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    changes, told = OTHER_CODE[name]
+    code, told = OTHER_CODE[name]
     episodes, out = settings()[lambda rows: rows["planner"] == "mppi"], tmp_path / "table"
     cautious = run_folder(tmp_path / "a", episodes[episodes["risk"] == "cvar"])
-    plain = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"], **changes)
+    plain = run_folder(tmp_path / "b", episodes[episodes["risk"] == "mean"], code=code)
     asked = (str(cautious), str(plain), "--by", "risk", "--out", str(out))
     assert command(monkeypatch, *asked) == 2
     refused = capsys.readouterr().err
@@ -168,9 +169,9 @@ def test_a_planner_that_was_edited_is_not_compared_with_another_either(tmp_path:
     """By planner the two have parts of their own; what both runs name has to be one."""
     episodes = settings()[lambda rows: rows["risk"] == "mean"]
     first = run_folder(tmp_path / "a", episodes[episodes["planner"] != "cl_rrt"])
-    parts = {f"planner {name}": {"origin": "file", "digest": "2"} for name in ("mppi", "cl_rrt")}
-    second = run_folder(tmp_path / "b", episodes[episodes["planner"] == "cl_rrt"], parts=parts)
-    # The second run names another `mppi` too, of which it holds no row here.
+    edited = code_with(parts={"planner mppi": "2"})
+    second = run_folder(tmp_path / "b", episodes[episodes["planner"] == "cl_rrt"], code=code_with())
+    # Rows of `cl_rrt` have no part in common with those of `mppi`.
     assert len(compare_runs([first, second], "planner", "", {}, 0.05)[0]) == 1
     # Of two scenarios each in a run of its own each pair has one code, and the label of a row two.
     moved = episodes[episodes["planner"] == "mppi"].assign(
@@ -180,7 +181,7 @@ def test_a_planner_that_was_edited_is_not_compared_with_another_either(tmp_path:
     here = run_folder(tmp_path / "c", pd.concat([episodes[episodes["planner"] == "mppi"], cautious]))
     two = pd.concat([moved, cautious.assign(scenario="hg", condition=lambda rows: rows["condition"] + "hg")])
     maps = {"paper-v1": {"maps": {"test/hg": ["m"] * MAPS}}}
-    there = run_folder(tmp_path / "d", two, parts=parts, datasets=maps)
+    there = run_folder(tmp_path / "d", two, code=edited, datasets=maps)
     with pytest.raises(ConfigError, match="d differs from c in planner mppi"):
         compare_runs([here, there], "risk", "", {}, 0.05)
 
@@ -206,8 +207,8 @@ def test_rows_of_one_condition_that_disagree_are_refused(tmp_path: Path) -> None
     mean, late = episodes["risk"] == "mean", episodes.copy()
     late.loc[mean & (late["map"] < 2), "total_time_s"] += 1
     first = run_folder(tmp_path / "a", episodes[mean | (episodes["risk"] == "cvar")])
-    parts = {"planner mppi": {"origin": "file mppi.py", "digest": "2"}}
-    second = run_folder(tmp_path / "b", late[mean | (late["risk"] == "var")], parts=parts)
+    edited = code_with(parts={"planner mppi": "2"})
+    second = run_folder(tmp_path / "b", late[mean | (late["risk"] == "var")], code=edited)
     for allowed in (False, True):
         with pytest.raises(
             ConfigError, match=r"2 of 12 episodes of .* in a and b \(b differs from a in planner mppi\)"

@@ -14,8 +14,8 @@ from benchnav.eval.failed_ground import ground_of_run
 from benchnav.eval.folder.folder import open_run, read_table, write_run
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.write import write_report
-from benchnav.eval.run.episode import build
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings, build
 
 BELOW = 0.6
 
@@ -32,7 +32,7 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     suite = Suite(
         data=str(dataset_path), scenarios=("std",), model="oracle", planners=("tests.eval.parts:Faulty",),
         risks=("cvar",), world=world, maps=2, seeds=(0, 1), realisations=2,
-        record="none",
+        record="steps",
     )  # fmt: skip
     for _ in run_suite(suite, made):
         pass
@@ -48,7 +48,7 @@ def test_the_ground_is_that_of_each_episode_under_its_own_noise(folder: Path) ->
     for place, row in enumerate(mixed.to_dict("records")):
         noise = {name: row[name] for name in ("seed", "realisation")}
         unit = Unit(condition=condition, maps=(row["map"],), **noise)
-        problem, simulation = build(unit, "again")
+        problem, simulation = build(unit, Settings().origins().of(unit))
         np.testing.assert_array_equal(ground.predicted[place], problem.risk_map[0].numpy())
         assert simulation.field is not None
         np.testing.assert_array_equal(ground.immobilising[place], (simulation.field[0] < BELOW).numpy())
@@ -66,7 +66,7 @@ def test_the_report_shows_it_and_says_what_the_planner_was_told(folder: Path) ->
     assert report.warnings == () or "No sheet" not in report.warnings[-1]
 
 
-@pytest.mark.parametrize("part", ["datasets", "parts"])
+@pytest.mark.parametrize("part", ["datasets", "codes"])
 def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, folder: Path) -> None:
     about = json.loads((folder / "run.json").read_text())
     before = json.dumps(about)
@@ -74,7 +74,8 @@ def test_other_maps_and_models_than_those_of_the_run_are_not_shown(part: str, fo
         (data,) = about[part].values()
         data["maps"]["test/std"] = ["0" * 16 for _ in data["maps"]["test/std"]]
     else:
-        about[part]["model oracle"]["name"] = "another"
+        (code,) = about[part].values()
+        code["parts"]["planner tests.eval.parts:Faulty"] = "another"
     write_run(folder, about)
     try:
         rows = failures_table(folder, read_table(folder, "episodes.parquet"))

@@ -22,12 +22,11 @@ def made(path: Path, **draws: tuple[tuple[int, int, int], ...]) -> Path:
     entries = {}
     for condition in conditions_of(suite, lambda data: ["std", "hs"]):
         extent = Extent(draws=draws.get(condition.labels["planner"], DRAWS))
-        entries[condition.id] = {"value": condition.value, "labels": condition.labels, **extent.to_dict()}
+        entries[condition.id] = {"value": condition.value, "labels": condition.labels, "draws": extent.draws}
     maps = {f"test/{scenario}": ["m"] * 60 for scenario in ("std", "hs")}
     about = {
-        "format": FORMAT, "format_version": FORMAT_VERSION, "run_id": "r", "suite": {}, "conditions": entries,
-        "datasets": {suite.data: {"id": "d", "maps": maps}}, "parts": {}, "commands": [], "machine": {},
-        "code": {"sources": "s", "versions": {}, "processor": "", "compiles": False}, "device": "cpu",
+        "format": FORMAT, "format_version": FORMAT_VERSION, "suite": {}, "conditions": entries,
+        "datasets": {suite.data: {"id": "d", "maps": maps}}, "commands": [], "machine": {}, "device": "cpu",
         "planner_limit_s": 0.0,
     }  # fmt: skip
     path.mkdir()

@@ -17,11 +17,11 @@ from benchnav.core.store import Shard
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import EPISODES, open_run, read_table, write_run
-from benchnav.eval.run import episode
+from benchnav.eval.folder.folder import EPISODES, metadata, open_run, read_table, write_run
+from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import compare, rerun
-from benchnav.eval.run.runner import Workers, run_suite
+from benchnav.eval.run.runner import run_suite
 from tests.eval.forged import forge_rows
 
 
@@ -36,7 +36,7 @@ def call(*words: str) -> int:
 def words_on(dataset: Path, *more: str) -> tuple[str, ...]:
     return (
         "run", "--data", str(dataset), "--model", "oracle", "--planners", "[tests.eval.parts:Faulty]", "--risks",
-        "[mean]", "--scenarios", "[std]", "--maps", "1", "--time_budget_s", "4", "--record", "none", *more,
+        "[mean]", "--scenarios", "[std]", "--maps", "1", "--time_budget_s", "4", "--record", "steps", *more,
     )  # fmt: skip
 
 
@@ -55,19 +55,24 @@ def run(made: Path, tmp_path: Path) -> Path:
 def quick(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": ("tests.eval.parts:Faulty",), "risks": ("mean",),
-        "scenarios": ("std",), "maps": 1, "record": "none", "steps": "none", "time_budget_s": 2.0,
+        "scenarios": ("std",), "maps": 1, "record": "none", "time_budget_s": 2.0,
     }  # fmt: skip
     return Suite(**(given | changes))
+
+
+def makings(folder: Path) -> set[str]:
+    """Tokens of the makings of a run's units."""
+    return {metadata(path)["made"] for path in folder.glob("units/*/*.parquet")}
 
 
 def test_a_link_stays_a_link_when_what_it_points_to_is_dropped(
     run: Path, dataset_path: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "link").symlink_to(run)
-    before = open_run(run).about["run_id"]
+    before = makings(run)
     list(run_suite(quick(dataset_path), tmp_path / "link", overwrite=True))
     assert (tmp_path / "link").is_symlink()
-    assert open_run(run).about["run_id"] != before
+    assert makings(run).isdisjoint(before)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "run"]
 
 
@@ -75,9 +80,9 @@ def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
     run: Path, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(run)
-    before = open_run(run).about["run_id"]
+    before = makings(run)
     list(run_suite(quick(dataset_path), Path(), overwrite=True))
-    assert open_run(Path()).about["run_id"] != before
+    assert makings(Path()).isdisjoint(before)
     assert not Path("report.html").exists()
     list(run_suite(quick(dataset_path), tmp_path / "part", shard=Shard(index=1, of=1)))
     (tmp_path / "all").mkdir()
@@ -91,16 +96,15 @@ def test_the_folder_that_the_user_is_in_can_be_dropped_and_merged_into(
 def test_a_copy_certifies_nothing(run: Path, tmp_path: Path) -> None:
     again = Path(shutil.copytree(run, tmp_path / "again"))
     with pytest.raises(ConfigError, match=r"1 of the 1 units in .*again are copies"):
-        list(rerun(run, again, Workers()))
-    # Nor under another name of the run.
-    about = open_run(again).about
-    write_run(again, {**about, "run_id": "other"})
+        list(rerun(run, again))
+    # Nor under another account of the run.
+    write_run(again, {**open_run(again).about, "history": []})
     with pytest.raises(ConfigError, match="copies"):
-        list(rerun(run, again, Workers()))
-    list(rerun(run, again, Workers(), overwrite=True))
+        list(rerun(run, again))
+    list(rerun(run, again, overwrite=True))
     assert compare(run, again).same
     # What was repeated may be gone on with.
-    list(rerun(run, again, Workers()))
+    list(rerun(run, again))
 
 
 def test_merged_copies_of_one_shard_certify_nothing(dataset_path: Path, tmp_path: Path) -> None:
@@ -108,11 +112,11 @@ def test_merged_copies_of_one_shard_certify_nothing(dataset_path: Path, tmp_path
     for name in ("one", "two"):
         list(merge_shards([tmp_path / "part"], tmp_path / name))
     with pytest.raises(ConfigError, match="copies"):
-        list(rerun(tmp_path / "one", tmp_path / "two", Workers()))
+        list(rerun(tmp_path / "one", tmp_path / "two"))
 
 
 def test_a_column_that_one_table_has_is_a_difference(run: Path, tmp_path: Path) -> None:
-    list(rerun(run, tmp_path / "again", Workers()))
+    list(rerun(run, tmp_path / "again"))
     forge_rows(run, pd.read_parquet(run / "episodes.parquet").assign(more=1.0))
     comparison = compare(run, tmp_path / "again")
     assert not comparison.same
@@ -241,8 +245,9 @@ def test_rows_have_the_group_of_their_map(
                 return super().read(split, indices, names)
             return {"group": np.array([40 + index // 2 for index in indices], np.int32)}
 
-    monkeypatch.setattr(episode, "TerrainDataset", Grouped)
-    block = episode.read_maps(Grouped(dataset_path), "test/std", [0, 1])
+    monkeypatch.setattr(units_of_run, "TerrainDataset", Grouped)
+    units_of_run._block.cache_clear()
+    block = units_of_run.read_maps(Grouped(dataset_path), "test/std", [0, 1])
     assert (block.groups.tolist(), block.groups.dtype) == ([40, 40], np.int64)
     list(run_suite(quick(dataset_path, maps=2), tmp_path / "grouped"))
     assert read_table(tmp_path / "grouped", EPISODES)["group"].tolist() == [40, 40]

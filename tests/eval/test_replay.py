@@ -121,7 +121,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
     assert "straight" not in words
     assert call(*words[1:], "--view", "false") == 0
     assert (
-        call("run", "--data", str(dataset_path), "--out", str(tmp_path / "none"), *SMALL, "--record", "none")
+        call("run", "--data", str(dataset_path), "--out", str(tmp_path / "none"), *SMALL, "--record", "steps")
         == 0
     )
     assert "recorded:" not in capsys.readouterr().out
@@ -139,8 +139,8 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
         (("replay", "RUN", "--instance", "4"), "It is now '--map'."),
         (("run", "--task.slowest", "0.2"), "It is now 'min_traversability'."),
         (("run", "--config", "old.yaml"), "It is now 'record'."),
-        (("run", "--record", "some"), "'none' or 'failures' or 'first' or 'all'"),
-        (("run", "--steps", "first"), "'none' or 'recorded' or 'all'"),
+        (("run", "--record", "some"), "'none' or 'steps' or 'first' or 'failures' or 'all'"),
+        (("run", "--steps", "first"), "It is now '--record'."),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(

@@ -31,7 +31,7 @@ def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
         risks=("mean",),
         scenarios=("std",),
         planner_options={planner: FEW_SAMPLES[planner]} if planner in FEW_SAMPLES else {},
-        record="none",
+        record="steps",
     )
     for _ in run_suite(suite, tmp_path / "run"):
         pass
@@ -43,7 +43,7 @@ STRAIGHT = [(25.1, 21.664, 0.8631), (29.0, 21.662, 0.7470), (26.4, 21.642, 0.819
 
 
 def test_golden_rows_of_the_blind_straight_line(tmp_path: Path) -> None:
-    suite = Suite(model="oracle", planners=("straight",), scenarios=("std",), maps=4, record="none")
+    suite = Suite(model="oracle", planners=("straight",), scenarios=("std",), maps=4, record="steps")
     for _ in run_suite(suite, tmp_path / "run"):
         pass
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
@@ -74,7 +74,7 @@ def drive_straight(map_index: int) -> tuple[float, float, float]:
 @pytest.mark.parametrize("scenario", ["std", "hg", "hs"])
 def test_astar_dwa_never_stalls_under_any_risk_setting(scenario: str, tmp_path: Path) -> None:
     risks = ("cvar", "var", "mean", "single-class")
-    suite = Suite(planners=("astar_dwa",), risks=risks, scenarios=(scenario,), record="none")
+    suite = Suite(planners=("astar_dwa",), risks=risks, scenarios=(scenario,), record="steps")
     for _ in run_suite(suite, tmp_path / "run", jobs=2):
         pass
     rows = pd.read_parquet(tmp_path / "run" / "episodes.parquet")
@@ -112,7 +112,7 @@ IN_STAKES = [
 def test_golden_rows_of_the_blind_straight_line_where_soft_ground_ends_a_episode(tmp_path: Path) -> None:
     suite = Suite(
         data="stakes-v1", world="stakes", model="oracle", planners=("straight",), scenarios=("std",),
-        maps=8, record="none",
+        maps=8, record="steps",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass

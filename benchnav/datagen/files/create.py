@@ -5,31 +5,23 @@ of many files is made where it is to be, and is finished when its manifest is wr
 one it is made in such a folder too.
 """
 
-import multiprocessing
-import os
+import platform
 import re
 import shutil
-import signal
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
-
-import joblib
 
 import benchnav
-from benchnav.core.cluster import connected, parallel, told_when_lost
 from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.core.store import Shard, real_place, restore, sole_writer, take_place
-from benchnav.core.workers import end_with
+from benchnav.core.workers import run_calls
 from benchnav.datagen.files.folder import Contents, whole, write_manifest
 from benchnav.datagen.files.hdf5 import check_target, is_one_file, named_errors, writing
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, is_dataset, open_file, read_manifest
 from benchnav.datagen.files.shard import SHARD_CELLS, ShardFile, cut, is_there, make, write
 from benchnav.datagen.recipe.recipe import Recipe
-
-_Made = tuple[ShardFile, bytes]
 
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
 _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
@@ -81,8 +73,9 @@ def create(
         total = sum(shard.maps for shard in own)
         done = total - sum(shard.maps for shard in missing)
         yield done, total
-        with _runner(recipe, jobs, scheduler if missing else "") as run, _left_nothing(folder, path):
-            for file, content in run(missing):
+        calls = [partial(_make, recipe, file, benchnav.__version__) for file in missing]
+        with _left_nothing(folder, path):
+            for file, content in run_calls(calls, jobs, scheduler if missing else ""):
                 write(folder / file.name, content)
                 done += file.maps
                 yield done, total
@@ -262,54 +255,17 @@ def _is_ours(file: Path) -> bool:
         return False
 
 
-@contextmanager
-def _runner(
-    recipe: Recipe, jobs: int, scheduler: str
-) -> Iterator[Callable[[Sequence[ShardFile]], Iterable[_Made]]]:
-    """Gives a function that makes shards, here, in processes of this machine or on a cluster, each as it is done."""
-    if scheduler:
-        with connected(scheduler) as client, told_when_lost(scheduler):
-            _check_workers(client)
-            yield lambda shards: parallel(client)(joblib.delayed(_make)(recipe, shard) for shard in shards)
-        return
-    if jobs == 1:
-        yield lambda shards: (_make(recipe, shard) for shard in shards)
-        return
-    executor = ProcessPoolExecutor(
-        jobs, multiprocessing.get_context("spawn"), initializer=_start_worker, initargs=(os.getpid(),)
-    )
-    try:
-        yield lambda shards: (
-            done.result() for done in as_completed(executor.submit(_make, recipe, shard) for shard in shards)
-        )
-    finally:
-        executor.shutdown(cancel_futures=True)
-
-
-def _make(recipe: Recipe, shard: ShardFile) -> _Made:
-    return shard, make(recipe, shard)
-
-
-def _start_worker(parent: int) -> None:
-    # An interrupt is for the parent to act on; and a parent that is killed takes its workers along.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with(parent)
-
-
-def _check_workers(client: Any) -> None:
-    """Refuses workers of another version.
+def _make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
+    """Makes a shard, perhaps in a process on another machine.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: another version of this package is installed there, or the recipe cannot be met.
     """
-    own = _version()
-    for address, version in client.run(_version, on_error="return").items():
-        if version != own:
-            raise ConfigError(f"Expected workers with benchnav {own}, got {address} with {version}.")
-
-
-def _version() -> str:
-    return benchnav.__version__
+    if benchnav.__version__ != version:
+        raise ConfigError(
+            f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
+        )
+    return shard, make(recipe, shard)
 
 
 @contextmanager

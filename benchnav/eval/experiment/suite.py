@@ -4,12 +4,15 @@
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.experiment.keep import Keep, Record, Steps
 
 PartSpec = str | dict[str, Any]
+
+# What is kept of episodes beside their rows, each with all that stands before it.
+Record = Literal["none", "steps", "first", "failures", "all"]
+RECORDS: tuple[Record, ...] = ("none", "steps", "first", "failures", "all")
 
 _SEEDS = 2**63  # what a table's column of whole numbers holds
 
@@ -42,8 +45,8 @@ class Suite:
         seed: Root seed of all draws.
         seeds: Several root seeds in place of `seed`.
         realisations: How often λ is drawn for each map and seed.
-        record: Episodes that are recorded for playback: none, failures, the first map of each condition, or all.
-        steps: Episodes whose steps are stored: none, those that are recorded, or all.
+        record: What is kept of episodes beside their rows, each with all before it: none; the steps of all episodes;
+            recordings for playback of the first map of each condition; of failures; of all.
         conditions: Several products: mappings of the keys above, each taking what it leaves out from there.
         hypotheses: What the run is to show, fixed before its first unit: mappings of `one` and `other`, conditions by
             their labels, such as {planner: mppi, risk: mean}; `metric`: success, T_total, score, traversability or
@@ -68,7 +71,6 @@ class Suite:
     seeds: tuple[int, ...] = ()
     realisations: int = 1
     record: Record = "first"
-    steps: Steps = "all"
     conditions: tuple[dict[str, Any], ...] = ()
     hypotheses: tuple[dict[str, Any], ...] = ()
 
@@ -86,14 +88,12 @@ class Suite:
                 raise ConfigError(f"Expected `seed` ≥ 0 and below 2^63, got {seed}.")
         if len(set(self.all_seeds)) != len(self.all_seeds):
             raise ConfigError(f"Expected `seeds` that differ, got {list(self.seeds)}.")
-        _ = self.keep  # refuses what is no choice
+        if self.record not in RECORDS:
+            raise ConfigError(
+                f"Expected `record` as {', '.join(RECORDS[:-1])} or {RECORDS[-1]}, got {self.record!r}."
+            )
 
     @property
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
-
-    @property
-    def keep(self) -> Keep:
-        """What is kept of episodes beside their rows."""
-        return Keep(record=self.record, steps=self.steps)

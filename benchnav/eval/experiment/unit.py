@@ -1,13 +1,13 @@
 """Units of work: a condition's block of maps under one seed and realisation, run as one batch."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from benchnav.core.store import Shard
 from benchnav.eval.experiment.condition import Condition
-from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import Record
 
 BLOCK_MAPS = 50
 
@@ -17,8 +17,7 @@ class Extent:
     """How often a condition is run.
 
     Args:
-        draws: (seed, realisation, maps): under each seed and draw of λ the first so
-            many maps of the split.
+        draws: (seed, realisation, maps): under each seed and draw of λ the first so many maps of the split.
     """
 
     draws: tuple[tuple[int, int, int], ...]
@@ -38,6 +37,11 @@ class Extent:
         """The most maps that any draw has."""
         return max(maps for _, _, maps in self.draws)
 
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return sum(maps for _, _, maps in self.draws)
+
     def union(self, other: "Extent") -> "Extent":
         """What is in either, and no more."""
         most: dict[tuple[int, int], int] = {}
@@ -45,14 +49,8 @@ class Extent:
             most[seed, realisation] = max(maps, most.get((seed, realisation), 0))
         return Extent(draws=tuple((*key, maps) for key, maps in most.items()))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return {"seeds": list(self.seeds), "draws": [list(draw) for draw in self.draws]}
 
-    @classmethod
-    def from_dict(cls, about: Mapping[str, Any]) -> "Extent":
-        """Reads what `to_dict` gave; other keys are left alone."""
-        return cls(draws=tuple((seed, realisation, count) for seed, realisation, count in about["draws"]))
+Conditions = Mapping[str, tuple[Condition, Extent]]  # by id, with how often each is run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,68 +62,83 @@ class Unit:
         seed: root seed.
         realisation: which draw of λ.
         maps: which maps of the condition's split; of one block.
-        keep: what is kept beside rows; a unit that does not begin its condition has no first map.
+        record: what is kept beside rows: the `steps` of all episodes; recordings of the `first` map of the condition,
+            of `failures`, or of `all`.
+        leads: the unit begins its condition, so that its first map is the condition's.
     """
 
     condition: Condition
     seed: int
     realisation: int
     maps: tuple[int, ...]
-    keep: Keep = field(default_factory=Keep)
+    record: Record = "none"
+    leads: bool = False
 
     @property
     def block(self) -> int:
         """Number of the block."""
         return self.maps[0] // BLOCK_MAPS
 
-    def share(self, of: int) -> Shard:
-        """The share that the unit is in, where so many machines make a run apart.
+    def shard(self, of: int) -> Shard:
+        """The shard that the unit is in, where so many machines make a run apart.
 
         It depends on the unit and that number alone, so that an extended run leaves every unit where it was.
-        Blocks, realisations and seeds of a condition go to the shares in turn; the share that a condition begins with
+        Blocks, realisations and seeds of a condition go to the shards in turn; the one that a condition begins with
         is drawn by its id, which is a digest.
         """
         turn = int(self.condition.id, 16) + self.seed + self.realisation + self.block
         return Shard(index=turn % of + 1, of=of)
 
     @property
-    def path(self) -> Path:
-        """The unit's file in a run folder."""
-        return Path("units", self.condition.id, self._file)
+    def name(self) -> str:
+        """Its name among the units of its condition."""
+        return f"{self.seed}-{self.realisation}-{self.block:05d}"
 
     @property
     def steps_path(self) -> Path:
         """The file of the unit's steps in a run folder, one partition a condition."""
-        return Path("steps", f"condition={self.condition.id}", self._file)
+        return Path("steps", f"condition={self.condition.id}", f"{self.name}.parquet")
 
-    @property
-    def _file(self) -> str:
-        return f"{self.seed}-{self.realisation}-{self.block:05d}.parquet"
+    def recording_path(self, member: int, suffix: str = ".npz") -> Path:
+        """The file of one episode's recording in a run folder; `.rrd` for the viewer's, which is made of it.
 
-    def stem(self, member: int) -> str:
-        """A name for files of one of the unit's episodes."""
+        The viewer names what it opens by the file, and takes letters, digits, `_` and `-` without a warning; all else
+        becomes `-`.
+        """
         labels = self.condition.labels
         words = [labels[name] for name in ("planner", "risk", "scenario")]
         words += [self.condition.id[:8], f"{self.seed}", f"{self.realisation}", f"{self.maps[member]:05d}"]
-        return "+".join("".join(c if c.isalnum() or c in "._-" else "_" for c in word) for word in words)
+        return Path("playback", "-".join(re.sub(r"[^A-Za-z0-9_-]+", "-", word) for word in words) + suffix)
+
+    def watched(self) -> range:
+        """Which episodes may come to be recorded, known before they are run."""
+        if self.record in ("failures", "all"):
+            return range(len(self.maps))
+        return range(1 if self.record == "first" and self.leads else 0)
+
+    def recorded(self, succeeded: Sequence[bool]) -> list[int]:
+        """Which episodes are recorded, by how they ended."""
+        first = [0] if self.leads else []
+        failed = [member for member, success in enumerate(succeeded) if not success]
+        chosen = {
+            "first": first,
+            "failures": sorted({*first, *failed}),
+            "all": list(range(len(self.maps))),
+        }
+        return chosen.get(self.record, [])
 
 
-def units(conditions: Mapping[str, tuple[Condition, Extent]], keep: Keep) -> list[Unit]:
+def units(conditions: Conditions, record: Record = "none") -> list[Unit]:
     """Cuts conditions into units of work, those that share a prediction next to one another.
 
     Those that look at no prediction are the shortest and come last of their block: a worker's memory is measured
     after its first unit, and one whose memory grows much thereafter is replaced, which takes long.
 
     Args:
-        conditions: by id, with how often each is run.
-        keep: what is kept beside rows.
+        conditions: what is run.
+        record: what is kept beside rows.
     """
-    later = replace(keep, record="none") if keep.record == "first" else keep
-    made = [
-        replace(unit, keep=later if place else keep)
-        for condition, extent in conditions.values()
-        for place, unit in enumerate(_blocks(condition, extent))
-    ]
+    made = [unit for condition, extent in conditions.values() for unit in _blocks(condition, extent, record)]
     order = {condition_id: place for place, condition_id in enumerate(conditions)}
     return sorted(
         made,
@@ -136,14 +149,18 @@ def units(conditions: Mapping[str, tuple[Condition, Extent]], keep: Keep) -> lis
     )  # fmt: skip
 
 
-def in_table_order(made: Iterable[Unit], conditions: Mapping[str, Any]) -> list[Unit]:
+def in_table_order(made: Iterable[Unit], conditions: Conditions) -> list[Unit]:
     """Units in the order in which tables list them, whatever the order they were run in."""
     order = {condition_id: place for place, condition_id in enumerate(conditions)}
     return sorted(made, key=lambda u: (order[u.condition.id], u.seed, u.realisation, u.block))
 
 
-def _blocks(condition: Condition, extent: Extent) -> Iterator[Unit]:
+def _blocks(condition: Condition, extent: Extent, record: Record) -> Iterator[Unit]:
+    leads = True
     for seed, realisation, maps in extent.draws:
         for start in range(0, maps, BLOCK_MAPS):
             block = tuple(range(start, min(start + BLOCK_MAPS, maps)))
-            yield Unit(condition=condition, seed=seed, realisation=realisation, maps=block)
+            yield Unit(
+                condition=condition, seed=seed, realisation=realisation, maps=block, record=record, leads=leads
+            )  # fmt: skip
+            leads = False

@@ -1,10 +1,10 @@
-"""Run folders, format version 4: what lies where, and how it is read.
+"""Run folders, format version 5: what lies where, and how it is read.
 
 A run folder holds `run.json` (conditions, and where everything came from), `units/` (what is finished: one
-Parquet file a unit, with rows and, in its metadata, what else is known of it), `steps/`, `playback/`, and,
-when all is done, `episodes.parquet`, `errors.txt` where a planner or model failed, and the report. Every file
-is written under another name first. `run.json` ends in a seal, the digest of all else in it, and holds the digests
-of the run's tables, so that an edit of either is found.
+Parquet file a unit, by condition and key, with rows and, in its metadata, what else is known of it), `steps/`,
+`playback/`, and, when all is done, `episodes.parquet`, `errors.txt` where a planner or model failed, and the report.
+Every file is written under another name first. `run.json` is sealed, and holds the digests of the run's tables, so
+that an edit of either is found.
 """
 
 import hashlib
@@ -24,17 +24,17 @@ import pyarrow.parquet as pq
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
-from benchnav.core.store import Shard, replacing, write_text
+from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import Condition, condition_from
-from benchnav.eval.experiment.keep import Keep
+from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import Extent, Unit
+from benchnav.eval.folder.provenance import Origin
 
-FORMAT, FORMAT_VERSION = "benchnav-run", 4
+FORMAT, FORMAT_VERSION = "benchnav-run", 5
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
-SEAL = "seal"
 KEYS = ["condition", "seed", "realisation", "map"]  # of a row
 
-_METADATA = b"benchnav"
+METADATA = b"benchnav"  # key of ours in a Parquet file's metadata
 
 # What reading a damaged file raises: of a condition's rules and world what refuses a suite, of a table its library's.
 _DAMAGE = (
@@ -55,7 +55,7 @@ class Run:
         folder: where.
         about: all of `run.json`.
         conditions: by id, with how often each is run.
-        shard: which share of the run the folder holds; None where it holds all.
+        shard: which shard of the run the folder holds; None where it holds all.
     """
 
     folder: Path
@@ -75,8 +75,8 @@ def open_run(folder: Path) -> Run:
             f"Expected a run folder with {RUN}, got {folder}. Make one with `benchnav-eval run`."
         )
     with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
-        about = json.loads((folder / RUN).read_text())
-        version = _format_version(about)
+        text = (folder / RUN).read_text()
+        version = _format_version(json.loads(text))
     if version != FORMAT_VERSION:
         reader = (
             "a newer benchnav" if version > FORMAT_VERSION else "benchnav 0.7, which reads versions 1 to 3"
@@ -86,10 +86,10 @@ def open_run(folder: Path) -> Run:
             f"with {reader}, or run its suite again."
         )
     with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
-        if _sealed(about) != about:
-            raise DamageError("it was changed after benchnav wrote it")
+        about = unseal(text)
         conditions = {
-            i: (condition_from(entry), Extent.from_dict(entry)) for i, entry in about["conditions"].items()
+            i: (condition_from(entry), Extent(draws=tuple(tuple(draw) for draw in entry["draws"])))
+            for i, entry in about["conditions"].items()
         }
         shard = Shard(**about["shard"]) if "shard" in about else None
     return Run(folder=folder, about=about, conditions=conditions, shard=shard)
@@ -108,15 +108,8 @@ def _format_version(about: Any) -> int:
 
 
 def write_run(folder: Path, about: Mapping[str, Any]) -> None:
-    """Writes `run.json`, sealed."""
-    write_text(folder / RUN, json.dumps(_sealed(about), indent=1))
-
-
-def _sealed(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What `run.json` holds, with the digest of all of it."""
-    content = {name: value for name, value in about.items() if name != SEAL}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return {**content, SEAL: hashlib.sha256(text.encode()).hexdigest()}
+    """Writes `run.json`."""
+    write_text(folder / RUN, seal(about))
 
 
 def _digest_of_file(path: Path) -> str:
@@ -134,7 +127,8 @@ def caveats(about: Mapping[str, Any]) -> list[str]:
         f"left out: planner {pair['planner']} with robot {pair['robot']}, which it cannot steer"
         for pair in about["dropped"]
     ]
-    return [*(f"warning: {line}" for line in about["warnings"]), *left_out]
+    warnings = [*about["warnings"], *([about["reused"]] if about.get("reused") else [])]
+    return [*(f"warning: {line}" for line in warnings), *left_out]
 
 
 def read_table(folder: Path, name: str) -> pd.DataFrame:
@@ -172,104 +166,118 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
         raise ConfigError(f"{path} is damaged: {said}. {remedy}") from error
 
 
-def write_unit(folder: Path, unit: Unit, rows: pd.DataFrame, about: dict[str, Any]) -> None:
-    """Writes a finished unit.
+@dataclass(frozen=True, kw_only=True)
+class Finished:
+    """A finished unit in a run folder.
 
     Args:
-        folder: the run folder.
-        unit: what was run.
-        rows: a row an episode.
-        about: what else is known; `run_id` and `traceback` among it. With it goes a token of this one making of
-            the unit, which copies keep.
+        path: its file.
+        about: the metadata of the file: `unit` (what was run), `key`, `code`, `digests` of the maps, `record`, `made`
+            (a token of this one making of it, which copies keep), `traceback` and `errors`.
     """
-    table = pa.Table.from_pandas(rows, preserve_index=False)
-    own = {"made": secrets.token_hex(8), "maps": list(unit.maps), "keep": unit.keep.to_dict()}
-    text = json.dumps({**about, **own})
-    table = table.replace_schema_metadata({**(table.schema.metadata or {}), _METADATA: text.encode()})
-    with replacing(folder / unit.path) as partial:
-        pq.write_table(table, partial)
+
+    path: Path
+    about: Mapping[str, Any]
+
+    def has(self, unit: Unit) -> bool:
+        """Whether it was recorded as a unit is now to be, and what was recorded is still of its making."""
+        if RECORDS.index(self.about["record"]) < RECORDS.index(unit.record):
+            return False
+        steps = self.path.parents[2] / unit.steps_path
+        return self.about["record"] == "none" or metadata(steps).get("key") == self.about["key"]
 
 
-def about_unit(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
-    """What is known of a unit; None where this run has not finished it for the maps it now has."""
-    about = _about(folder, unit, run_id)
-    return about if about and about.get("maps") == list(unit.maps) else None
+def find_units(folder: Path, unit: Unit) -> list[Finished]:
+    """Finds all makings of a unit, of whatever code and maps, the newest first."""
+    files = sorted(
+        (folder / "units" / unit.condition.id).glob(f"{unit.name}-*.parquet"),
+        key=lambda path: path.stat().st_mtime,
+        reverse=True,
+    )
+    found = [Finished(path=path, about=metadata(path)) for path in files]
+    return [finished for finished in found if finished.about.get("unit") == _identity(unit)]
 
 
-def kept(folder: Path, unit: Unit, run_id: str) -> Keep:
-    """What this run has kept of a unit beside its rows, perhaps of fewer maps; nothing where it has not run."""
-    about = _about(folder, unit, run_id)
-    return Keep(**about["keep"]) if about else Keep()
+def _identity(unit: Unit) -> list[Any]:
+    return [unit.condition.id, unit.seed, unit.realisation, *unit.maps]
 
 
-def making(folder: Path, unit: Unit) -> str | None:
-    """Which making of a unit a folder holds, of any run: the same for copies alone; None where it holds none."""
-    made: str | None = _any_about(folder, unit).get("made")
-    return made
-
-
-def _about(folder: Path, unit: Unit, run_id: str) -> dict[str, Any] | None:
-    about = _any_about(folder, unit)
-    return about if about.get("run_id") == run_id else None
-
-
-def _any_about(folder: Path, unit: Unit) -> dict[str, Any]:
+def metadata(path: Path) -> dict[str, Any]:
+    """What a Parquet file of a run says of itself; nothing where it is not there or damaged."""
     try:
-        metadata = pq.read_schema(folder / unit.path).metadata or {}
-        about: dict[str, Any] = json.loads(metadata.get(_METADATA, b"{}"))
+        known = pq.read_schema(path).metadata or {}
+        about: dict[str, Any] = json.loads(known.get(METADATA, b"{}"))
     except (OSError, ValueError):
         return {}
     return about
 
 
-def has_all(about: Mapping[str, Any] | None, unit: Unit) -> bool:
-    """Whether a unit is finished, and was recorded as it is now to be.
+def with_metadata(table: pa.Table, about: Mapping[str, Any]) -> pa.Table:
+    """A table that says something of itself; see `metadata`."""
+    return table.replace_schema_metadata(
+        {**(table.schema.metadata or {}), METADATA: json.dumps(about).encode()}
+    )
+
+
+def write_unit(
+    folder: Path, unit: Unit, origin: Origin, rows: pd.DataFrame, errors: Sequence[str], traceback: str
+) -> None:
+    """Writes a finished unit.
 
     Args:
-        about: from `about_unit`.
-        unit: as it is now to be run.
+        folder: the run folder.
+        unit: what was run.
+        origin: of its rows.
+        rows: a row an episode.
+        errors: what went wrong, a line each.
+        traceback: of the first of them.
     """
-    return about is not None and Keep(**about["keep"]).covers(unit.keep)
+    key = origin.key(unit)
+    about = {
+        **{"unit": _identity(unit), "key": key, "code": origin.code, "digests": list(origin.maps)},
+        **{
+            "record": unit.record,
+            "made": secrets.token_hex(8),
+            "traceback": traceback,
+            "errors": list(errors),
+        },
+    }
+    table = pa.Table.from_pandas(rows.assign(code=origin.code_digest), preserve_index=False)
+    with replacing(folder / "units" / unit.condition.id / f"{unit.name}-{key}.parquet") as partial:
+        pq.write_table(with_metadata(table, about), partial)
 
 
-def copy_unit(source: Path, unit: Unit, folder: Path, run_id: str) -> None:
-    """Copies the file of a finished unit into another run folder, as a unit of that run."""
-    table = pq.read_table(source / unit.path, partitioning=None)
-    metadata = dict(table.schema.metadata)
-    metadata[_METADATA] = json.dumps({**json.loads(metadata[_METADATA]), "run_id": run_id}).encode()
-    with replacing(folder / unit.path) as partial:
-        pq.write_table(table.replace_schema_metadata(metadata), partial)
+def clear_unit(folder: Path, unit: Unit) -> None:
+    """Removes steps and recordings of an earlier making of a unit; its rows stay."""
+    (folder / unit.steps_path).unlink(missing_ok=True)
+    for member in range(len(unit.maps)):
+        for suffix in (".npz", ".rrd"):
+            (folder / unit.recording_path(member, suffix)).unlink(missing_ok=True)
 
 
-def finish_run(folder: Path, finished: Iterable[Unit]) -> None:
-    """Writes `episodes.parquet` of all units, a unit at a time, its digest into `run.json`, and `errors.txt`.
+def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: str = "") -> None:
+    """Writes `episodes.parquet` of all units, a unit at a time, its digest and codes into `run.json`, and `errors.txt`.
 
-    Raises:
-        ConfigError: a unit is missing, or of another run.
+    Args:
+        folder: the run folder.
+        finished: all units of the run, in the order of the table.
+        reused: a line on units that other code has made; empty where there are none.
     """
-    about, finished = open_run(folder).about, list(finished)
-    write_errors(folder, finished, about["run_id"])
-    _merge(folder / EPISODES, (_episode_table(folder, unit) for unit in finished))
-    tables = {EPISODES: _digest_of_file(folder / EPISODES)}
-    if about.get("tables") != tables:
-        write_run(folder, {**about, "tables": tables})
+    about = open_run(folder).about
+    write_errors(folder, finished)
+    _merge(folder / EPISODES, (_episode_table(one.path) for _, one in finished))
+    codes = {}
+    for _, one in finished:
+        origin = Origin(code=one.about["code"], maps=())
+        codes[origin.code_digest] = origin.code
+    known = {"codes": codes, "reused": reused, "tables": {EPISODES: _digest_of_file(folder / EPISODES)}}
+    if {name: about.get(name) for name in known} != known:
+        write_run(folder, {**about, **known})
 
 
-def write_errors(folder: Path, finished: Sequence[Unit], run_id: str) -> None:
-    """Writes `errors.txt` of all units, or removes it where nothing failed.
-
-    Raises:
-        ConfigError: a unit is missing, or of another run.
-    """
-    abouts = [about_unit(folder, unit, run_id) for unit in finished]
-    for unit, about in zip(finished, abouts, strict=True):
-        if about is None:
-            raise ConfigError(
-                f"{folder / unit.path} is not of this run. Give its `benchnav-eval run` command again."
-            )
-    traces = [
-        text for unit, about in zip(finished, abouts, strict=True) if about and (text := _trace(unit, about))
-    ]
+def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> None:
+    """Writes `errors.txt` of all units, or removes it where nothing failed."""
+    traces = [text for unit, one in finished if (text := _trace(unit, one, folder))]
     if traces:
         write_text(folder / ERRORS, "\n".join(traces))
     else:
@@ -286,20 +294,22 @@ def _merge(path: Path, tables: Iterable[pa.Table]) -> None:
             writer.close()
 
 
-def unit_rows(folder: Path, unit: Unit) -> pd.DataFrame:
+def unit_rows(finished: Finished) -> pd.DataFrame:
     """Reads the rows of a finished unit."""
-    return _episode_table(folder, unit).to_pandas()
+    return _episode_table(finished.path).to_pandas()
 
 
-def _episode_table(folder: Path, unit: Unit) -> pa.Table:
-    rows = pq.read_table(folder / unit.path, partitioning=None).to_pandas()
+def _episode_table(path: Path) -> pa.Table:
+    rows = pq.read_table(path, partitioning=None).to_pandas()
     return pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
 
 
-def _trace(unit: Unit, about: dict[str, Any]) -> str:
-    if not about.get("traceback") and not about.get("errors"):
+def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
+    about = finished.about
+    if not about["traceback"] and not about["errors"]:
         return ""
     labels = ", ".join(f"{name} {label}" for name, label in unit.condition.labels.items())
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"
-    heading = f"{labels}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({unit.path})"
-    return "\n".join([heading, *about.get("errors", []), about.get("traceback", "")])
+    place = finished.path.relative_to(folder)
+    heading = f"{labels}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({place})"
+    return "\n".join([heading, *about["errors"], about["traceback"]])

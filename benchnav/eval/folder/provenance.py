@@ -1,4 +1,9 @@
-"""Where rows come from: what `run.json` holds, and what has to be the same for a run to go on."""
+"""Where rows come from: the code and the maps that made them, and what `run.json` says of machine and commands.
+
+A unit of work is known by a key: the digest of its condition, seed, realisation, maps and code. Code is all of this
+package that a unit of the condition imports (see `package_modules`), the parts' own code and files, versions of what
+is installed, and the arithmetic of the processor.
+"""
 
 import json
 import os
@@ -8,6 +13,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -18,29 +24,168 @@ import torch
 
 import benchnav
 from benchnav.core import registry
-from benchnav.core.sources import digest_of
+from benchnav.core.device import gpu_name
+from benchnav.core.shipped import PACKAGE
+from benchnav.core.sources import digest_of, package_modules
+from benchnav.core.store import text_digest
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition
-from benchnav.eval.experiment.unit import Extent
-from benchnav.models.predictor import model_identity
+from benchnav.eval.experiment.unit import Conditions, Unit
+from benchnav.models.checkpoint import read_config
+from benchnav.models.predictor import find_checkpoint, model_identity
 from benchnav.planning.planners.compilation import can_compile
 
-PACKAGES = ("benchnav", "torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
+PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
 
-Conditions = Mapping[str, tuple[Condition, Extent]]
+# Runs a unit: what it imports is what rows depend on.
+_UNIT = "benchnav.eval.run.unit"
+_MOST_NAMED = 3
+
+Code = dict[str, dict[str, Any]]
 
 
-def describe_code() -> dict[str, Any]:
-    """What rows depend on beside their condition: sources, versions, arithmetic of the processor."""
-    package = Path(benchnav.__file__).parent
-    files = sorted(path for path in package.rglob("*") if path.suffix in (".py", ".yaml"))
-    named = ((path.relative_to(package).as_posix().encode(), path.read_bytes()) for path in files)
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """What makes the rows of a unit, beside its condition, seed and realisation.
+
+    Args:
+        code: `environment` (versions, processor, device, time limit of planners), `modules` of this package with their
+            digests, and `parts`, the digests of code and files that are not of it.
+        maps: digest of what the split's maps mean, and that of each map.
+    """
+
+    code: Code
+    maps: tuple[str, ...]
+
+    @property
+    def code_digest(self) -> str:
+        """Digest of the code, 12 hexadecimal digits."""
+        return text_digest(self.code)[:12]
+
+    def key(self, unit: Unit) -> str:
+        """The key of a unit that is made so, 16 hexadecimal digits."""
+        return text_digest([unit.condition.id, unit.seed, unit.realisation, unit.maps, self.maps, self.code])[
+            :16
+        ]
+
+
+class Origins:
+    """Looks origins of units up, as they are now; what was looked up once stays.
+
+    Args:
+        planner_limit_s: time limit of each call of a planner; 0 for none.
+        device: where all is computed, "cpu" or "cuda".
+    """
+
+    def __init__(self, planner_limit_s: float, device: str) -> None:
+        """Has looked nothing up yet."""
+        self._environment = {
+            **{name: version(name) for name in PACKAGES},
+            "python": platform.python_version(),
+            "processor": torch.backends.cpu.get_cpu_capability(),
+            "compiles": can_compile(),
+            "device": gpu_name(device) or device,
+            "planner_limit_s": planner_limit_s,
+        }
+        self._codes: dict[str, Code] = {}
+        self._maps: dict[tuple[str, str], list[str]] = {}
+        self._meanings: dict[tuple[str, str], str] = {}
+
+    def of(self, unit: Unit) -> Origin:
+        """The origin of a unit that is made now."""
+        condition = unit.condition
+        if condition.id not in self._codes:
+            self._codes[condition.id] = {"environment": self._environment, **describe_parts(condition)}
+        place = condition.data, condition.split
+        if len(self._maps.get(place, ())) <= unit.maps[-1]:
+            dataset = TerrainDataset(find_dataset(condition.data))
+            self._maps[place] = map_digests(dataset, condition.split, unit.maps[-1] + 1)
+            self._meanings[place] = dataset.about_digest(condition.split)
+        maps = (self._meanings[place], *(self._maps[place][i] for i in unit.maps))
+        return Origin(code=self._codes[condition.id], maps=maps)
+
+
+def describe_parts(condition: Condition) -> Code:
+    """The `modules` of this package that a condition's units import, and the digests of its other `parts`."""
+    modules, parts = [_UNIT], {}
+    for kind in PART_KINDS:
+        part = getattr(condition, kind)
+        name = f"{kind} {part.part}"
+        if kind == "model" and part.part not in registry.names("model") and ":" not in part.part:
+            parts[name] = text_digest(model_identity(part.part)["files"])
+            family = read_config(find_checkpoint(part.part))["model"]
+            modules.append(registry.find("model", family).target.__module__)
+            continue
+        found = registry.find(kind, part.part)
+        if found.shipped:
+            modules.append(found.target.__module__)
+        else:
+            parts[name] = text_digest([found.origin, found.digest])
+        files = registry.option_files(kind, part)
+        parts |= {f"{text} of {name}": digest for text, digest in files.items()}
+    return {"modules": package_modules(modules), "parts": parts}
+
+
+def describe_datasets(conditions: Conditions) -> dict[str, Any]:
+    """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
+    used: dict[str, dict[str, int]] = {}
+    for condition, extent in conditions.values():
+        splits = used.setdefault(condition.data, {})
+        splits[condition.split] = max(extent.maps, splits.get(condition.split, 0))
+    datasets = {data: TerrainDataset(find_dataset(data)) for data in used}
     return {
-        "sources": digest_of(item for pair in named for item in pair),
-        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        "processor": torch.backends.cpu.get_cpu_capability(),
-        "compiles": can_compile(),
+        data: {
+            "id": datasets[data].id,
+            "maps": {split: map_digests(datasets[data], split, count) for split, count in splits.items()},
+            "about": {split: datasets[data].about_digest(split) for split in splits},
+        }
+        for data, splits in used.items()
     }
+
+
+def map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:
+    """Digests of the first maps of a split, 16 hexadecimal digits each."""
+    digests = dataset.entry_digests(split, range(count))
+    return [digest_of([entry.tobytes()])[:16] for entry in digests]
+
+
+def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Names what two codes both have and what is not the same, with the values where they are short.
+
+    Args:
+        earlier: as `Origin.code`.
+        now: as well.
+    """
+    unlike = {
+        group: [name for name, value in earlier[group].items() if now[group].get(name, value) != value]
+        for group in ("modules", "environment", "parts")
+    }
+    modules = unlike["modules"]
+    more = f" and {len(modules) - _MOST_NAMED} more of its modules" if len(modules) > _MOST_NAMED else ""
+    return [
+        *([f"{', '.join(modules[:_MOST_NAMED])}{more}"] if modules else []),
+        *(f"{n} ({earlier['environment'][n]} to {now['environment'][n]})" for n in unlike["environment"]),
+        *unlike["parts"],
+    ]
+
+
+def dataset_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Names what of the maps of two runs is not the same; what only one has is no difference.
+
+    Args:
+        earlier: from `describe_datasets`.
+        now: as well.
+    """
+    changed = []
+    for data, about in earlier.items():
+        other = now.get(data, {"maps": {}, "about": {}})
+        for split, digests in about["maps"].items():
+            pairs = zip(digests, other["maps"].get(split, digests), strict=False)
+            if any(before != after for before, after in pairs):
+                changed.append(f"maps of {data} {split}")
+            if other["about"].get(split, about["about"][split]) != about["about"][split]:
+                changed.append(f"class table, λ_stuck, resolution or kind of truth of {data} {split}")
+    return changed
 
 
 def describe_machine() -> dict[str, Any]:
@@ -49,7 +194,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """What was asked of a run: command, suite, date, machine, and git commit of this package, an entry each.
+    """What was asked of a run: command, suite, date, machine, version and git commit of this package, an entry each.
 
     The commit ends in `+` where files differ from it, and is empty where the package is in no repository. A command
     that is given again at the same place adds no entry.
@@ -58,7 +203,13 @@ def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any
         earlier: entries that are there.
         suite: of this process's command, as it was written.
     """
-    asked = {"command": describe_command(), "suite": dict(suite), **describe_machine(), "commit": _commit()}
+    asked = {
+        "command": describe_command(),
+        "suite": dict(suite),
+        **describe_machine(),
+        "benchnav": benchnav.__version__,
+        "commit": _commit(),
+    }
     now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), **json.loads(json.dumps(asked))}
     again = any({**entry, "date": now["date"]} == now for entry in earlier)
     return [*earlier, *([] if again else [now])]
@@ -66,7 +217,17 @@ def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any
 
 def join(*lists: Iterable[Any]) -> list[Any]:
     """All entries of lists of plain data, each once, in order."""
-    return list({json.dumps(item, sort_keys=True): item for one in lists for item in one}.values())
+    return list({json.dumps(item, sort_keys=True): item for entries in lists for item in entries}.values())
+
+
+def describe_command() -> str:
+    """The command of this process."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
+def command_lines(earlier: Iterable[str]) -> list[str]:
+    """The commands that made a run, this process's last."""
+    return [*(line for line in earlier if line != describe_command()), describe_command()]
 
 
 @cache
@@ -80,10 +241,8 @@ def _processor() -> str:
 
 @cache
 def _commit() -> str:
-    package = Path(benchnav.__file__).parent
-
     def git(*words: str) -> str:
-        command = ["git", "-C", str(package), *words]
+        command = ["git", "-C", str(PACKAGE), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
@@ -91,137 +250,3 @@ def _commit() -> str:
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
     except (OSError, subprocess.SubprocessError):
         return ""
-
-
-def describe_command() -> str:
-    """The command of this process."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-
-
-def describe(conditions: Conditions) -> dict[str, Any]:
-    """All that rows depend on beside the conditions themselves."""
-    return {
-        "datasets": describe_maps(conditions),
-        "parts": describe_parts(conditions),
-        "code": describe_code(),
-    }
-
-
-def describe_maps(conditions: Conditions) -> dict[str, Any]:
-    """The maps used: by dataset its id and, by split, a digest of each map."""
-    used: dict[str, dict[str, int]] = {}
-    for condition, extent in conditions.values():
-        splits = used.setdefault(condition.data, {})
-        splits[condition.split] = max(extent.maps, splits.get(condition.split, 0))
-    datasets = {data: TerrainDataset(find_dataset(data)) for data in used}
-    return {
-        data: {
-            "id": datasets[data].id,
-            "maps": {split: _map_digests(datasets[data], split, count) for split, count in splits.items()},
-            "about": {split: datasets[data].about_digest(split) for split in splits},
-        }
-        for data, splits in used.items()
-    }
-
-
-def describe_parts(conditions: Conditions) -> dict[str, Any]:
-    """Models by the digests of their files, parts that are not ours by origin and digest, files that options name."""
-    described: dict[str, Any] = {}
-    for condition, _ in conditions.values():
-        for kind in PART_KINDS:
-            part = getattr(condition, kind)
-            name = f"{kind} {part.part}"
-            if kind == "model" and name not in described:
-                described[name] = model_identity(part.part)
-            elif name not in described:
-                found = registry.find(kind, part.part)
-                described[name] = {} if found.shipped else {"origin": found.origin, "digest": found.digest}
-            for text, digest in registry.option_files(kind, part).items():
-                described[f"{text} of {name}"] = {"digest": digest}
-    return {name: identity for name, identity in described.items() if identity}
-
-
-def code_of(about: Mapping[str, Any], condition: Condition) -> dict[str, Any]:
-    """What rows of a condition depend on beside its value and its maps, by what people call it.
-
-    Args:
-        about: the `run.json` of its run.
-        condition: of the run.
-    """
-    used = {
-        f"{kind} {getattr(condition, kind).part}": json.dumps(dict(getattr(condition, kind).options))
-        for kind in PART_KINDS
-    }
-
-    def bears(name: str) -> bool:
-        named = ((name.removesuffix(f" of {owner}"), options) for owner, options in used.items())
-        return name in used or any(text != name and json.dumps(text) in options for text, options in named)
-
-    parts = {name: identity for name, identity in about.get("parts", {}).items() if bears(name)}
-    return _code({**about, "parts": parts})
-
-
-def _code(about: Mapping[str, Any]) -> dict[str, Any]:
-    """All that rows depend on beside conditions and maps."""
-    code = about["code"]
-    return {
-        "benchnav's own sources": {"digest": code["sources"]},
-        **code["versions"],
-        **{name: code[name] for name in ("processor", "compiles")},
-        "planner_limit_s": about["planner_limit_s"],
-        "device": _device(about),
-        **about["parts"],
-    }
-
-
-def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Names what both have and what is not the same, with the values where they are short.
-
-    Args:
-        earlier: from `code_of`.
-        now: as well.
-    """
-    unlike = [name for name, value in earlier.items() if name in now and now[name] != value]
-    return [
-        name if isinstance(now[name], Mapping) else f"{name} ({earlier[name]} to {now[name]})"
-        for name in unlike
-    ]
-
-
-def differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Says what changed between two states of a run that bears on rows; what only one has is no change.
-
-    Args:
-        earlier: the `run.json` of the folder.
-        now: what it would be.
-    """
-    changed = code_differences(_code(earlier), _code(now))
-    for data, about in earlier["datasets"].items():
-        again = now["datasets"].get(data, {"maps": {}})["maps"]
-        for split, digests in about["maps"].items():
-            pairs = zip(digests, again.get(split, digests), strict=False)
-            if any(before != after for before, after in pairs):
-                changed.append(f"maps of {data} {split}")
-        meanings = now["datasets"].get(data, {}).get("about", {})
-        changed += [
-            f"class table, λ_stuck, resolution or kind of truth of {data} {split}"
-            for split, digest in about["about"].items()
-            if meanings.get(split, digest) != digest
-        ]
-    return changed
-
-
-def _device(about: Mapping[str, Any]) -> str:
-    """What a run is computed on."""
-    device: str = about["gpu"] or about["device"]
-    return device
-
-
-def _map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:
-    digests = dataset.entry_digests(split, range(count))
-    return [digest_of([entry.tobytes()])[:16] for entry in digests]
-
-
-def command_lines(earlier: Iterable[str]) -> list[str]:
-    """The commands that made a run, this process's last."""
-    return [*(line for line in earlier if line != describe_command()), describe_command()]

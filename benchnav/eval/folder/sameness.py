@@ -1,6 +1,6 @@
 """Whether two tables of episodes hold the same results, bit for bit.
 
-Columns of wall time, which begin with `planning_`, are no results.
+Columns of wall time, which begin with `planning_`, and the digest of the code are no results.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ def differences(first: pd.DataFrame, second: pd.DataFrame) -> list[Difference]:
 
 
 def _results(rows: pd.DataFrame) -> list[str]:
-    return [name for name in rows.columns if name not in KEYS and not name.startswith(_TIMING)]
+    return [name for name in rows.columns if name not in (*KEYS, "code") and not name.startswith(_TIMING)]
 
 
 def _unlike(one: pd.Series, other: pd.Series) -> np.ndarray:

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.folder import DamageError, damaged, open_run
+from benchnav.eval.folder.folder import DamageError, damaged, metadata, open_run, with_metadata
 
 STEPS = "steps"
 
@@ -30,16 +30,17 @@ _ORDER = ["condition", *_KEYS, "step"]
 _REMEDY = "Remove the steps, which the report can do without, or run it again with another `--out`."
 
 
-def write_steps(folder: Path, unit: Unit, table: pa.Table) -> None:
+def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
     """Writes the steps of a unit, whole or not at all.
 
     Args:
         folder: the run folder.
         unit: what was run.
+        key: of the unit.
         table: from `step_table`.
     """
     with replacing(folder / unit.steps_path) as partial:
-        pq.write_table(table, partial, compression="zstd")
+        pq.write_table(with_metadata(table, {"key": key}), partial, compression="zstd")
 
 
 def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
@@ -66,7 +67,7 @@ def _align(paths: Sequence[Path]) -> None:
         none = pa.array(np.full(len(table), np.nan, np.float32))
         full = {name: table[name] if name in table.column_names else none for name in names}
         with replacing(path) as partial:
-            pq.write_table(pa.table(full), partial, compression="zstd")
+            pq.write_table(with_metadata(pa.table(full), metadata(path)), partial, compression="zstd")
 
 
 def open_steps(folder: Path) -> ds.Dataset | None:
@@ -132,7 +133,7 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     source = open_steps(folder)
     if source is None:
         raise ConfigError(
-            f"Expected a run with steps, got {folder} without any. Make them with `--steps all`."
+            f"Expected a run with steps, got {folder} without any. Make them with `--record steps`."
         )
     unknown = [name for name in wanted if name not in source.schema.names]
     if unknown:

@@ -27,7 +27,7 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         steps were not kept.
     """
     labels = ["planner", "risk", "model", "scenario", "world"]
-    columns = ["condition", *labels, *_KEYS[1:], "outcome", "end_time_s"]
+    columns = ["condition", *labels, *_KEYS[1:], "outcome", "end_time_s", "code"]
     failed = episodes.loc[~episodes["success"].astype(bool), columns]
     ends = _ends(steps_of(folder, list(failed["condition"].unique())))
     return failed.merge(ends, on=_KEYS, how="left").reset_index(drop=True)

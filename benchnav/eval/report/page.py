@@ -1,6 +1,7 @@
 """The report as one HTML page, which needs no other file and no network."""
 
 import base64
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,28 +76,23 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
     Args:
         about: all of `run.json`.
     """
-    code, machine = about["code"], about["machine"]
-    lines = [("run", about["run_id"]), ("sources of benchnav", code["sources"])]
-    lines += [(f"version of {name}", version) for name, version in code["versions"].items()]
-    lines.append(("processor", f"{machine['processor']} {code['processor']}".strip()))
-    lines.append(("cores", str(machine["cores"])))
-    lines.append(("device", f"{about['device']} {about['gpu'] or ''}".strip()))
-    lines.append(("compiler", "yes" if code["compiles"] else "no"))
+    machine, codes = about["machine"], about["codes"]
+    lines = [
+        ("commit of benchnav", about["history"][-1]["commit"]),
+        ("version of benchnav", about["history"][-1]["benchnav"]),
+    ]
+    environments = {json.dumps(code["environment"]): code["environment"] for code in codes.values()}
+    for environment in environments.values():
+        lines += [(name, str(value)) for name, value in environment.items()]
+    lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))
     for data, known in about["datasets"].items():
         maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
-    for part, identity in about["parts"].items():
-        lines.append((part, _identity(identity)))
+    parts = {name: digest for code in codes.values() for name, digest in code["parts"].items()}
+    lines += list(parts.items())
     seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]
-
-
-def _identity(identity: Any) -> str:
-    if not isinstance(identity, Mapping):
-        return str(identity)
-    files = [f"{name} {digest}" for name, digest in identity.get("files", {}).items()]
-    return "; ".join([*files, *(str(identity[key]) for key in ("origin", "digest") if identity.get(key))])
 
 
 def _inline(path: Path) -> str:

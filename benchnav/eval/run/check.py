@@ -1,9 +1,13 @@
-"""What is refused, and what a user is told, before anything of a suite is run or dropped."""
+"""Before a run: every condition is built on one map, so that what cannot be run is refused before anything is.
 
-from collections.abc import Iterable
+Nothing is predicted and nothing is planned, but a planner prepares itself on a tiny map of its own.
+"""
+
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from benchnav.core import registry
@@ -16,12 +20,16 @@ from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, conditions_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.experiment.unit import Extent
-from benchnav.eval.run.check_world import check_budgets, check_draws, check_known_ground
+from benchnav.eval.experiment.unit import BLOCK_MAPS, Extent
+from benchnav.eval.run.unit import noise_key, read_maps
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint, predict
+from benchnav.models.predictor import PRIVILEGED, class_mismatch, find_checkpoint
 from benchnav.planning.planners.planner import check_steers
-from benchnav.planning.problem import pose_problem
+from benchnav.planning.problem import Task, pose_problem
+from benchnav.planning.world.realisation import check_known
+from benchnav.planning.world.simulation import Simulation
+
+Say = Callable[[str], None]
 
 _MEMBERS = {
     "planner": ("init", "plan"),
@@ -66,7 +74,6 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         ConfigError: a part, scenario, map or combination cannot be had, or no planner can steer any robot.
         DatasetError: there is no such dataset.
     """
-    warnings: list[str] = []
     datasets: dict[str, TerrainDataset] = {}
 
     def scenarios_of(data: str) -> list[str]:
@@ -81,68 +88,77 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         )
     for condition in conditions:
         _check_split(condition, scenarios_of(condition.data), datasets[condition.data], suite.maps)
-    for condition in _distinct(conditions, ("planner", "robot", "objective")):
-        _check_members(condition)
     conditions, dropped = _steered(conditions)
-    for condition in _distinct(conditions, ("planner", "robot", "objective")):
-        _check_first_plan(condition)
-    check_budgets(conditions, datasets, suite.maps, warnings.append)
-    check_known_ground(conditions, datasets, suite.maps)
-    check_draws(conditions, datasets, suite)
-    _check_single_class(conditions, datasets)
     if elsewhere:
         check_everywhere(conditions)
-    for condition in _distinct(conditions, ("model",)):
-        model = _class_table(condition)
-        for data in {
-            other.data for other in conditions if other.model == condition.model and not other.blind
-        }:
-            warnings += filter(
-                None, [class_mismatch(model, datasets[data], f"model {condition.model.label}")]
-            )
-    warnings += [line for condition in conditions for line in _doubts(condition, datasets[condition.data])]
+    builder = Builder(datasets, suite.all_seeds[0], suite.maps)
+    for condition in conditions:
+        builder.build(condition)
+    doubts = [line for condition in conditions for line in _doubts(condition, datasets[condition.data])]
     wanted = {}
     for condition in conditions:
-        there = datasets[condition.data].map_count(condition.split)
-        extent = Extent.product(suite.all_seeds, suite.realisations, suite.maps or there)
+        count = datasets[condition.data].map_count(condition.split)
+        extent = Extent.product(suite.all_seeds, suite.realisations, suite.maps or count)
         wanted[condition.id] = (condition, extent)
     return Checked(
         conditions=wanted,
         dropped=tuple(dropped),
-        warnings=tuple(dict.fromkeys(warnings)),
+        warnings=tuple(dict.fromkeys([*builder.warnings, *doubts])),
         hypotheses=fix_hypotheses(
             suite.hypotheses,
             {i: condition for i, (condition, _) in wanted.items()},
-            {i: sum(count for _, _, count in extent.draws) for i, (_, extent) in wanted.items()},
+            {i: extent.episodes for i, (_, extent) in wanted.items()},
         ),
     )
 
 
-def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[str, str]]]:
-    """The conditions in which the planner can steer the robot, and the pairs in which it cannot."""
-    unfit: dict[str, dict[str, str]] = {}
-    for condition in _distinct(conditions, ("planner", "robot")):
-        planner, robot = condition.planner.label, condition.robot.label
-        try:
-            check_steers(condition.make_planner(), condition.make_task().robot, planner)
-        except ConfigError as error:
-            unfit[_pair(condition)] = {"planner": planner, "robot": robot, "reason": str(error)}
-    left = [condition for condition in conditions if _pair(condition) not in unfit]
-    if not left:
-        raise ConfigError(next(iter(unfit.values()))["reason"])
-    return left, list(unfit.values())
+class Builder:
+    """Builds conditions on the first map of their splits; what is the same in several is built once.
 
+    Args:
+        datasets: those that are open, by path or id.
+        seed: root seed of the draw of λ.
+        maps: of each split; 0 for all.
 
-def _pair(condition: Condition) -> str:
-    return repr([condition.planner, condition.robot])
+    Attributes:
+        warnings: what readers of the results should know.
+    """
 
+    def __init__(self, datasets: dict[str, TerrainDataset], seed: int, maps: int) -> None:
+        """Has built nothing yet."""
+        self.datasets, self.seed, self.maps = datasets, seed, maps
+        self.warnings: list[str] = []
+        self._seen: set[str] = set()
 
-def _class_table(condition: Condition) -> Any:
-    """What knows the class table of a condition's model, which is thereby tried: its checkpoint where it has one."""
-    model = condition.make_model()
-    if ":" in condition.model.part or condition.model.part in registry.names("model"):
-        return model
-    return load_checkpoint(find_checkpoint(condition.model.part))
+    def build(self, condition: Condition) -> None:
+        """Builds a condition.
+
+        Raises:
+            BenchnavError: it cannot be run.
+        """
+        if condition.data not in self.datasets:
+            self.datasets[condition.data] = TerrainDataset(find_dataset(condition.data))
+        dataset, task = self.datasets[condition.data], condition.make_task()
+        if self._is_new("planner", condition.planner, condition.robot, condition.objective):
+            _check_planner(condition, task)
+        place = condition.data, condition.split
+        if self._is_new("ground", *place, condition.world.noise):
+            _check_known_ground(condition, dataset, self.maps)
+        if self._is_new("world", *place, condition.world, condition.rules, condition.robot):
+            first = read_maps(dataset, condition.split, [0])
+            noise = noise_key(self.seed, condition.split, 0)
+            Simulation(first.terrain, task, condition.world, first.places, noise, [0])
+            self.warnings += _late(condition, task, dataset, self.maps)
+        if not condition.blind and self._is_new(
+            "model", condition.model, condition.data, condition.risk.part
+        ):
+            self.warnings += _check_model(condition, dataset)
+
+    def _is_new(self, *parts: Any) -> bool:
+        key = repr(parts)
+        new = key not in self._seen
+        self._seen.add(key)
+        return new
 
 
 def _check_split(condition: Condition, known: list[str], dataset: TerrainDataset, maps: int) -> None:
@@ -169,22 +185,27 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     return f" All maps of {dataset.id} are made with `benchnav-datagen create {dataset.id}`."
 
 
-def _check_single_class(conditions: list[Condition], datasets: dict[str, TerrainDataset]) -> None:
-    """Refuses the single-class option of a model whose components are no classes, by its first prediction."""
-    for condition in _distinct(conditions, ("model", "risk")):
-        if condition.risk.part != "single-class" or condition.blind:
-            continue
+def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[str, str]]]:
+    """The conditions in which the planner can steer the robot, and the pairs in which it cannot."""
+    unfit: dict[str, dict[str, str]] = {}
+    pairs = {repr([condition.planner, condition.robot]): condition for condition in conditions}
+    for pair, condition in pairs.items():
+        planner, robot = condition.planner.label, condition.robot.label
+        task, made = condition.make_task(), condition.make_planner()
+        _check_members(condition, made, task)
         try:
-            mixture = predict(condition.make_model(), datasets[condition.data].terrain(condition.split, [0]))
-        except (Exception, SystemExit):
-            continue  # a model that fails is its episodes' own matter
-        condition.make_risk()(mixture)
+            check_steers(made, task.robot, planner)
+        except ConfigError as error:
+            unfit[pair] = {"planner": planner, "robot": robot, "reason": str(error)}
+    left = [one for one in conditions if repr([one.planner, one.robot]) not in unfit]
+    if not left:
+        raise ConfigError(next(iter(unfit.values()))["reason"])
+    return left, list(unfit.values())
 
 
-def _check_members(condition: Condition) -> None:
+def _check_members(condition: Condition, planner: Any, task: Task) -> None:
     """Refuses a part that stands in the place of another kind."""
-    task = condition.make_task()
-    made = {"planner": condition.make_planner(), "robot": task.robot, "objective": task.objective}
+    made = {"planner": planner, "robot": task.robot, "objective": task.objective}
     for kind, names in _MEMBERS.items():
         missing = [name for name in names if not hasattr(made[kind], name)]
         if missing:
@@ -194,7 +215,7 @@ def _check_members(condition: Condition) -> None:
             )
 
 
-def _check_first_plan(condition: Condition) -> None:
+def _check_planner(condition: Condition, task: Task) -> None:
     """Lets a shipped planner refuse what only its preparation can tell, such as its bounds."""
     if not registry.find("planner", condition.planner.part).shipped:
         return
@@ -204,7 +225,7 @@ def _check_first_plan(condition: Condition) -> None:
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
     places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
     try:
-        problem = pose_problem(condition.make_task(), seen, mixture, ground, *places, 1.0)
+        problem = pose_problem(task, seen, mixture, ground, *places, 1.0)
         condition.make_planner().init(problem, torch.Generator())
     except BenchnavError:
         raise
@@ -213,6 +234,47 @@ def _check_first_plan(condition: Condition) -> None:
             f"Planner {condition.planner.label!r} cannot be prepared for robot {condition.robot.label!r} and objective "
             f"{condition.objective.label!r}: {one_line(error)}"
         ) from error
+
+
+def _check_known_ground(condition: Condition, dataset: TerrainDataset, maps: int) -> None:
+    """Refuses maps with cells whose λ a world cannot tell, which only maps that were imported have."""
+    if not any("source" in part for part in dataset.splits[condition.split]["parts"]):
+        return
+    chosen = range(maps or dataset.map_count(condition.split))
+    for start in chosen[::BLOCK_MAPS]:
+        check_known(dataset.terrain(condition.split, chosen[start : start + BLOCK_MAPS]), condition.world)
+
+
+def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) -> list[str]:
+    """Tells of goals that top speed does not reach within T; refuses a T without a step."""
+    chosen = range(maps or dataset.map_count(condition.split))
+    read = dataset.read(condition.split, chosen, ["start_m", "goal_m", "reference_time_s"])
+    top_speed = task.robot.top_speed_mps
+    budget = condition.world.budget_s(torch.from_numpy(read["reference_time_s"]), top_speed)
+    condition.world.steps(budget, task.robot.dt_s)
+    way = np.linalg.norm(read["goal_m"] - read["start_m"], axis=1) - task.rules.goal_radius_m
+    late = way / top_speed > budget.numpy()
+    if not late.any():
+        return []
+    return [
+        f"in {late.sum()} of {len(late)} maps of {condition.split} a robot of {top_speed:g} m/s cannot reach the goal "
+        "within T"
+    ]
+
+
+def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
+    """Loads the model, which may refuse; tells of another class table, and refuses single-class where it has none."""
+    part, model = condition.model.part, condition.make_model()
+    knows_classes = bool(getattr(model, "class_names", ())) or isinstance(model, PRIVILEGED)
+    if condition.risk.part == "single-class" and not knows_classes:
+        raise ConfigError(
+            f"Expected a model that tells classes for the risk setting 'single-class', got {condition.model.label!r}, "
+            "which has no `class_names`."
+        )
+    if ":" not in part and part not in registry.names("model"):
+        model = load_checkpoint(find_checkpoint(part))  # which has a class table in any case
+    line = class_mismatch(model, dataset, f"model {condition.model.label}")
+    return [line] if line else []
 
 
 def check_everywhere(conditions: Iterable[Condition]) -> None:
@@ -248,10 +310,3 @@ def _doubts(condition: Condition, dataset: TerrainDataset) -> list[str]:
             "a failure may be the map's"
         )
     return lines
-
-
-def _distinct(conditions: list[Condition], kinds: tuple[str, ...]) -> list[Condition]:
-    found: dict[str, Condition] = {}
-    for condition in conditions:
-        found.setdefault(repr([getattr(condition, kind) for kind in kinds]), condition)
-    return list(found.values())

@@ -8,7 +8,7 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.folder.steps import open_steps
 from benchnav.eval.report.charts.driven import GROUND, MAP, DrivenGround, telling_map
-from benchnav.eval.run.episode import noise_key, read_maps
+from benchnav.eval.run.unit import noise_key, read_maps
 from benchnav.planning.world.simulation import Simulation
 
 

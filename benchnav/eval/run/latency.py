@@ -5,7 +5,8 @@ prepares and perhaps compiles, and is not counted; each later one is, with whate
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ import torch
 
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Extent, Unit
-from benchnav.eval.run.episode import build, one_thread, simulate
+from benchnav.eval.folder.folder import open_run, write_run
+from benchnav.eval.run.unit import Settings, build, one_thread, simulate
 
 _MOST_STEPS = 100
 _MOST_S = 3.0
@@ -21,35 +23,34 @@ _MOST_S = 3.0
 _FACTORS = ("planner", "robot", "objective")
 
 
-def measure_latencies(
-    conditions: Mapping[str, tuple[Condition, Extent]],
-    known: Mapping[str, Mapping[str, Any]],
-    run_id: str,
-    planner_limit_s: float,
-    device: str,
-) -> dict[str, dict[str, Any]]:
-    """Measures what was not measured.
+def measure_latencies(folder: Path, chosen: Collection[str], settings: Settings) -> None:
+    """Measures the planners of some conditions and writes it into `run.json`, where it is not there yet.
+
+    What is written by condition: `median_ms`, `p95_ms` and `max_ms` over `steps` steps. Conditions of one planner,
+    robot and objective share one measurement, on the first map of the first of them. A planner that fails has none.
 
     Args:
-        conditions: by id.
-        known: latencies by condition, as this gives them.
-        run_id: predictions are kept for one run alone.
-        planner_limit_s: time limit of each call of a planner; 0 for none.
-        device: where all is computed.
-
-    Returns:
-        By condition, of those that were measured: `median_ms`, `p95_ms` and `max_ms` over `steps` steps. Conditions of
-        one planner, robot and objective share one measurement, on the first map of the first of them. A planner that
-        fails has none.
+        folder: the run folder.
+        chosen: ids of the conditions.
+        settings: how planners are run.
     """
-    found: dict[str, Any] = {_key(conditions[i][0]): about for i, about in known.items() if i in conditions}
-    for condition, extent in conditions.values():
+    run = open_run(folder)
+    entries = run.about["conditions"]
+    found: dict[str, dict[str, Any] | None] = {}
+    for condition_id in chosen:
+        if "latency" in entries[condition_id]:
+            found[_key(run.conditions[condition_id][0])] = entries[condition_id]["latency"]
+    changed = False
+    for condition_id, (condition, extent) in run.conditions.items():
+        if condition_id not in chosen or "latency" in entries[condition_id]:
+            continue
         if _key(condition) not in found:
-            found[_key(condition)] = _measure(
-                condition, extent, run_id, planner_limit_s, torch.device(device)
-            )
-    every = {condition_id: found[_key(condition)] for condition_id, (condition, _) in conditions.items()}
-    return {condition_id: about for condition_id, about in every.items() if about}
+            found[_key(condition)] = _measure(condition, extent, settings)
+        if latency := found[_key(condition)]:
+            entries[condition_id]["latency"] = latency
+            changed = True
+    if changed:
+        write_run(folder, run.about)
 
 
 def _key(condition: Condition) -> str:
@@ -57,9 +58,7 @@ def _key(condition: Condition) -> str:
     return repr([value[name] for name in _FACTORS])
 
 
-def _measure(
-    condition: Condition, extent: Extent, run_id: str, planner_limit_s: float, device: torch.device
-) -> dict[str, Any] | None:
+def _measure(condition: Condition, extent: Extent, settings: Settings) -> dict[str, Any] | None:
     seed, realisation, _ = extent.draws[0]
     unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=(0,))
     warm: list[float] = []
@@ -71,8 +70,8 @@ def _measure(
 
     with one_thread():
         try:
-            problem, simulation = build(unit, run_id, device)
-            episodes, _ = simulate(unit, problem, simulation, None, 1, planner_limit_s, enough=enough)
+            problem, simulation = build(unit, settings.origins().of(unit), torch.device(settings.device))
+            episodes, _ = simulate(unit, problem, simulation, settings, enough=enough)
         except Exception:  # what failed has failed its episodes too, which say how
             return None
     counted = 1e3 * episodes.planning_s[1:].numpy()

@@ -1,22 +1,24 @@
-"""Merging the shards of a run into one run folder, which then is as any: reported, resumed, extended."""
+"""Merging the shards of a run into one run folder, which then is as any: reported, resumed, extended.
 
-import os
-import secrets
+Units are files that are known by what made them, so that merging is copying them together and checking.
+"""
+
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.store import Shard, replacing, sole_writer
-from benchnav.eval.experiment.keep import Keep
+from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_place
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import (
     RUN,
+    Finished,
     Run,
-    about_unit,
-    copy_unit,
+    find_units,
     finish_run,
     open_run,
     unit_rows,
@@ -26,7 +28,7 @@ from benchnav.eval.folder.sameness import differences
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.run.driven_ground import keep_ground
 
-_NOT_OF_UNITS = ("units", "figures")
+_COPIED = ("units", "steps", "playback")
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:
@@ -42,50 +44,38 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         ConfigError: a part is no shard, the parts are not of one run, or units are missing; nothing is written.
     """
     with sole_writer(folder, str(folder)):
-        _check_new(folder)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ConfigError(
+                f"Expected `out` to be a new folder, got {folder}, which is there. Write `benchnav-eval merge OUT PART "
+                "…`, with the new folder first."
+            )
         runs = [_open_shard(part) for part in parts]
         of = _check_alike(runs)
-        conditions = runs[0].conditions
-        # What is recorded is in the folders of the shards already.
-        every = in_table_order(units(conditions, Keep()), conditions)
+        every = in_table_order(units(runs[0].conditions), runs[0].conditions)
         found = [(unit, _find(unit, runs)) for unit in every]
-        _check_whole([unit for unit, run in found if run is None], runs, of)
+        _check_whole([unit for unit, finished in found if finished is None], runs, of)
+        _check_one_code([finished for _, finished in found if finished is not None])
         target = folder.resolve()
-        partial = target.with_name(f".{target.name}.partial")
-        if partial.exists():
-            shutil.rmtree(partial)
-        about = _about(runs)
-        write_run(partial, about)
+        partial = new_folder(target)
+        write_run(partial, _about(runs))
         yield 0, len(every)
-        for done, (unit, run) in enumerate(found, start=1):
-            assert run is not None
-            copy_unit(run.folder, unit, partial, about["run_id"])
+        for done, (unit, finished) in enumerate(found, start=1):
+            if finished is not None:
+                _copy(finished.path, partial / "units" / unit.condition.id / finished.path.name)
             yield done, len(every)
         for run in runs:
-            _copy_rest(run.folder, partial)
+            for path in sorted(path for kind in _COPIED[1:] for path in (run.folder / kind).rglob("*")):
+                if path.is_file() and not path.name.startswith("."):
+                    _copy(path, partial / path.relative_to(run.folder))
         align_steps(partial, every)
-        finish_run(partial, every)
+        finish_run(partial, [(unit, find_units(partial, unit)[0]) for unit in every])
         keep_ground(partial)
-        _take_place(partial, target)
+        take_place(partial, target, last=RUN)
 
 
-def _take_place(partial: Path, target: Path) -> None:
-    """Gives a whole run its name; an empty folder that is there is filled, since it may be the one the user is in."""
-    if not target.exists():
-        os.replace(partial, target)
-        return
-    # `run.json` last, which makes it a run.
-    for path in sorted(partial.iterdir(), key=lambda path: path.name == RUN):
-        os.replace(path, target / path.name)
-    partial.rmdir()
-
-
-def _check_new(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(
-            f"Expected `out` to be a new folder, got {folder}, which is there. Write `benchnav-eval merge OUT PART "
-            "…`, with the new folder first."
-        )
+def _copy(source: Path, target: Path) -> None:
+    with replacing(target) as partial:
+        shutil.copyfile(source, partial)
 
 
 def _open_shard(part: Path) -> Run:
@@ -105,7 +95,8 @@ def _check_alike(runs: Sequence[Run]) -> int:
     first = runs[0]
     reasons = []
     for run in runs[1:]:
-        unlike = _unlike_conditions(first, run) + provenance.differences(first.about, run.about)
+        unlike = _unlike_conditions(first, run)
+        unlike += provenance.dataset_differences(first.about["datasets"], run.about["datasets"])
         if run.about.get("hypotheses") != first.about.get("hypotheses"):
             unlike.append("hypotheses")
         if _shard(run).of != _shard(first).of:
@@ -118,6 +109,17 @@ def _check_alike(runs: Sequence[Run]) -> int:
             f"{'. '.join(reasons)}. Give one command, of one code and data, for each of the shards."
         )
     return _shard(first).of
+
+
+def _check_one_code(finished: Sequence[Finished]) -> None:
+    """Refuses units of one run that different code has made, but for what was taken as such."""
+    for earlier, now in pairwise(finished):
+        changed = provenance.code_differences(earlier.about["code"], now.about["code"])
+        if changed:
+            raise ConfigError(
+                f"Expected shards that one code has made, but {earlier.path} and {now.path} differ in "
+                f"{'; '.join(changed)}. Give the commands of the shards again, by one code."
+            )
 
 
 def _unlike_conditions(first: Run, other: Run) -> list[str]:
@@ -142,26 +144,23 @@ def _name(condition: Any) -> str:
     return " ".join(condition.labels[name] for name in ("scenario", "world", "planner", "model", "risk"))
 
 
-def _find(unit: Unit, runs: Sequence[Run]) -> Run | None:
-    """Tells which run has finished a unit; refuses one that came out differently in two."""
-    holders = [run for run in runs if about_unit(run.folder, unit, run.about["run_id"]) is not None]
-    for other in holders[1:]:
-        if differences(unit_rows(holders[0].folder, unit), unit_rows(other.folder, unit)):
+def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
+    """A finished unit of some runs, the newest of each; refuses one that came out differently in two."""
+    found = [makings[0] for run in runs if (makings := find_units(run.folder, unit))]
+    for other in found[1:]:
+        if differences(unit_rows(found[0]), unit_rows(other)):
             raise ConfigError(
-                f"Expected the same rows wherever a unit is, but {unit.path} ({_name(unit.condition)}) differs between "
-                f"{holders[0].folder} and {other.folder}. Leave one of them out."
+                f"Expected the same rows wherever a unit is, but {unit.name} ({_name(unit.condition)}) differs between "
+                f"{found[0].path} and {other.path}. Leave one of them out."
             )
-    return holders[0] if holders else None
+    return found[0] if found else None
 
 
 def _check_whole(missing: Sequence[Unit], runs: Sequence[Run], of: int) -> None:
     """Refuses a run that is not whole, and says which shards are to be run."""
     if not missing:
         return
-    counts: dict[int, int] = {}
-    for unit in missing:
-        index = unit.share(of).index
-        counts[index] = counts.get(index, 0) + 1
+    counts = Counter(unit.shard(of).index for unit in missing)
     folders = {_shard(run).index: run.folder for run in runs}
     named = []
     for index, count in sorted(counts.items()):
@@ -187,18 +186,7 @@ def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     }
     commands = provenance.command_lines(provenance.join(*(run.about["commands"] for run in runs)))
     history = provenance.extend_history(joined["history"], about["suite"])
-    given = {"run_id": secrets.token_hex(8), "conditions": conditions, "commands": commands}
-    return {**about, **given, **joined, "history": history}
-
-
-def _copy_rest(part: Path, folder: Path) -> None:
-    """Copies what units wrote beside their rows, such as recordings."""
-    for path in sorted(part.glob("*/**/*")):
-        place = path.relative_to(part)
-        hidden = any(name.startswith(".") for name in place.parts)
-        if path.is_file() and not hidden and place.parts[0] not in _NOT_OF_UNITS:
-            with replacing(folder / place) as partial:
-                shutil.copyfile(path, partial)
+    return {**about, **joined, "conditions": conditions, "commands": commands, "history": history}
 
 
 def _shard(run: Run) -> Shard:

@@ -4,28 +4,28 @@ What is repeated are the conditions of `run.json`, each as often as it was run, 
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from benchnav.core import registry
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.store import sole_writer
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.experiment.condition import PART_KINDS, Condition
-from benchnav.eval.experiment.keep import Keep
-from benchnav.eval.experiment.unit import units
+from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import EPISODES, RUN, Run, making, open_run, read_table
+from benchnav.eval.folder.folder import EPISODES, RUN, Run, find_units, open_run, read_table
 from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
-from benchnav.eval.run.check import check_everywhere
-from benchnav.eval.run.check_world import Say
-from benchnav.eval.run.runner import Work, Workers, run_work
+from benchnav.eval.run.begin import Work
+from benchnav.eval.run.check import Builder, Say, check_everywhere
+from benchnav.eval.run.runner import run_work
+from benchnav.eval.run.unit import Settings
 
 _SHOWN = 5
 
@@ -53,14 +53,20 @@ class Comparison:
 
 
 def rerun(
-    run_folder: Path, folder: Path, workers: Workers, overwrite: bool = False, say: Say = lambda line: None
+    run_folder: Path,
+    folder: Path,
+    jobs: int = 1,
+    scheduler: str = "",
+    overwrite: bool = False,
+    say: Say = lambda line: None,
 ) -> Iterator[tuple[int, int]]:
     """Runs all of a finished run again, yielding (units done, units in all); to be iterated to the end.
 
     Args:
         run_folder: what is repeated.
         folder: where to; a rerun that is there is gone on with.
-        workers: who runs the units.
+        jobs: worker processes.
+        scheduler: address of a Dask cluster's scheduler, whose workers are used in place of `jobs`.
         overwrite: drop the run that is there.
         say: is told what a user should know, a line at a time.
 
@@ -72,13 +78,14 @@ def rerun(
         raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
     if not overwrite:
         _check_no_copy(run, folder)
+    settings = Settings(planner_limit_s=run.about["planner_limit_s"], device=device_of_run(run.about).type)
     _check_there(run)
     if not overwrite and (folder / RUN).exists() and set(open_run(folder).conditions) != set(run.conditions):
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run_folder}, but {folder} has other conditions. Choose "
             "another `out`."
         )
-    if workers.elsewhere or run.about["planner_limit_s"]:
+    if jobs > 1 or scheduler or settings.planner_limit_s:
         check_everywhere(condition for condition, _ in run.conditions.values())
     work = Work(
         suite=run.about["suite"],
@@ -86,12 +93,11 @@ def rerun(
         dropped=tuple(run.about["dropped"]),
         warnings=tuple(run.about["warnings"]),
         hypotheses=run.about.get("hypotheses", {}),
-        keep=Keep(),
-        planner_limit_s=run.about["planner_limit_s"],
-        device=device_of_run(run.about).type,
+        record="none",
+        settings=settings,
     )
     with sole_writer(folder, str(folder)):
-        yield from run_work(work, folder, workers, overwrite, say)
+        yield from run_work(work, folder, jobs, scheduler, overwrite, say)
 
 
 def compare(run_folder: Path, folder: Path) -> Comparison:
@@ -124,9 +130,8 @@ def _open(folder: Path) -> Run:
 
 def _check_no_copy(run: Run, folder: Path) -> None:
     """Refuses a folder with units that were copied from the run: to compare a run with itself certifies nothing."""
-    every = units(run.conditions, Keep()) if folder.is_dir() else []
-    made = [(making(run.folder, unit), making(folder, unit)) for unit in every]
-    copied = sum(one is not None and one == other for one, other in made)
+    every = units(run.conditions) if folder.is_dir() else []
+    copied = sum(bool(_makings(run.folder, unit) & _makings(folder, unit)) for unit in every)
     if copied:
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, but {copied} of the {len(every)} units in "
@@ -134,37 +139,33 @@ def _check_no_copy(run: Run, folder: Path) -> None:
         )
 
 
+def _makings(folder: Path, unit: Unit) -> set[str]:
+    """Tokens of all makings of a unit, which copies of it share."""
+    return {finished.about["made"] for finished in find_units(folder, unit)}
+
+
 def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
-    lacking: dict[str, str] = {}
+    lacking: dict[str, None] = {}
+    builder = Builder({}, seed=0, maps=1)
     for condition, extent in run.conditions.values():
-        for name, find in _needs(condition, extent.maps).items():
-            if name in lacking:
-                continue
+        for check in (partial(_check_maps, extent.maps), provenance.describe_parts):
             try:
-                find()
+                check(condition)
             except BenchnavError as error:
-                lacking[name] = str(error)
+                lacking[str(error)] = None
+        if not lacking:
+            builder.build(condition)
     if lacking:
-        told = " ".join(f"{name}: {reason}" for name, reason in lacking.items())
-        raise ConfigError(f"{run.folder} cannot be repeated here, since something is no longer there. {told}")
+        raise ConfigError(
+            f"{run.folder} cannot be repeated here, since something is no longer there. {' '.join(lacking)}"
+        )
 
 
-def _needs(condition: Condition, maps: int) -> Mapping[str, Callable[[], Any]]:
-    """What a condition needs, by name, each as a call that fails where it is not there."""
-
-    def splits() -> None:
-        dataset = TerrainDataset(find_dataset(condition.data))
-        there = dataset.map_count(condition.split)
-        if there < maps:
-            raise ConfigError(f"Expected {maps} maps, got {there}.")
-
-    def part(kind: str) -> Callable[[], Any]:
-        return lambda: registry.find(kind, getattr(condition, kind).part)
-
-    kinds = {f"{kind} {getattr(condition, kind).part}": part(kind) for kind in PART_KINDS if kind != "model"}
-    models = {} if condition.blind else {f"model {condition.model.part}": condition.make_model}
-    return {f"maps of {condition.data} {condition.split}": splits, **models, **kinds}
+def _check_maps(maps: int, condition: Condition) -> None:
+    count = TerrainDataset(find_dataset(condition.data)).map_count(condition.split)
+    if count < maps:
+        raise ConfigError(f"Expected {maps} maps of {condition.data} {condition.split}, got {count}.")
 
 
 def _verdict(conditions: Mapping[str, Condition], rows: int, different: list[Difference]) -> list[str]:
@@ -212,7 +213,10 @@ def _greatest(different: list[Difference]) -> list[str]:
 
 
 def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    changed = provenance.differences(before, now)
+    """What differs between what two runs were made by, in words."""
+    codes = zip(before["codes"].values(), now["codes"].values(), strict=False)
+    changed = [line for pair in codes for line in provenance.code_differences(*pair)]
+    changed += provenance.dataset_differences(before["datasets"], now["datasets"])
     machines = [
         f"{about['machine']['processor']}, {about['machine']['cores']} cores" for about in (before, now)
     ]
@@ -220,4 +224,4 @@ def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
         changed.append(f"machine ({machines[0]} to {machines[1]})")
     if not changed:
         return ["nothing that is known of the environment differs"]
-    return [f"what differs in the environment: {'; '.join(changed)}"]
+    return [f"what differs in the environment: {'; '.join(dict.fromkeys(changed))}"]

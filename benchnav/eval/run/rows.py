@@ -18,9 +18,17 @@ from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.outcome import Outcome
 
+# Columns of an episode's results, in the order of tables.
+_RESULTS = (
+    *("outcome", "success", "total_time_s", "end_time_s", "traversability", "reference_time_s", "time_ratio"),
+    *("score", "path_length_m", "stuck_share", "roughness_radps2", "planning_ms", "planning_ms_p95"),
+    *("planning_start_ms", "rejected_draws", "compiled", "error"),
+)
+
 
 def episode_rows(
     unit: Unit,
+    groups: np.ndarray,
     problem: Problem,
     episodes: Episodes,
     reference_time_s: np.ndarray,
@@ -31,6 +39,7 @@ def episode_rows(
 
     Args:
         unit: what was run.
+        groups: which maps go together, shape [B].
         problem: what was to be solved.
         episodes: what happened.
         reference_time_s: grid reference times at 1 m/s, shape [B]; NaN where there is none.
@@ -39,7 +48,7 @@ def episode_rows(
         compiled: the planner ran compiled.
 
     Returns:
-        The condition's id and labels, `seed`, `realisation`, `map`; `outcome`, `success`; `total_time_s`,
+        The condition's id and labels, `seed`, `realisation`, `map`, `group`; `outcome`, `success`; `total_time_s`,
         where a failure counts as the whole time budget; `end_time_s`, when the episode ended;
         `traversability`, the mean of the observed λ; `reference_time_s`; `time_ratio`, over the reference time at
         the robot's top speed, NaN for failures; `score`, BARN's, 0 for failures; `path_length_m`;
@@ -48,14 +57,7 @@ def episode_rows(
         What an episode that ended at once does not have is NaN.
     """
     top_speed, rows = problem.robot.top_speed_mps, []
-    condition = unit.condition
-    named = {
-        "condition": condition.id,
-        **condition.labels,
-        "seed": unit.seed,
-        "realisation": unit.realisation,
-    }
-    for b, map_index in enumerate(unit.maps):
+    for b in range(len(unit.maps)):
         steps = int(episodes.steps[b])
         outcome = Outcome(int(episodes.outcome[b]))
         met = episodes.traversability[b, :steps].double().numpy()
@@ -68,8 +70,7 @@ def episode_rows(
         reference = float(reference_time_s[b]) / top_speed
         rows.append(
             {
-                **named,
-                "map": map_index,
+                **_named(unit, groups, b),
                 "outcome": outcome.name.lower(),
                 "success": success,
                 "total_time_s": end_time_s if success else float(problem.time_budget_s[b]),
@@ -90,36 +91,28 @@ def episode_rows(
     return pd.DataFrame(rows)
 
 
-def error_rows(unit: Unit, time_budget_s: Tensor, error: str) -> pd.DataFrame:
+def error_rows(unit: Unit, groups: np.ndarray, time_budget_s: Tensor, error: str) -> pd.DataFrame:
     """Rows of episodes that could not begin, since their model or risk measure failed; T of shape [B]."""
+    failed = dict.fromkeys(_RESULTS, np.nan) | {
+        **{"outcome": Outcome.MODEL_ERROR.name.lower(), "success": False, "end_time_s": 0.0, "score": 0.0},
+        **{"rejected_draws": 0, "compiled": False, "error": error},
+    }
     rows = [
-        {
-            "condition": unit.condition.id,
-            **unit.condition.labels,
-            "seed": unit.seed,
-            "realisation": unit.realisation,
-            "map": map_index,
-            "outcome": Outcome.MODEL_ERROR.name.lower(),
-            "success": False,
-            "total_time_s": budget,
-            "end_time_s": 0.0,
-            "traversability": np.nan,
-            "reference_time_s": np.nan,
-            "time_ratio": np.nan,
-            "score": 0.0,
-            "path_length_m": np.nan,
-            "stuck_share": np.nan,
-            "roughness_radps2": np.nan,
-            "planning_ms": np.nan,
-            "planning_ms_p95": np.nan,
-            "planning_start_ms": np.nan,
-            "rejected_draws": 0,
-            "compiled": False,
-            "error": error,
-        }
-        for map_index, budget in zip(unit.maps, time_budget_s.tolist(), strict=True)
+        {**_named(unit, groups, b), **failed, "total_time_s": budget}
+        for b, budget in enumerate(time_budget_s.tolist())
     ]
     return pd.DataFrame(rows)
+
+
+def _named(unit: Unit, groups: np.ndarray, member: int) -> dict[str, Any]:
+    """What an episode is known by."""
+    condition = unit.condition
+    return {
+        "condition": condition.id,
+        **condition.labels,
+        **{"seed": unit.seed, "realisation": unit.realisation},
+        **{"map": unit.maps[member], "group": groups[member]},
+    }
 
 
 def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
@@ -159,26 +152,25 @@ def score(time_s: float, reference_s: float) -> float:
     return least / min(max(time_s, 2 * least), 8 * least)
 
 
-def step_table(unit: Unit, problem: Problem, episodes: Episodes, members: Sequence[int]) -> pa.Table:
+def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
     """Tabulates driven paths, a row a state: one a step and one for the last state.
 
     Args:
         unit: what was run.
         problem: what was to be solved.
         episodes: what happened.
-        members: which of the unit's episodes.
 
     Returns:
         `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
         name, and `traversability` as met; actions and `traversability` are NaN at the last state.
     """
-    counts = [int(episodes.steps[member]) + 1 for member in members]
+    counts = [int(steps) + 1 for steps in episodes.steps]
     step = np.concatenate([np.arange(count) for count in counts])
 
     def stacked(values: Any, extra: bool) -> np.ndarray:
         """One value a row; NaN at the last state of each episode where it has none."""
         rows = []
-        for member, count in zip(members, counts, strict=True):
+        for member, count in enumerate(counts):
             own = values[member, : count if extra else count - 1].numpy().astype(np.float32)
             rows.append(own if extra else np.append(own, np.float32(np.nan)))
         return np.concatenate(rows)
@@ -186,7 +178,7 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes, members: Sequen
     columns: dict[str, Any] = {
         "seed": np.full(len(step), unit.seed),
         "realisation": np.full(len(step), unit.realisation, np.int32),
-        "map": np.repeat(np.array(unit.maps, np.int32)[list(members)], counts),
+        "map": np.repeat(np.array(unit.maps, np.int32), counts),
         "step": step.astype(np.int32),
         "time_s": step * problem.dt_s,
     }

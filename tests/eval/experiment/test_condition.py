@@ -200,7 +200,6 @@ def test_a_suite_refuses_what_means_nothing() -> None:
         {"maps": -1},
         {"seeds": (1, 1)},
         {"record": "sometimes"},
-        {"steps": "first"},
     ):
         with pytest.raises(ConfigError):
             replace(Suite(), **bad)

@@ -9,7 +9,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import EPISODES, SEAL, open_run, read_table
+from benchnav.eval.folder.folder import EPISODES, open_run, read_table
 from benchnav.eval.run.runner import run_suite
 
 
@@ -18,7 +18,7 @@ def made(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("schema") / "run"
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty",), risks=("mean", "cvar:0.5"),
-        scenarios=("std",), maps=2, seeds=(0, 3), time_budget_s=2.0, record="none", steps="none",
+        scenarios=("std",), maps=2, seeds=(0, 3), time_budget_s=2.0, record="none",
     )  # fmt: skip
     list(run_suite(suite, folder))
     return folder
@@ -39,15 +39,15 @@ def test_an_empty_or_truncated_file_is_damaged_and_a_missing_one_is_none(text: s
         open_run(run)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 5])
+@pytest.mark.parametrize("version", [1, 2, 3, 6])
 def test_runs_of_other_formats_are_refused_with_what_reads_them(version: int, run: Path) -> None:
     about = (
         {"command": "benchnav-eval"} if version == 1 else {**open_run(run).about, "format_version": version}
     )
     (run / "run.json").write_text(json.dumps(about))
-    reader = "a newer benchnav" if version == 5 else r"benchnav 0\.7"
+    reader = "a newer benchnav" if version == 6 else r"benchnav 0\.7"
     with pytest.raises(
-        ConfigError, match=rf"format version 4, got .* of version {version}\. Read it with {reader}"
+        ConfigError, match=rf"format version 5, got .* of version {version}\. Read it with {reader}"
     ):
         open_run(run)
 
@@ -55,7 +55,7 @@ def test_runs_of_other_formats_are_refused_with_what_reads_them(version: int, ru
 def test_a_seal_that_does_not_fit_is_damage(run: Path) -> None:
     text = (run / "run.json").read_text()
     (run / "run.json").write_text(text.replace('"compiles": ', '"compiles":  '))
-    assert open_run(run).about["code"]  # as JSON it is the same
+    assert open_run(run).about["codes"]  # as JSON it is the same
     (run / "run.json").write_text(text.replace('"date": "2', '"date": "3'))
     with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
         open_run(run)
@@ -66,6 +66,8 @@ def test_a_table_or_a_seal_that_was_changed_or_taken_away_is_damage(run: Path) -
     with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
         read_table(run, EPISODES)
     about = open_run(run).about
-    (run / "run.json").write_text(json.dumps({name: value for name, value in about.items() if name != SEAL}))
+    (run / "run.json").write_text(
+        json.dumps({name: value for name, value in about.items() if name != "manifest_digest"})
+    )
     with pytest.raises(ConfigError, match="changed after benchnav wrote it"):
         open_run(run)

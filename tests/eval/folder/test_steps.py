@@ -13,7 +13,6 @@ import torch
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.condition import conditions_of
-from benchnav.eval.experiment.keep import Keep
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent, units
 from benchnav.eval.folder.folder import EPISODES, open_run, read_table
@@ -28,10 +27,10 @@ PLANNERS: tuple[Any, ...] = ({"part": "tests.eval.parts:Faulty", "label": "slow"
 
 
 def run(dataset: Path, folder: Path, **changes: Any) -> Path:
-    given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "maps": 2, "seeds": (0, 5)} | changes
+    given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "maps": 2, "seeds": (0, 5)}
+    given |= {"record": "steps"} | changes
     suite = Suite(
-        data=str(dataset), scenarios=("std",), model="oracle", noise="stored", time_budget_s=4.0, record="none",
-        **given,
+        data=str(dataset), scenarios=("std",), model="oracle", noise="stored", time_budget_s=4.0, **given,
     )  # fmt: skip
     for _ in run_suite(suite, folder):
         pass
@@ -45,7 +44,7 @@ def folder(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 def test_steps_hold_the_driven_path_and_the_robots_own_actions() -> None:
     problem, episodes = made()
-    rows = step_table(unit(), problem, episodes, [0, 1]).to_pandas()
+    rows = step_table(unit(), problem, episodes).to_pandas()
     first, second = (rows[rows["map"] == i] for i in unit().maps)
     assert first["x_m"].tolist() == [0, 3, 3]
     assert first["y_m"].tolist() == [0, 0, 4]
@@ -55,8 +54,6 @@ def test_steps_hold_the_driven_path_and_the_robots_own_actions() -> None:
     assert np.isnan(first["speed_mps"].iloc[-1])
     assert second["step"].tolist() == [0, 1, 2, 3, 4]
     assert second["time_s"].tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
-    alone = step_table(unit(), problem, episodes, [1]).to_pandas()
-    pd.testing.assert_frame_equal(alone, second.reset_index(drop=True))
 
 
 def test_one_episode_is_read_with_filters_by_any_reader(folder: Path) -> None:
@@ -115,21 +112,10 @@ def test_robots_of_other_actions_share_the_columns(dataset_path: Path, tmp_path:
         assert own["speed_mps"].notna().any()
 
 
-def test_steps_of_recorded_episodes_alone_or_none(dataset_path: Path, tmp_path: Path) -> None:
-    suite = Suite(
-        data=str(dataset_path), scenarios=("std",), model="oracle", planners=PLANNERS, risks=("mean", "cvar"),
-        maps=2, seeds=(0, 5), time_budget_s=4.0, steps="recorded",
-    )  # fmt: skip
-    for _ in run_suite(suite, tmp_path / "run"):
-        pass
-    steps = read_steps(tmp_path / "run")
-    kept = steps[["condition", "seed", "map"]].drop_duplicates()
-    assert len(kept) == 3
-    assert set(kept["seed"]) == {0}
-    assert set(kept["map"]) == {0}
-    none = run(dataset_path, tmp_path / "none", steps="none")
+def test_a_run_that_keeps_rows_alone_has_no_steps(dataset_path: Path, tmp_path: Path) -> None:
+    none = run(dataset_path, tmp_path / "none", record="none")
     assert not (none / "steps").exists()
-    with pytest.raises(ConfigError, match="--steps all"):
+    with pytest.raises(ConfigError, match="--record steps"):
         read_steps(none)
 
 
@@ -141,7 +127,7 @@ def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> No
     conditions = {
         t.id: (t, Extent.product((0, 5), 1, 2)) for t in conditions_of(suite, lambda data: ("std",))
     }
-    align_steps(folder, units(conditions, Keep()))
+    align_steps(folder, units(conditions))
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
@@ -150,13 +136,14 @@ def test_a_file_that_was_cut_short_is_named_when_the_run_is_finished(folder: Pat
     path = next(copy.glob("steps/*/*"))
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ConfigError, match="steps is damaged"):
-        align_steps(copy, units(open_run(copy).conditions, Keep()))
+        align_steps(copy, units(open_run(copy).conditions))
 
 
 def test_an_episode_that_ended_at_once_has_its_one_state() -> None:
     problem, episodes = made()
     at_once = replace(episodes, steps=torch.tensor([0, 1]))
-    rows = step_table(unit(), problem, at_once, [0]).to_pandas()
+    rows = step_table(unit(), problem, at_once).to_pandas()
+    rows = rows[rows["map"] == unit().maps[0]]
     assert (len(rows), rows["time_s"].tolist()) == (1, [0.0])
     assert np.isnan(rows["traversability"]).all()
 

@@ -8,7 +8,7 @@ import pytest
 from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.page import Drawn, provenance_lines, write_page
 from benchnav.eval.report.tables import ResultTable
-from tests.eval.forged import CODE
+from tests.eval.forged import code_with
 
 EVIL = "<script>alert(1)</script> & \"quoted\" 'too'"
 
@@ -45,8 +45,8 @@ def page(tmp_path: Path) -> Page:
         bold=frozenset({(1, 1)}), bold_note="the best", explained=(("planner", EVIL),),
     )  # fmt: skip
     about = {
-        "run_id": "", "commands": [EVIL], "parts": {EVIL: {"origin": EVIL}}, "datasets": {}, "conditions": {},
-        "code": CODE, "machine": {"processor": "", "cores": 2}, "device": "cpu", "gpu": None,
+        "commands": [EVIL], "datasets": {}, "conditions": {}, "codes": {"a": code_with(parts={EVIL: EVIL})},
+        "machine": {"processor": "", "cores": 2}, "history": [{"commit": "", "benchnav": "1"}],
     }  # fmt: skip
     text = write_page(
         EVIL, [EVIL], [EVIL], [Finding(title=EVIL, sentences=(EVIL,))], table, [Drawn(path=picture, caption=EVIL)],
@@ -89,23 +89,20 @@ def test_figures_keep_their_size_on_the_page(page: Page) -> None:
 
 def test_provenance_of_a_run() -> None:
     about = {
-        "run_id": "r1",
-        "code": {"sources": "abc", "versions": {"torch": "2.0"}, "processor": "AVX2", "compiles": False},
-        "machine": {"processor": "x86_64", "cores": 2},
-        "device": "cuda",
-        "gpu": "a GPU",
-        "datasets": {"paper-v1": {"id": "paper-v1", "maps": {"test/std": ["d"] * 20}}},
-        "parts": {
-            "model m": {"files": {"a.bin": "1f"}},
-            "risk r.py:f": {"origin": "r.py", "digest": "9e"},
-            "x": "y",
+        "history": [{"commit": "old", "benchnav": "0"}, {"commit": "abc", "benchnav": "1.2"}],
+        "codes": {
+            "a": code_with(parts={"model m": "1f"}),
+            "b": code_with(parts={"risk r.py:f": "9e"}, environment={"compiles": False}),
         },
+        "machine": {"processor": "x86_64", "cores": 2},
+        "datasets": {"paper-v1": {"id": "paper-v1", "maps": {"test/std": ["d"] * 20}}},
         "conditions": {"t": {"seeds": [0, 7]}},
     }
     assert provenance_lines(about) == [
-        ("run", "r1"), ("sources of benchnav", "abc"), ("version of torch", "2.0"), ("processor", "x86_64 AVX2"),
-        ("cores", "2"), ("device", "cuda a GPU"), ("compiler", "no"),
-        ("dataset paper-v1", "paper-v1; maps: test/std 20"),
-        ("model m", "a.bin 1f"), ("risk r.py:f", "r.py; 9e"), ("x", "y"), ("seeds", "0, 7"),
+        ("commit of benchnav", "abc"), ("version of benchnav", "1.2"),
+        ("torch", "2.1"), ("processor", "AVX2"), ("compiles", "True"), ("device", "cpu"), ("planner_limit_s", "0.0"),
+        ("torch", "2.1"), ("processor", "AVX2"), ("compiles", "False"), ("device", "cpu"), ("planner_limit_s", "0.0"),
+        ("machine", "x86_64, 2 cores"), ("dataset paper-v1", "paper-v1; maps: test/std 20"),
+        ("model m", "1f"), ("risk r.py:f", "9e"), ("seeds", "0, 7"),
     ]  # fmt: skip
     assert ("device", "cpu") in provenance_lines(about | {"device": "cpu", "gpu": None})

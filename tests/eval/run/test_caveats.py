@@ -14,7 +14,7 @@ from benchnav.eval.folder.folder import open_run
 from benchnav.eval.report.write import print_report, write_report
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import rerun
-from benchnav.eval.run.runner import Workers, run_suite
+from benchnav.eval.run.runner import run_suite
 
 FREE, STEERING = "tests.eval.parts:Faulty", "tests.eval.parts:Steering"
 LINE = "left out: planner Steering with robot bicycle, which it cannot steer"
@@ -24,7 +24,7 @@ WARNING = "warning: in 2 of 2 maps of test/std a robot of 1 m/s cannot reach the
 def suite_on(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": (FREE, STEERING), "risks": ("mean", "cvar:0.5"),
-        "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "maps": 2, "record": "none", "steps": "none",
+        "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "maps": 2, "record": "none",
         "time_budget_s": 3.0,
     }  # fmt: skip
     return Suite(**(given | changes))
@@ -64,7 +64,7 @@ def test_a_pair_that_cannot_be_steered_is_left_out_and_named_everywhere(
     # A run that is extended, and one that is repeated, still say it.
     list(run_suite(suite_on(dataset_path, robots=("unicycle",), seed=1), folder))
     assert open_run(folder).about["dropped"] == [dropped]
-    next(steps := rerun(folder, tmp_path / "again", Workers()))
+    next(steps := rerun(folder, tmp_path / "again"))
     steps.close()
     again = open_run(tmp_path / "again").about
     assert (again["dropped"], again["warnings"]) == ([dropped], open_run(folder).about["warnings"])

@@ -8,23 +8,24 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pandas as pd
 import pytest
 import torch
 
-from benchnav.core import cluster as dask
+from benchnav.core import workers as dask
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.eval import cli
-from benchnav.eval.experiment.keep import Keep
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run import cluster
-from benchnav.eval.run.cluster import check_worker
+from benchnav.eval.run.cluster import check_worker, run_on_worker
 from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings
 
 distributed = pytest.importorskip("distributed")
 
@@ -127,19 +128,26 @@ def test_a_worker_of_other_code_or_without_the_data_is_named(
     cluster_of_two: Cluster, dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite = suite_on(dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,))
-    code = provenance.describe_code()
+    modules = provenance.package_modules
     with monkeypatch.context() as patch:
-        patch.setattr(provenance, "describe_code", lambda: {**code, "sources": "0" * 64})
-        with pytest.raises(ConfigError, match=r"tcp://127\.0\.0\.1:\d+ differs in benchnav's own sources"):
+        patch.setattr(
+            provenance, "package_modules", lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"}
+        )
+        with pytest.raises(
+            ConfigError, match=r"tcp://127\.0\.0\.1:\d+: .*others: benchnav\.eval\.run\.rollout"
+        ):
             list(run_suite(suite, tmp_path / "run", scheduler=cluster_of_two.address))
-    assert not (tmp_path / "run").exists()
+    assert not list((tmp_path / "run").glob("units/*/*"))
     # What only a unit can tell: a part's file, and the maps, that are not there when it begins.
     mine, data = tmp_path / "mine.py", shutil.copy(dataset_path, tmp_path / "tiny.h5")
     mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
     suite = suite_on(data, tmp_path / "log", planners=(f"{mine}:Mine",))
     for change, expected in (
-        (lambda: mine.write_text(mine.read_text() + "# edited\n"), r"\d+ differs in planner .*mine\.py"),
-        (data.unlink, r"\d+ lacks what the run needs: .*tiny\.h5"),
+        (
+            lambda: mine.write_text(mine.read_text() + "# edited\n"),
+            r"\d+: .*these are others: planner .*mine\.py",
+        ),
+        (data.unlink, r"\d+: .*tiny\.h5"),
     ):
         steps = run_suite(suite, tmp_path / "run", overwrite=True, scheduler=cluster_of_two.address)
         next(steps)
@@ -182,14 +190,6 @@ def test_half_of_a_run_on_a_cluster_that_is_lost_and_half_here(dataset_path: Pat
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     list(run_suite(suite, tmp_path / "here"))
     same(tmp_path / "here", tmp_path / "run")
-
-
-def test_a_worker_is_told_all_that_its_maps_have_to_be(dataset_path: Path, tmp_path: Path) -> None:
-    suite = suite_on(dataset_path, tmp_path / "log", risks=("mean",), scenarios=("std",), seeds=(0,))
-    list(run_suite(suite, tmp_path / "run"))
-    run = open_run(tmp_path / "run")
-    (unit,) = units(run.conditions, Keep())
-    assert cluster._subset(run.about, unit)["datasets"] == provenance.describe_maps(run.conditions)
 
 
 def test_a_scheduler_that_cannot_be_reached_is_one_line_and_drops_nothing(
@@ -253,57 +253,44 @@ def test_parts_of_this_process_alone_are_refused(dataset_path: Path, tmp_path: P
         list(run_suite(suite, tmp_path / "run", scheduler="tcp://127.0.0.1:1"))
 
 
-def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
-    dataset_path: Path, tmp_path: Path
-) -> None:
-    list(
-        run_suite(suite_on(dataset_path, tmp_path / "log", scenarios=("std",), seeds=(0,)), tmp_path / "run")
+def worker_of(folder: Path, threads: int = 1) -> Any:
+    """What a unit sees of the worker that it is on."""
+    return SimpleNamespace(
+        address="tcp://w", local_directory=str(folder), state=SimpleNamespace(nthreads=threads)
     )
-    about = open_run(tmp_path / "run").about
-    told = {name: about[name] for name in ("code", "parts", "datasets")}
-    fit = {**told, "threads": 1, "starts_processes": False, "gpu": None}
-    check_worker("tcp://w", fit, about)
-    check_worker("tcp://w", {**fit, "starts_processes": True}, {**about, "planner_limit_s": 5.0})
-    on_gpu = {**about, "device": "cuda", "gpu": "a GPU"}
-    check_worker("tcp://w", {**fit, "gpu": "a GPU"}, on_gpu)
-    check_worker("tcp://w", {**fit, "gpu": "a GPU"}, about)
-    code, (data,) = about["code"], about["datasets"]
-    other_maps = {data: {"maps": {"test/std": ["0", "1"]}}}
-    for state, expected in (
-        (ModuleNotFoundError("No module named 'benchnav'"), "benchnav installed"),
-        ({**fit, "threads": 4}, "with 4"),
-        ({**fit, "code": {**code, "sources": "0"}}, "own sources"),
-        ({**fit, "code": {**code, "processor": "ABACUS"}}, "ABACUS"),
-        ({**fit, "code": {**code, "versions": {**code["versions"], "numpy": "9"}}}, r"numpy \(.* to 9\)"),
-        ({**fit, "parts": {"model oracle": {"name": "other"}}}, "model oracle"),
-        ({**fit, "datasets": other_maps}, "maps of"),
-    ):
-        with pytest.raises(ConfigError, match=rf"tcp://w.*{expected}|{expected}.*tcp://w"):
-            check_worker("tcp://w", state, about)
-    with pytest.raises(ConfigError, match="no-nanny"):
-        check_worker("tcp://w", fit, {**about, "planner_limit_s": 5.0})
+
+
+def test_a_worker_is_refused_for_each_thing_that_would_change_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its code and maps are checked with each unit."""
+    check_worker(worker_of(tmp_path), Settings())
+    check_worker(worker_of(tmp_path), Settings(planner_limit_s=5.0))
+    with pytest.raises(ConfigError, match="tcp://w with 4"):
+        check_worker(worker_of(tmp_path, threads=4), Settings())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"with a GPU .*tcp://w"):
-        check_worker("tcp://w", fit, on_gpu)
-    with pytest.raises(ConfigError, match="a GPU to another"):
-        check_worker("tcp://w", {**fit, "gpu": "another"}, on_gpu)
+        check_worker(worker_of(tmp_path), Settings(device="cuda"))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    check_worker(worker_of(tmp_path), Settings(device="cuda"))
+    daemon = SimpleNamespace(daemon=True)
+    monkeypatch.setattr("multiprocessing.current_process", lambda: daemon)
+    check_worker(worker_of(tmp_path), Settings())
+    with pytest.raises(ConfigError, match=r"tcp://w.*no-nanny"):
+        check_worker(worker_of(tmp_path), Settings(planner_limit_s=5.0))
 
 
-def test_a_worker_runs_units_on_the_device_of_the_run(
+def test_a_worker_runs_units_on_the_device_and_under_the_limit_of_the_run(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite = suite_on(dataset_path, tmp_path / "log", scenarios=("std",), seeds=(0,))
     list(run_suite(suite, tmp_path / "run"))
-    run = open_run(tmp_path / "run")
-    unit = next(iter(units(run.conditions, Keep())))
-    worker = SimpleNamespace(
-        address="tcp://w", local_directory=str(tmp_path), state=SimpleNamespace(nthreads=1)
-    )
-    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    unit = units(open_run(tmp_path / "run").conditions)[0]
+    monkeypatch.setattr("distributed.get_worker", lambda: worker_of(tmp_path))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
-    given: list[object] = []
-    for device in ("cpu", "cuda"):
-        gpu = "a GPU" if device == "cuda" else None
-        about = cluster._subset({**run.about, "device": device, "gpu": gpu}, unit)
-        cluster._make(lambda *words: given.append(words[-1]), tmp_path, unit, "one", about)
-    assert given == ["cpu", "cuda"]
+    given: list[Settings] = []
+    monkeypatch.setattr(cluster, "run_unit", lambda *words: given.append(words[-1]))
+    asked = [Settings(), Settings(device="cuda", planner_limit_s=3.0)]
+    for settings in asked:
+        assert run_on_worker(tmp_path, unit, Settings().origins().of(unit), settings) == (unit, {})
+    assert given == asked

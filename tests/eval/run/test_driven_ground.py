@@ -61,8 +61,6 @@ def test_whichever_map_is_telling_is_kept_under_its_own_noise(dataset: Path, tmp
 
 
 def test_no_map_is_kept_where_no_steps_are(dataset: Path, tmp_path: Path) -> None:
-    folder = run(
-        dataset, tmp_path / "run", planners=("straight",), risks=("mean",), record="none", steps="none"
-    )
+    folder = run(dataset, tmp_path / "run", planners=("straight",), risks=("mean",), record="none")
     assert (folder / "episodes.parquet").exists()
     assert not (folder / GROUND).exists()

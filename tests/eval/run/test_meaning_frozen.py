@@ -52,7 +52,7 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
     suite = Suite(
         data=str(dataset.path), scenarios=("std",), models=("oracle", "clairvoyant"), risks=("mean", "cvar:0.5"),
         planners=({"part": "tests.eval.parts:Spy", "options": {"log": str(folder / "log")}},),
-        seeds=SEEDS, realisations=REALISATIONS, maps=0, record="none", conditions=({"world": worlds},),
+        seeds=SEEDS, realisations=REALISATIONS, maps=0, record="steps", conditions=({"world": worlds},),
     )  # fmt: skip
     for _ in run_suite(suite, folder / "run", jobs=2):
         pass

@@ -7,6 +7,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,21 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.folder import open_run, read_table
+from benchnav.eval.folder.provenance import Origin
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.report.playback.files import playback_path
+from benchnav.eval.report.playback.files import write_viewer_files
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run import runner
-from benchnav.eval.run.recorder import find_recording
-from benchnav.eval.run.runner import run_suite, run_unit
+from benchnav.eval.run import unit as units_of_run
+from benchnav.eval.run.again import find_recording
+from benchnav.eval.run.runner import run_suite
+from benchnav.eval.run.unit import Settings, run_unit
 from tests import factories
 from tests.eval.report.playback.rrd import read_path
 
@@ -41,6 +46,16 @@ PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")
 KEYS = ["scenario", "planner", "risk", "seed", "realisation", "map"]
 # What a wall clock says is no result.
 TIMING = ["planning_ms", "planning_ms_p95", "planning_start_ms"]
+
+
+SHIPPED = "paper-v1"
+GIVES_UP = """from tests.eval.parts import Faulty
+
+class Mine(Faulty):
+    def __init__(self, fault="none", after_s=1.0):
+        super().__init__("give up", 1.0)
+"""
+MINE = "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
 
 
 def suite_on(dataset: Path, **changes: object) -> Suite:
@@ -61,6 +76,18 @@ def finish(suite: Suite, folder: Path, jobs: int = 1, **options: object) -> pd.D
     for _ in run_suite(suite, folder, jobs, **options):  # type: ignore[arg-type]
         pass
     return pd.read_parquet(folder / "episodes.parquet")
+
+
+def unused(suite: Suite, folder: Path, **options: object) -> str:
+    """Runs a suite in a folder of which no unit counts; gives what is said to differ."""
+    said: list[str] = []
+    rows = finish(suite, folder, say=said.append, **options)
+    count = rows["condition"].nunique()
+    assert not any("were there already" in line for line in said)
+    (line,) = [line for line in said if "not used" in line]
+    differing, _, rest = line.removeprefix("finished by other code or maps (").rpartition("), so not used: ")
+    assert rest.startswith(f"{count} of {count} units; --reuse-code")
+    return differing
 
 
 def same(first: pd.DataFrame, second: pd.DataFrame) -> None:
@@ -88,8 +115,9 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
     assert set(episodes["planner"]) == set(PLANNERS)
     assert set(episodes[episodes["planner"] == "straight"]["risk"]) == {"–"}
     about = json.loads((folder / "run.json").read_text())
-    assert (about["format"], about["format_version"]) == ("benchnav-run", 4)
-    assert about["code"]["versions"]["torch"] == torch.__version__.split("+")[0]
+    assert (about["format"], about["format_version"]) == ("benchnav-run", 5)
+    environments = [code["environment"] for code in about["codes"].values()]
+    assert {known["torch"] for known in environments} == {torch.__version__.split("+")[0]}
     (data,) = about["datasets"].values()
     assert [len(digests) for digests in data["maps"].values()] == [2, 2]
     assert len({digest for digests in data["maps"].values() for digest in digests}) == 4
@@ -105,6 +133,7 @@ def test_a_run_folder_has_all_that_is_promised(finished: tuple[Suite, Path]) -> 
 
 def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]) -> None:
     _, folder = finished
+    write_viewer_files(folder)
     recordings = sorted((folder / "playback").glob("*.rrd"))
     conditions = open_run(folder).conditions
     assert len(recordings) == len(conditions) == (1 + 3 * 2) * 2
@@ -114,7 +143,7 @@ def test_recordings_verify_and_hold_the_driven_path(finished: tuple[Suite, Path]
     )
     for planner in PLANNERS:
         ((unit, member),) = find_episodes(folder, {"planner": [planner]}, None, 0, 0)
-        path = playback_path(folder, unit.stem(member))
+        path = folder / unit.recording_path(member, ".rrd")
         assert path in recordings
         episode = read_steps(folder, condition=unit.condition.id, map=0)
         times, positions = read_path(path)
@@ -211,11 +240,9 @@ def test_a_run_is_extended_by_what_is_missing(
     folder = tmp_path / "run"
     finish(quick(dataset_path), folder)
     before = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}
-    run_id = open_run(folder).about["run_id"]
     extended = finish(quick(dataset_path, **change), folder)
     assert (extended["condition"].nunique(), len(extended)) == (conditions, rows)
     assert sum(path.stat().st_mtime_ns == when for path, when in before.items()) == kept == len(before)
-    assert open_run(folder).about["run_id"] == run_id
     # What was there and what came make the rows of a run that had all at once.
     fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
     fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
@@ -230,7 +257,7 @@ def test_a_run_is_extended_by_maps(tmp_path: Path) -> None:
     for maps in (50, 52, 0, 4):
         rows = finish(replace(suite, maps=maps), folder)
         sizes.append((len(rows), len(list(folder.glob("units/*/*")))))
-    assert sizes == [(50, 1), (52, 2), (53, 2), (53, 2)]
+    assert sizes == [(50, 1), (52, 2), (53, 3), (53, 3)]  # a last block of more maps is another unit
     same(rows, finish(replace(suite, maps=0), tmp_path / "fresh"))
 
 
@@ -256,20 +283,31 @@ def test_code_that_changes_while_a_run_goes_on_makes_no_table(dataset_path: Path
     steps = run_suite(suite, tmp_path / "run")
     next(steps)
     mine.write_text(mine.read_text() + "# edited\n")
-    with pytest.raises(ConfigError, match=r"While .* running these changed: .*mine\.py"):
+    with pytest.raises(ConfigError, match=r"that the run was begun with, but these are others: .*mine\.py"):
         list(steps)
     assert not (tmp_path / "run" / "episodes.parquet").exists()
 
 
-def test_a_unit_of_another_run_does_not_count(dataset_path: Path, tmp_path: Path) -> None:
+def test_a_unit_of_another_run_counts_if_the_same_made_it(dataset_path: Path, tmp_path: Path) -> None:
     suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
     for name in ("one", "two"):
         finish(suite, tmp_path / name)
     (unit,) = (path.relative_to(tmp_path / "one") for path in (tmp_path / "one").glob("units/*/*"))
+    (tmp_path / "two" / unit).unlink()
     shutil.copy(tmp_path / "one" / unit, tmp_path / "two" / unit)
     said: list[str] = []
-    finish(suite, tmp_path / "two", say=said.append)
-    assert said == []  # nothing was there: the unit was run anew
+    same(
+        finish(suite, tmp_path / "two", say=said.append),
+        pd.read_parquet(tmp_path / "one" / "episodes.parquet"),
+    )
+    assert said == ["1 of 1 units were there already"]
+    # Under other seeds it is another unit, also where it lies under its name.
+    shutil.copy(
+        tmp_path / "one" / unit, (tmp_path / "two" / unit).with_name(unit.name.replace("0-", "5-", 1))
+    )
+    said.clear()
+    finish(replace(suite, seed=5), tmp_path / "two", say=said.append)
+    assert "1 of 2 units were there already" in said
 
 
 @pytest.mark.parametrize("risk", ["cvar:1.5", "var:-0.1", "expected-time:-1", "chance:2", "single-class:1"])
@@ -281,16 +319,14 @@ def test_options_that_a_risk_measure_cannot_take_are_refused_before_the_run(
     assert not (tmp_path / "run" / "units").exists()
 
 
-def test_a_run_with_another_time_limit_or_compiler_is_refused(
+def test_units_under_another_time_limit_or_compiler_are_not_used(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite = quick(dataset_path, scenarios=("std",), risks=("mean",))
     finish(suite, tmp_path / "run")
-    with pytest.raises(ConfigError, match="planner_limit_s"):
-        finish(suite, tmp_path / "run", planner_limit_s=9.0)
+    assert unused(suite, tmp_path / "run", planner_limit_s=9.0) == "planner_limit_s (0.0 to 9.0)"
     monkeypatch.setattr(provenance, "can_compile", lambda: None)
-    with pytest.raises(ConfigError, match="compiles"):
-        finish(suite, tmp_path / "run")
+    assert unused(suite, tmp_path / "run").startswith("compiles (")
 
 
 def test_every_unit_is_run_on_the_device_that_is_asked_for(
@@ -298,11 +334,12 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
 ) -> None:
     suite, given = quick(dataset_path, scenarios=("std",), risks=("mean",)), []
 
-    def run_elsewhere(unit: Unit, folder: Path, run_id: str, limit_s: float, device: str) -> None:
-        given.append(device)
-        run_unit(unit, folder, run_id, limit_s)
+    def run_here(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> None:
+        given.append(settings.device)
+        monkeypatch.setattr(units_of_run, "_check_origin", lambda *given: None)
+        run_unit(unit, folder, origin, Settings())
 
-    monkeypatch.setattr(runner, "run_unit", run_elsewhere)
+    monkeypatch.setattr(runner, "run_unit", run_here)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a GPU")
     finish(suite, tmp_path / "cuda", device="auto")
@@ -310,11 +347,9 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     assert open_run(tmp_path / "cuda").about["device"] == "cuda"
     assert open_run(tmp_path / "cuda").about["gpu"] == "a GPU"
     given.clear()
-    with pytest.raises(ConfigError, match=r"device \(a GPU to cpu\).*--device cuda"):
-        finish(suite, tmp_path / "cuda", device="cpu")
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "another")
-    with pytest.raises(ConfigError, match=r"device \(a GPU to another\)"):
-        finish(suite, tmp_path / "cuda", device="cuda")
+    assert unused(suite, tmp_path / "cuda", device="cuda") == "device (a GPU to another)"
+    given.clear()
     finish(suite, tmp_path / "cpu", device="cpu")
     assert set(given) == {"cpu"}
     assert open_run(tmp_path / "cpu").about["gpu"] is None
@@ -324,7 +359,7 @@ def test_every_unit_is_run_on_the_device_that_is_asked_for(
     assert not (tmp_path / "none").exists()
 
 
-def test_a_run_of_other_code_or_data_is_refused_and_what_changed_is_named(
+def test_units_of_other_code_or_maps_are_kept_and_not_used_and_what_changed_is_named(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data, mine, folder = tmp_path / "tiny.h5", tmp_path / "mine.py", tmp_path / "run"
@@ -332,37 +367,99 @@ def test_a_run_of_other_code_or_data_is_refused_and_what_changed_is_named(
     mine.write_text("from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n")
     suite = quick(data, planners=(f"{mine}:Mine",), scenarios=("std",))
     rows = finish(suite, folder)
-    code = provenance.describe_code()
+    modules = provenance.package_modules
     changes = {
-        "benchnav's own sources": {**code, "sources": "0" * 64},
-        "torch": {**code, "versions": {**code["versions"], "torch": "9.9"}},
-        "processor": {**code, "processor": "ABACUS"},
-    }
-    for name, changed in changes.items():
+        "benchnav.eval.run.rollout": (
+            provenance, "package_modules", lambda names: modules(names) | {"benchnav.eval.run.rollout": "0"}
+        ),
+        "torch (": (provenance, "version", lambda name: "9.9" if name == "torch" else version(name)),
+        "processor (": (torch.backends.cpu, "get_cpu_capability", lambda: "ABACUS"),
+    }  # fmt: skip
+    for name, (place, attribute, changed) in changes.items():
         with monkeypatch.context() as patch:
-            patch.setattr(provenance, "describe_code", lambda changed=changed: changed)
-            with pytest.raises(ConfigError, match=name):
-                finish(suite, folder)
+            patch.setattr(place, attribute, changed)
+            assert unused(suite, shutil.copytree(folder, tmp_path / name)).startswith(name)
     mine.write_text(mine.read_text() + "# another\n")
-    with pytest.raises(ConfigError, match=r"mine\.py"):
-        finish(suite, folder)
+    assert "mine.py" in unused(suite, shutil.copytree(folder, tmp_path / "other code"))
     mine.write_text(mine.read_text().removesuffix("# another\n"))
     factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    os.replace(data, tmp_path / "first.h5")
     os.replace(tmp_path / "other.h5", data)
-    with pytest.raises(ConfigError, match=r"maps of .* test/std"):
-        finish(suite, folder)
-    pd.testing.assert_frame_equal(pd.read_parquet(folder / "episodes.parquet"), rows)
-    assert len(finish(suite, folder, overwrite=True)) == len(rows)
+    assert unused(suite, folder) == "maps"
+    # As it was, all is there again, and the table is of it.
+    os.replace(tmp_path / "first.h5", data)
+    files, said = {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")}, list[str]()
+    same(finish(suite, folder, say=said.append), rows)
+    assert said == ["2 of 2 units were there already"]
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("units/*/*")} == files
+    assert len(files) == 4
+
+
+def test_units_of_other_code_are_taken_when_asked_for_and_marked(
+    dataset_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine, folder = tmp_path / "mine.py", tmp_path / "run"
+    mine.write_text(MINE)
+    suite = quick(dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",))
+    first = finish(suite, folder)
+    mine.write_text(MINE + "# the same, in other words\n")
+    said: list[str] = []
+    rows = finish(replace(suite, seeds=(0, 5)), folder, reuse_code=True, say=said.append)
+    assert "1 of 2 units were there already" in said
+    assert not any("not used" in line for line in said)
+    codes = dict(zip(rows["seed"], rows["code"], strict=True))
+    assert codes[0] == first["code"].iloc[0] != codes[5]
+    about = open_run(folder).about
+    assert set(about["codes"]) == set(codes.values())
+    line = f"1 of 2 units are of other code (planner {mine}:Mine); column `code` tells which rows"
+    assert about["reused"] == line
+    report = write_report(folder)
+    assert f"warning: {line}" in report.warnings
+    # Rows of other code are compared with none of this code, unless that is asked for.
+    finish(replace(suite, seeds=(0, 5), risks=("cvar",)), folder, reuse_code=True)
+    with pytest.raises(ConfigError, match="the code that made them differs too"):
+        compare_runs([folder], "risk", "", {}, 0.05)
+    # Without it the unit is run anew, and nothing is marked.
+    finish(replace(suite, seeds=(0, 5)), folder)
+    assert open_run(folder).about["reused"] == ""
+    assert len(set(read_table(folder, "episodes.parquet")["code"])) == 1
+    # Of other maps nothing is ever taken.
+    other = factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
+    data = tmp_path / "data.h5"
+    shutil.copy(dataset_path, data)
+    moved = replace(suite, data=str(data))
+    finish(moved, tmp_path / "moved")
+    shutil.copy(other, data)
+    assert unused(moved, tmp_path / "moved", reuse_code=True) == "maps"
+
+
+def test_what_was_recorded_by_other_code_is_not_taken_for_this(dataset_path: Path, tmp_path: Path) -> None:
+    """Steps and recordings lie once; rows of each code stay. Back at old code only its rows are of it."""
+    mine, folder = tmp_path / "mine.py", tmp_path / "run"
+    mine.write_text(MINE)
+    suite = quick(
+        dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",), record="steps"
+    )
+    finish(suite, folder)
+    driven = read_steps(folder)
+    mine.write_text(GIVES_UP)
+    assert "mine.py" in unused(suite, folder)
+    assert len(read_steps(folder)) < len(driven)
+    mine.write_text(MINE)
+    said: list[str] = []
+    finish(suite, folder, say=said.append)
+    assert "run again for recordings or steps that were not asked for: 1 of 1 units" in said
+    pd.testing.assert_frame_equal(read_steps(folder), driven)
 
 
 def test_a_changed_checkpoint_is_named(
     dataset_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     suite = quick(dataset_path, scenarios=("std",))
+    suite = replace(suite, model=SHIPPED)
     finish(suite, tmp_path / "run")
     monkeypatch.setattr(provenance, "model_identity", lambda source: {"name": source, "files": {"a": "b"}})
-    with pytest.raises(ConfigError, match="model oracle"):
-        finish(suite, tmp_path / "run")
+    assert unused(suite, tmp_path / "run") == f"model {SHIPPED}"
 
 
 def test_two_runs_in_one_folder_refuse_each_other_also_with_overwrite(
@@ -397,7 +494,8 @@ def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, 
     recording = find_recording(folder, unit, member)
     steps = read_steps(folder, planner="astar_dwa", risk="mean", scenario="hs", map=1)
     np.testing.assert_array_equal(recording.states[:, :2], steps[["x_m", "y_m"]].to_numpy())
-    _, positions = read_path(playback_path(folder, unit.stem(member)))
+    write_viewer_files(folder)
+    _, positions = read_path(folder / unit.recording_path(member, ".rrd"))
     np.testing.assert_array_equal(positions[:, :2], recording.states[:, :2])
 
 
@@ -482,6 +580,7 @@ def test_a_planner_that_gives_up_at_once_is_recorded_and_reported(dataset_path: 
     assert episodes["end_time_s"].tolist() == [0, 0]
     assert episodes["total_time_s"].tolist() == [12, 12]
     write_report(tmp_path / "run")
+    write_viewer_files(tmp_path / "run")
     (recording,) = (tmp_path / "run" / "playback").glob("*.rrd")
     _, positions = read_path(recording)
     assert len(positions) <= 2
@@ -510,7 +609,7 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
         lines: list[str] = []
         suite = Suite(
             data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), maps=2,
-            time_budget_s=budget, robots=(robot,), record="none",
+            time_budget_s=budget, robots=(robot,), record="steps",
         )  # fmt: skip
         for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
             pass
@@ -532,7 +631,7 @@ def test_a_world_that_cannot_be_drawn_is_refused_before_a_run_is_dropped(
         planners=("straight",),
         scenarios=("std",),
         maps=2,
-        record="none",
+        record="steps",
     )
     before = finish(suite, tmp_path / "run")
     for world, expected in (
@@ -551,9 +650,9 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
-        scenarios=("std",), maps=1, record="none", time_budget_s=1.0,
+        scenarios=("std",), maps=1, record="steps", time_budget_s=1.0,
     )  # fmt: skip
-    with pytest.raises(ConfigError, match="without `group`"):
+    with pytest.raises(ConfigError, match="which has no `class_names`"):
         finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
     assert set(finish(suite, tmp_path / "run")["risk"]) == {"–", *Suite().risks}
 
@@ -561,7 +660,7 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
 def test_a_command_that_may_start_no_processes_runs_its_units_itself(tmp_path: Path) -> None:
     config = tmp_path / "suite.yaml"
     data = factories.tiny_dataset(tmp_path / "d.h5")
-    config.write_text(f"data: {data}\nscenarios: [std]\nmaps: 1\nrecord: none\nsteps: none\n"
+    config.write_text(f"data: {data}\nscenarios: [std]\nmaps: 1\nrecord: none\n"
                       "conditions:\n  - {planners: [straight]}\n")  # fmt: skip
     code = "from benchnav.eval import cli; cli._finish = cli._failed; cli.main()"
     words = ["run", "--config", str(config), "--jobs", "2", "--out", str(tmp_path / "run")]

@@ -1,13 +1,16 @@
-"""From a unit of work to its problem and its simulation.
+"""Running a unit of work: its maps, its problem and simulation, its episodes, and the files that hold them.
 
 Only the unit's own block of maps is read and predicted. A prediction serves all planners and risk settings
 of its block that a process runs one after another.
 """
 
+import json
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,18 +21,96 @@ from benchnav.core import rng
 from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.registry import Part
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit
+from benchnav.eval.folder.folder import clear_unit, write_unit
+from benchnav.eval.folder.provenance import Origin, Origins, code_differences
+from benchnav.eval.folder.steps import write_steps
 from benchnav.eval.run.isolation import IsolatedPlanner
+from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
-from benchnav.models.predictor import Clairvoyant, predict
+from benchnav.eval.run.rows import episode_rows, error_rows, step_table
+from benchnav.models.predictor import Clairvoyant, load_model, predict
 from benchnav.planning import risk
 from benchnav.planning.planners.planner import Plan, Step
 from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How units are run.
+
+    Args:
+        planner_limit_s: time limit of each call of a planner; 0 for none.
+        device: where all is computed, "cpu" or "cuda".
+    """
+
+    planner_limit_s: float = 0.0
+    device: str = "cpu"
+
+    def origins(self) -> Origins:
+        """Looks up what units come from that are run so."""
+        return Origins(self.planner_limit_s, self.device)
+
+
+def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> None:
+    """Runs one unit on one thread and writes its file, and before it its recordings and steps.
+
+    Args:
+        unit: what is run.
+        folder: the run folder.
+        origin: of the unit as the run was begun.
+        settings: how it is run.
+
+    Raises:
+        ConfigError: its code or its maps are others here and now.
+    """
+    _check_origin(unit, origin, settings)
+    clear_unit(folder, unit)
+    device = torch.device(settings.device)
+    with one_thread():
+        block = read_block(unit, origin, device)
+        try:
+            problem, simulation = build(unit, origin, device)
+        except PredictionError as error:
+            budgets = unit.condition.world.budget_s(
+                block.places.reference_time_s, unit.condition.make_task().robot.top_speed_mps
+            )
+            rows = error_rows(unit, block.groups, budgets, str(error))
+            write_unit(folder, unit, origin, rows, [str(error)], traceback.format_exc())
+            return
+        watched = unit.watched()
+        recorder = Recorder(unit, problem, simulation, block.terrain, watched)
+        watch = recorder.watch if watched else None
+        episodes, compiled = simulate(unit, problem, simulation, settings, watch, recorder.every)
+    succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
+    for member in unit.recorded(succeeded):
+        recorder.recording(episodes, member).save(folder / unit.recording_path(member))
+    if unit.record != "none":
+        write_steps(folder, unit, origin.key(unit), step_table(unit, problem, episodes))
+    reference = block.places.reference_time_s.cpu().numpy()
+    rejected_draws = (simulation.attempts - 1).tolist()
+    rows = episode_rows(unit, block.groups, problem, episodes, reference, rejected_draws, compiled)
+    errors = sorted({error for error in episodes.errors if error})
+    write_unit(folder, unit, origin, rows, errors, episodes.traceback)
+
+
+def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
+    """Refuses to make rows of other code or maps than those that the run was begun with."""
+    now = settings.origins().of(unit)
+    changed = code_differences(origin.code, now.code)
+    if now.maps != origin.maps:
+        changed.append(f"maps of {unit.condition.data} {unit.condition.split}")
+    if changed or now != origin:
+        raise ConfigError(
+            f"Expected the code and the maps that the run was begun with, but these are others: {'; '.join(changed)}. "
+            "Give the run's command again; what was finished is kept."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,21 +145,21 @@ def read_maps(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> Block
     )
 
 
-def read_block(unit: Unit, run_id: str, device: torch.device = CPU) -> Block:
-    """Reads a unit's maps and places onto a device; they are kept for one run alone."""
-    return _block(run_id, unit.condition.data, unit.condition.split, unit.maps, device)
+def read_block(unit: Unit, origin: Origin, device: torch.device = CPU) -> Block:
+    """Reads a unit's maps and places onto a device; they are kept for other settings."""
+    return _block(unit.condition.data, unit.condition.split, unit.maps, origin.maps, device)
 
 
 class PredictionError(BenchnavError):
     """A model or a risk measure raised; the cause says what."""
 
 
-def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem, Simulation]:
+def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Problem, Simulation]:
     """Makes the problem and the simulation of a unit.
 
     Args:
         unit: what is to be run.
-        run_id: predictions are kept for one run alone.
+        origin: of the unit; what is kept of predictions is kept for it.
         device: where all is computed.
 
     Raises:
@@ -87,11 +168,11 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
         BenchnavError: the data cannot be read, or are not enough for the world.
     """
     condition = unit.condition
-    block, task = read_block(unit, run_id, device), condition.make_task()
+    block, task = read_block(unit, origin, device), condition.make_task()
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
-        mixture = _predict(unit, run_id, device, simulation.field)
+        mixture = _predict(unit, origin, device, simulation.field)
         risk_map = risk.apply(condition.make_risk(), mixture)
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
@@ -109,21 +190,17 @@ def build(unit: Unit, run_id: str, device: torch.device = CPU) -> tuple[Problem,
     return problem, simulation
 
 
-def time_budgets(unit: Unit, run_id: str) -> Tensor:
-    """T of each episode of a unit, shape [B]."""
-    top_speed = unit.condition.make_task().robot.top_speed_mps
-    return unit.condition.world.budget_s(read_block(unit, run_id).places.reference_time_s, top_speed)
-
-
-def _predict(unit: Unit, run_id: str, device: torch.device, field: Tensor | None) -> TraversabilityMixture:
+def _predict(unit: Unit, origin: Origin, device: torch.device, field: Tensor | None) -> TraversabilityMixture:
     """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
-    condition = unit.condition
-    model = _model(run_id, _ModelOf(condition))
-    if not isinstance(model, Clairvoyant):
-        return _prediction(run_id, _ModelOf(condition), condition.data, condition.split, unit.maps, device)
+    part = unit.condition.model
+    options = json.dumps(dict(part.options), sort_keys=True)
+    model = (part.part, options, origin.code["parts"].get(f"model {part.part}", ""))
+    block = (unit.condition.data, unit.condition.split, unit.maps, origin.maps, device)
+    if not isinstance(_model(*model), Clairvoyant):
+        return _prediction(model, block)
     if field is None:
         raise ConfigError("Expected λ that stays what it is for the clairvoyant, got resampled λ.")
-    return predict(model, replace(read_block(unit, run_id, device).terrain, traversability=field))
+    return predict(_model(*model), replace(_block(*block).terrain, traversability=field))
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
@@ -144,9 +221,9 @@ def simulate(
     unit: Unit,
     problem: Problem,
     simulation: Simulation,
+    settings: Settings,
     watch: Watcher | None = None,
     watch_every: int = 1,
-    planner_limit_s: float = 0.0,
     **options: Any,
 ) -> tuple[Episodes, bool]:
     """Runs a unit's episodes; gives what happened, and whether the planner ran compiled.
@@ -155,17 +232,17 @@ def simulate(
         unit: what is run.
         problem: the unit's.
         simulation: the unit's.
+        settings: of them the time limit of planners.
         watch: see `run_episodes`, as of `watch_every` and `options`.
         watch_every: as there.
-        planner_limit_s: time limit of each call of the planner; 0 for none.
         **options: further arguments of `run_episodes`.
     """
     condition = unit.condition
     planner: Any
     with ExitStack() as stack:
         try:
-            if planner_limit_s:
-                planner = stack.enter_context(IsolatedPlanner(condition, planner_limit_s))
+            if settings.planner_limit_s:
+                planner = stack.enter_context(IsolatedPlanner(condition, settings.planner_limit_s))
             else:
                 planner = condition.make_planner()
         except (Exception, SystemExit) as error:
@@ -199,36 +276,21 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-class _ModelOf:
-    """A condition's model as a key of a cache: the same for all conditions of one model."""
-
-    def __init__(self, condition: Condition) -> None:
-        self.condition, self.key = condition, repr((condition.model.part, condition.model.options))
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ModelOf) and self.key == other.key
+# What is kept of maps and models is kept for what they are now: other digests are read and loaded anew.
 
 
 @lru_cache(maxsize=2)
-def _block(run_id: str, data: str, split: str, maps: tuple[int, ...], device: torch.device) -> Block:
-    return read_maps(_dataset(run_id, data), split, maps).to(device)
+def _block(
+    data: str, split: str, maps: tuple[int, ...], digests: tuple[str, ...], device: torch.device
+) -> Block:
+    return read_maps(TerrainDataset(find_dataset(data)), split, maps).to(device)
 
 
 @lru_cache(maxsize=2)
-def _dataset(run_id: str, data: str) -> TerrainDataset:
-    return TerrainDataset(find_dataset(data))
+def _prediction(model: tuple[str, str, str], block: tuple[Any, ...]) -> TraversabilityMixture:
+    return predict(_model(*model), _block(*block).terrain)
 
 
 @lru_cache(maxsize=2)
-def _prediction(
-    run_id: str, model: _ModelOf, data: str, split: str, maps: tuple[int, ...], device: torch.device
-) -> TraversabilityMixture:
-    return predict(_model(run_id, model), _block(run_id, data, split, maps, device).terrain)
-
-
-@lru_cache(maxsize=2)
-def _model(run_id: str, model: _ModelOf) -> Any:
-    return model.condition.make_model()
+def _model(part: str, options: str, digest: str) -> Any:
+    return load_model(Part(part=part, label="", options=json.loads(options)))

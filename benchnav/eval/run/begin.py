@@ -1,0 +1,177 @@
+"""What a command asks of a run, and the `run.json` that a run begins with or is extended by."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchnav.core import registry
+from benchnav.core.device import gpu_name
+from benchnav.core.errors import ConfigError
+from benchnav.core.registry import NO_DEFAULT, Part
+from benchnav.core.store import Shard
+from benchnav.eval.experiment.condition import Condition, check_labels
+from benchnav.eval.experiment.suite import Record
+from benchnav.eval.experiment.unit import Conditions
+from benchnav.eval.folder import provenance
+from benchnav.eval.folder.folder import EPISODES, FORMAT, FORMAT_VERSION, RUN, Run, open_run, write_run
+from benchnav.eval.run.check import Say
+from benchnav.eval.run.unit import Settings
+from benchnav.planning.planners.planner import what_it_follows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Work:
+    """What a command asks of a run.
+
+    Args:
+        suite: as it was written, for `run.json`.
+        conditions: by id, with how often each is to be run.
+        record: what is kept of episodes beside their rows.
+        settings: how units are run.
+        shard: which shard of the units is run; None for all.
+        reuse_code: whether finished units of other code count.
+        dropped: pairs of planner and robot that were left out, as `check.Checked` has them.
+        warnings: what readers of the results should know.
+        hypotheses: from `fix_hypotheses`; empty where there are none.
+    """
+
+    suite: Mapping[str, Any]
+    conditions: Conditions
+    record: Record
+    settings: Settings
+    shard: Shard | None = None
+    reuse_code: bool = False
+    dropped: tuple[Mapping[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+    hypotheses: Mapping[str, Any] = field(default_factory=dict)
+
+
+def begin(work: Work, folder: Path, say: Say) -> Conditions:
+    """Writes `run.json`, or extends the one that is there; gives all conditions of the run.
+
+    Raises:
+        ConfigError: the folder holds something else, or a run that this one cannot extend.
+    """
+    if not (folder / RUN).exists():
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ConfigError(
+                f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
+            )
+        write_run(folder, _about({}, work, work.conditions))
+        return work.conditions
+    earlier = open_run(folder)
+    _check_extends(work, earlier)
+    conditions = dict(earlier.conditions)
+    for condition_id, (condition, extent) in work.conditions.items():
+        known = conditions.get(condition_id)
+        conditions[condition_id] = (condition, known[1].union(extent) if known else extent)
+    if conditions != earlier.conditions:
+        new = len(conditions) - len(earlier.conditions)
+        more = {0: "by more episodes", 1: "by 1 new condition"}.get(new, f"by {new} new conditions")
+        say(f"{folder} is extended {more}")
+        (folder / EPISODES).unlink(missing_ok=True)  # until all that is asked for is there
+    now = _about(earlier.about, work, conditions)
+    if now != earlier.about:
+        write_run(folder, now)
+    return conditions
+
+
+def drop(folder: Path) -> None:
+    """Empties a run folder, which stays what it is: a link, another file system, the folder that the user is in."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        open_run(folder)  # Only what is a run folder may be dropped.
+        place = folder.resolve()
+        with TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.dropped-") as dropped:
+            # `run.json` last, so that a kill leaves a run that can be dropped or gone on with.
+            for path in sorted(place.iterdir(), key=lambda path: path.name == RUN):
+                os.replace(path, Path(dropped, path.name))
+
+
+def _check_extends(work: Work, earlier: Run) -> None:
+    folder = earlier.folder
+    if earlier.shard != work.shard:
+        raise ConfigError(
+            f"Expected `out` to be new or to hold {_in_words(work.shard)}, but {folder} holds "
+            f"{_in_words(earlier.shard)}. Choose another `out`."
+        )
+    # Others would be written after what they are tested by.
+    fixed = earlier.about.get("hypotheses", {}).get("digest", "none")
+    if work.hypotheses and work.hypotheses["digest"] != fixed:
+        raise ConfigError(
+            f"Expected the `hypotheses` that {folder} was begun with (digest {fixed}), got others (digest "
+            f"{work.hypotheses['digest']}), which would be written after its first results. Leave `hypotheses` out to "
+            "go on, or choose another `out`."
+        )
+    check_labels(condition for known in (earlier, work) for condition, _ in known.conditions.values())
+
+
+def _in_words(shard: Shard | None) -> str:
+    return "a whole run" if shard is None else f"shard {shard} of one"
+
+
+def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> dict[str, Any]:
+    """What `run.json` is to hold, of which the folder may hold an earlier state."""
+    known = earlier.get("conditions", {})
+    latencies = {i: {"latency": entry["latency"]} for i, entry in known.items() if "latency" in entry}
+    entries = {
+        condition_id: {
+            **{"value": condition.value, "labels": condition.labels, **_notes(condition)},
+            **{"seeds": extent.seeds, "draws": extent.draws, **latencies.get(condition_id, {})},
+        }
+        for condition_id, (condition, extent) in conditions.items()
+    }
+    about = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        **({"shard": asdict(work.shard)} if work.shard else {}),
+        "suite": dict(work.suite),
+        **({"hypotheses": fixed} if (fixed := earlier.get("hypotheses", work.hypotheses)) else {}),
+        "conditions": entries,
+        "dropped": provenance.join(earlier.get("dropped", ()), work.dropped),
+        "warnings": provenance.join(earlier.get("warnings", ()), work.warnings),
+        **asdict(work.settings),
+        "gpu": gpu_name(work.settings.device),
+        "datasets": provenance.describe_datasets(conditions),
+        "machine": provenance.describe_machine(),
+        "commands": provenance.command_lines(earlier.get("commands", ())),
+        "history": provenance.extend_history(earlier.get("history", ()), work.suite),
+        **{name: earlier[name] for name in ("codes", "reused", "tables") if name in earlier},
+    }
+    return json.loads(json.dumps(about))
+
+
+def _notes(condition: Condition) -> dict[str, Any]:
+    """What tables say of a condition's planner."""
+    planner = condition.make_planner()
+    task, remarks = condition.make_task(), getattr(planner, "remarks", None)
+    return {
+        "follows": what_it_follows(planner, task),
+        "remarks": list(remarks(task)) if remarks else [],
+        "changed": changed_options(condition.planner),
+    }
+
+
+def changed_options(planner: Part) -> list[str]:
+    """Options of a planner that differ from their defaults, as `name = value`, nested ones with dots."""
+    target = registry.find("planner", planner.part).target
+    known = registry.options_of("planner", target)
+    given = {name: option.default for name, option in known.items() if option.default is not NO_DEFAULT}
+    defaults = registry.complete(
+        "planner", Part(part=planner.part, label="", options={**planner.options, **given})
+    )
+    return _differences(defaults.options, planner.options)
+
+
+def _differences(defaults: Mapping[str, Any], values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found = []
+    for name, value in values.items():
+        default = defaults.get(name)
+        if isinstance(value, Mapping) and isinstance(default, Mapping):
+            found += _differences(default, value, f"{prefix}{name}.")
+        elif value != default:
+            found.append(f"{prefix}{name} = {value}")
+    return found
