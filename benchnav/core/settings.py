@@ -293,7 +293,8 @@ def _parsed(kind: Any, value: Any) -> Any:
         value = f"[{value}]"
     try:
         parser = _parser(kind)
-        if value is None:  # which the parser takes for nothing given
+        # The parser takes null, and anything but a mapping for a dataclass, for nothing given.
+        if value is None or is_dataclass(kind):
             raise ValueError
         return parser.instantiate(parser.parse_object({"value": value})).value
     except (ArgumentError, TypeError) as error:

@@ -12,6 +12,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import (
+    NO_DEFAULT,
     changed,
     hint,
     in_words,
@@ -109,6 +110,20 @@ def test_a_message_names_the_key_what_was_expected_and_what_came(
     with pytest.raises(ConfigError) as caught:
         rover(FULL | change)
     assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("value", [3, "3", "x", [1], True, None])
+def test_only_a_mapping_is_a_dataclass_even_where_all_has_defaults(value: Any) -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Easy:
+        a: int = 1
+
+    for now in (NO_DEFAULT, Easy(a=2)):
+        with pytest.raises(ConfigError, match=r"^Expected easy as a mapping, got"):
+            read(Easy, value, of("easy"), now=now)
+        if value is not None:
+            with pytest.raises(ConfigError, match=r"^Expected easy as a mapping or null, got"):
+                read(Easy | None, value, of("easy"), now=now)
 
 
 def test_a_default_of_none_may_be_given_whatever_the_type_says() -> None:
