@@ -6,7 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 OLD = re.compile(r"luck|yardstick|told[ _]apart|\brungs?\b|ladder|\btwins?\b|slowest|\bfelt\b", re.IGNORECASE)
 # The table of renames, its test, and this.
-NAME_THEM = {"benchnav/core/options.py", "tests/eval/test_replay.py", "tests/test_words.py"}
+NAME_THEM = {"benchnav/core/settings.py", "tests/eval/test_replay.py", "tests/test_words.py"}
 
 
 def test_old_words_are_gone() -> None:

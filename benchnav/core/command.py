@@ -1,6 +1,9 @@
-"""How the commands parse, report errors and show progress: one way for all three.
+"""How the commands read their words, report errors and show progress: one way for all three.
 
-Bad input ends in one line on standard error and exit status 2; an interruption in status 130.
+Words and YAML files make one plain mapping, which `benchnav.core.settings` reads by the types of the function's
+parameters; the help is jsonargparse's. `--contact-sheet` is `--contact_sheet true`, `--maps 3` is `--maps [3]`; a
+flag whose value is a name or a mapping may be given as both, `--world paper --world.noise stored`. Bad input ends in
+one line on standard error and exit status 2; an interruption in status 130.
 """
 
 import errno
@@ -8,16 +11,35 @@ import inspect
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from types import SimpleNamespace
+from typing import Any, Literal, get_origin
 
-from benchnav.core.arguments import Known, explain, know, spell
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.core.options import hint
+from benchnav.core.registry import KINDS
+from benchnav.core.settings import (
+    NO_DEFAULT,
+    Option,
+    changed,
+    dataclass_in,
+    hint,
+    in_words,
+    list_options,
+    load_yaml,
+    members_of,
+    of,
+    plain,
+    read_options,
+    read_yaml,
+)
 
 INTERRUPTED = 130
+
+_Flag = tuple[list[str], str]  # the option that a flag stands for, keys within its value; and its text
 
 Device = Literal["auto", "cpu", "cuda"]  # of the flag --device; see `benchnav.core.device`
 
@@ -40,11 +62,34 @@ class Command:
     settings: type | None = None
     configs: Path | None = None
 
+    @cached_property
+    def options(self) -> dict[str, Option]:
+        """What can be given, by name."""
+        options = list_options(self.function)
+        if self.settings:
+            options.pop(next(iter(options)))
+            options = list_options(self.settings) | options
+        return options
+
+    @cached_property
+    def flags(self) -> dict[str, Any]:
+        """Types by flag; flags for the fields of a dataclass have a dot."""
+        kinds = {name: option.kind for name, option in self.options.items() if name not in self.positionals}
+        for name, kind in tuple(kinds.items()):
+            within = list_options(dataclass_in(kind)) if dataclass_in(kind) else {}
+            kinds |= {f"{name}.{field}": option.kind for field, option in within.items()}
+        return kinds | {"config": str, "print_config": bool}
+
+    @cached_property
+    def shipped(self) -> dict[str, Path]:
+        """Shipped YAML files by name."""
+        return {path.stem: path for path in sorted(self.configs.glob("*.yaml"))} if self.configs else {}
+
 
 def run(
     program: str, description: str, commands: dict[str, Command], argv: Sequence[str] | None = None
 ) -> int:
-    """Parses a command line and runs the subcommand it names; without one it prints the help.
+    """Reads a command line and runs the subcommand it names; without one it prints the help.
 
     Args:
         program: name of the command.
@@ -55,44 +100,26 @@ def run(
     Returns:
         Exit status: 0, 1 where the command says so, 2 for bad input, 130 when interrupted.
     """
-    from jsonargparse import ArgumentError, ArgumentParser
-
     # Notices of libraries to their own developers would bury what a user has to read.
     warnings.filterwarnings("ignore", category=FutureWarning, module=r"torch\..*")
-    argv = list(sys.argv[1:] if argv is None else argv)
-    parser = ArgumentParser(prog=program, description=description, exit_on_error=False)
-    subcommands = parser.add_subcommands(required=True, metavar="COMMAND", dest="command")
-    known: dict[str, Known] = {}
-    for name, command in commands.items():
-        known[name] = know(f"{program} {name}", *(getattr(command, item.name) for item in fields(command)))
-        subcommands.add_subcommand(name, _subparser(command, known[name]), help=_summary(command.function))
-    if not argv:
-        parser.print_help()
-        return 0
-    asked, words = argv[0], argv[1:]
+    asked, *words = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    command = commands.get(asked)
     try:
-        if asked not in commands and asked not in ("-h", "--help"):
+        if asked in ("-h", "--help"):
+            _print_help(program, description, commands)
+            return 0
+        if command is None:
             raise ConfigError(
                 f"Expected a command among {', '.join(commands)}, got {asked!r}.{hint(asked, commands)}"
             )
-        spelled = spell(words, known[asked]) if asked in commands else words
-        parsed = parser.instantiate(parser.parse_args([asked, *spelled]))
-        command = commands[asked]
-        arguments = dict(vars(parsed[asked]))
-        arguments.pop("config", None)
-        if command.settings is None:
-            return command.function(**arguments) or 0
-        settings = command.settings(**{f.name: arguments.pop(f.name) for f in fields(command.settings)})
-        return command.function(settings, **arguments) or 0
-    except ArgumentError as error:
-        return _refuse(program, explain(str(error), words, known[asked]))
+        return _call(f"{program} {asked}", command, words) or 0
     except (BenchnavError, UnicodeDecodeError) as error:
         return _refuse(program, str(error))
     except BrokenPipeError:
         sys.stderr.close()
         return 0
     except OSError as error:
-        return _refuse(program, _unusable(error, known[asked]))
+        return _refuse(program, _unusable(error, command))
     except KeyboardInterrupt:
         print(f"{program}: interrupted; what was finished is kept", file=sys.stderr)
         return INTERRUPTED
@@ -117,17 +144,10 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
 
     console = Console(stderr=True)
     if console.is_terminal:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
-        columns: list[Any] = [TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()]
-        with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
+        columns = [*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()]
+        with Progress(*columns, console=console) as bar:
             task = bar.add_task(what, total=None)
             for done, total in steps:
                 bar.update(task, completed=done, total=total)
@@ -139,28 +159,164 @@ def show_progress(steps: Iterable[tuple[int, int]], what: str) -> None:
             tell(f"{what}: {done}/{total}")
 
 
-def _subparser(command: Command, known: Known) -> Any:
+def _call(program: str, command: Command, words: Sequence[str]) -> int | None:
+    """Calls the function of a subcommand with what its words say, or prints its help or settings."""
+    import yaml
+
+    if {"-h", "--help"} & set(words):
+        return _print_help_of(program, command)
+    flags, places = _read_words(program, command, words)
+    arguments = _read_arguments(program, command, flags, places)
+    known = {
+        name: option.default for name, option in command.options.items() if option.default is not NO_DEFAULT
+    }
+    if printed := [value for path, value in flags if path == ["print_config"]]:
+        settings = plain(arguments if "skip_default" in printed else known | arguments)
+        print(yaml.safe_dump(settings, sort_keys=False, allow_unicode=True), end="")
+        return 0
+    if lacking := [name for name in command.options if name not in known | arguments]:
+        named = [name.upper() if name in command.positionals else f"--{name}" for name in lacking]
+        raise ConfigError(f"Expected {' and '.join(named)}, got none. See `{program} --help`.")
+    if command.settings is None:
+        return command.function(**arguments)
+    own = {name: arguments.pop(name) for name in list_options(command.settings) if name in arguments}
+    return command.function(command.settings(**own), **arguments)
+
+
+def _read_arguments(
+    program: str, command: Command, flags: Sequence[_Flag], places: Sequence[str]
+) -> dict[str, Any]:
+    """Makes arguments by name of flags and of what is given by place.
+
+    YAML files come first, then flags, then keys within the value of a flag, wherever they stand.
+
+    Raises:
+        ConfigError: something given is unknown or of another type.
+    """
+    options, arguments = command.options, SimpleNamespace()  # by name, which later ones begin from
+    for file in [value for path, value in flags if path == ["config"]]:
+        settings = read_options(options, _read_config(command, file), of(file), base=arguments)
+        vars(arguments).update(settings)
+    given: dict[str, Any] = {}
+    for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
+        if name in options:
+            now = given.get(name, getattr(arguments, name, options[name].default))
+            given[name] = _merged(name, options[name].kind, now, keys, value)
+    for name in command.positionals:
+        if options[name].kind == list[str] and (places or not hasattr(arguments, name)):
+            given[name], places = list(places), []
+        elif places:
+            given[name], *places = places
+    if places:
+        raise ConfigError(f"Expected nothing more, got {' '.join(places)!r}. See `{program} --help`.")
+    vars(arguments).update(read_options(options, given, "--{}".format, base=arguments))
+    return vars(arguments)
+
+
+def _read_words(program: str, command: Command, words: Sequence[str]) -> tuple[list[_Flag], list[str]]:
+    """Reads words as flags, each with the keys that it stands for and its value; and what is given by place."""
+    flags: list[_Flag] = []
+    places: list[str] = []
+    rest = deque(words)
+    while rest:
+        word = rest.popleft()
+        if not word.startswith("-") or word == "-":
+            places.append(word)
+            continue
+        flag, equals, value = word.partition("=")
+        path = _path_of(program, command, flag)
+        kind = command.flags.get(".".join(path), Any)
+        has_value = bool(rest) and not rest[0].startswith("--")
+        if kind is bool:
+            has_value = has_value and rest[0].lower() in ("true", "false", "yes", "no")
+        if not equals and not has_value and kind is not bool:
+            raise ConfigError(f"Expected a value after {flag} ({in_words(kind)}), got none.")
+        if not equals:
+            value = rest.popleft() if has_value else "true"
+        flags.append((path, value))
+    return flags, places
+
+
+def _path_of(program: str, command: Command, flag: str) -> list[str]:
+    """The option that a flag stands for, and keys within its value.
+
+    Raises:
+        ConfigError: there is no such option.
+    """
+    name, *keys = flag.removeprefix("--").split(".")
+    name, whole = name.replace("-", "_"), flag.removeprefix("--").replace("-", "_")
+    if whole in command.flags:
+        return whole.split(".")
+    if keys and _takes_mapping(command.flags.get(name)):
+        return [name, *keys]  # which stay as they are
+    near = hint(whole, command.flags, "--")
+    raise ConfigError(f"Expected flags that `{program}` has, got {flag}.{near} See `{program} --help`.")
+
+
+def _merged(name: str, kind: Any, now: Any, keys: Sequence[str], text: str) -> Any:
+    """The value of an option when the text of a flag is added to it: of the whole, or of a key in it."""
+    is_group, value = dataclass_in(kind) is not None, text
+    if (keys and not is_group) or (text.lstrip().startswith("{") and (is_group or _takes_mapping(kind))):
+        value = load_yaml(text)
+    if is_group and not isinstance(now, dict):
+        now = {}  # what is not given stays as it is
+    if not keys:
+        return value
+    if isinstance(now, str) and str in members_of(kind):
+        now = {"part" if name in KINDS else "preset": now}
+    return changed(now, keys, value)
+
+
+def _read_config(command: Command, value: str) -> dict[str, Any]:
+    """Reads a YAML file of settings, by path or by the name of a shipped one."""
+    path = Path(value).expanduser()
+    if not path.is_file():
+        path = command.shipped.get(value, path)
+    if not path.exists():
+        among = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
+        near = [*command.shipped, *(str(path.parent / other.name) for other in path.parent.glob("*.y*ml"))]
+        raise ConfigError(
+            f"Expected --config as a YAML file{among}, got {value!r}, which is not there.{hint(str(path), near)}"
+        )
+    content = read_yaml(path)
+    if not isinstance(content, dict | None):
+        raise ConfigError(f"Expected {path} to hold settings as `name: value`, got {type(content).__name__}.")
+    settings: dict[str, Any] = {}
+    for key, item in (content or {}).items():
+        settings = changed(settings, str(key).split("."), item)
+    return settings
+
+
+def _print_help(program: str, description: str, commands: Mapping[str, Command]) -> None:
+    print(f"usage: {program} COMMAND …\n\n{description}\n\ncommands, each with a --help of its own:")
+    width = max(map(len, commands))
+    for name, command in commands.items():
+        print(f"  {name:{width}}  {_summary(command.function)}")
+
+
+def _print_help_of(program: str, command: Command) -> int:
+    from docstring_parser import parse
     from jsonargparse import ArgumentParser
 
-    parser = ArgumentParser(exit_on_error=False, description=_summary(command.function))
-    shipped = f", or one of {', '.join(known.shipped)}" if known.shipped else ""
-    parser.add_argument(
-        "--config", action="config", help=f"Path of a YAML file with these settings{shipped}."
-    )
-    hints = get_type_hints(command.function)
-    for positional in command.positionals:
-        rest = {"type": str, "nargs": "*", "default": []} if hints[positional] == list[str] else {}
-        parser.add_argument(
-            positional,
-            **({"type": hints[positional]} | rest),
-            help=_argument_help(command.function, positional),
-        )
+    parser = ArgumentParser(prog=program, description=_summary(command.function))
+    shipped = f", or one of {', '.join(command.shipped)}" if command.shipped else ""
+    about = f"Path of a YAML file with these settings{shipped}."
+    parser.add_argument("--config", action="config", help=about)
+    documented = {p.arg_name: p.description for p in parse(inspect.getdoc(command.function) or "").params}
+    for name in command.positionals:
+        many: dict[str, Any] = {"nargs": "*"} if command.options[name].kind == list[str] else {}
+        parser.add_argument(name, type=str, help=documented.get(name), **many)
     skip: set[str | int] = set(command.positionals)
     if command.settings:
         parser.add_class_arguments(command.settings, as_group=False)
-        skip.add(next(iter(hints)))
+        skip.add(next(iter(inspect.signature(command.function).parameters)))
     parser.add_function_arguments(command.function, as_group=False, skip=skip)
-    return parser
+    parser.print_help()
+    return 0
+
+
+def _takes_mapping(kind: Any) -> bool:
+    return any(get_origin(member) is dict for member in members_of(kind))
 
 
 def _refuse(program: str, message: str) -> int:
@@ -168,7 +324,7 @@ def _refuse(program: str, message: str) -> int:
     return 2
 
 
-def _unusable(error: OSError, known: Known) -> str:
+def _unusable(error: OSError, command: Command | None) -> str:
     """Says which file or folder the system refused, and what to do."""
     reason = error.strerror or str(error)
     if not error.filename:
@@ -176,17 +332,10 @@ def _unusable(error: OSError, known: Known) -> str:
     path = Path(str(error.filename))
     if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"could not use {path}: {reason}"
-    there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
-    remedy = "Choose another place with --out, or change" if "out" in known.kinds else "Change"
-    return f"could not use {path.absolute()}: {reason}. {remedy} the permissions of {there}."
+    existing = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+    remedy = "Choose another place with --out, or change" if command and "out" in command.flags else "Change"
+    return f"could not use {path.absolute()}: {reason}. {remedy} the permissions of {existing}."
 
 
 def _summary(function: Callable[..., Any]) -> str:
     return (inspect.getdoc(function) or "").splitlines()[0]
-
-
-def _argument_help(function: Callable[..., Any], name: str) -> str:
-    from docstring_parser import parse
-
-    documented = parse(inspect.getdoc(function) or "").params
-    return next((p.description or "" for p in documented if p.arg_name == name), "")

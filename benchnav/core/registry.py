@@ -32,21 +32,21 @@ from typing import Any
 
 import benchnav
 from benchnav.core.errors import ConfigError
-from benchnav.core.options import (
+from benchnav.core.settings import (
     NO_DEFAULT,
     Option,
     call,
     config_class,
-    from_text,
     gone_options,
     hint,
     list_options,
+    load_yaml,
+    of,
     one_line,
     parameters,
     plain,
-    refuse_unknown,
-    type_name,
-    typed,
+    read,
+    read_options,
 )
 from benchnav.core.sources import (
     attribute,
@@ -77,7 +77,6 @@ __all__ = [
     "read_part",
     "register",
     "take",
-    "type_name",
 ]
 
 KINDS = ("planner", "model", "risk", "robot", "objective")
@@ -192,7 +191,10 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         name, option = _first_option(kind, source, text)
         if name in options:
             raise ConfigError(f"Expected option {name!r} of {kind} {text!r} once, got {options[name]!r} too.")
-        options = {name: from_text(f"{kind} {source!r}", name, option, value), **options}
+        value = read(
+            option.kind, load_yaml(value) if option.kind is Any else value, of(f"{kind} {source!r}"), name
+        )
+        options = {name: value, **options}
     place = source.rpartition(":")[0]
     label = fields.get("label") or (text[len(place) + 1 :] if place else text)
     return Part(part=source, label=str(label), options=options)
@@ -204,20 +206,15 @@ def complete(kind: str, part: Part) -> Part:
     Raises:
         ConfigError: there is no such part or option, or a value is of another type.
     """
-    owner = f"{kind} {part.part!r}"
     target = find(kind, part.part).target
-    known, given = options_of(kind, target), _typed_options(kind, part, target)
-    options = {}
-    for name, option in known.items():
-        value = given.get(name, option.default)
-        if value is NO_DEFAULT:
-            raise ConfigError(
-                f"Expected option {name!r} of {owner} as {type_name(option.kind)}, got none. It has no default."
-            )
+    given, options = _read_options(kind, part, target), {}
+    for name, option in options_of(kind, target).items():
         try:
-            options[name] = plain(value)
+            options[name] = plain(given.get(name, option.default))
         except ConfigError as error:
-            raise ConfigError(f"Option {name!r} of {owner} cannot be recorded. {error}") from error
+            raise ConfigError(
+                f"Option {name!r} of {kind} {part.part!r} cannot be recorded. {error}"
+            ) from error
     return Part(part=part.part, label=part.label, options=options)
 
 
@@ -239,8 +236,8 @@ def make(kind: str, part: str | Mapping[str, Any] | Part, **given: Any) -> Any:
     owner = f"{kind} {part.part!r}"
     target = find(kind, part.part).target
     complete(kind, part)
-    arguments = _typed_options(kind, part, target)
-    config = config_class(target, _GIVEN.get(kind, ()))
+    arguments = _read_options(kind, part, target)
+    config = config_class(target, _skipped(kind, target))
     if config:
         arguments = {"config": call(f"options of {owner}", config, arguments)}
     arguments |= {name: value for name, value in given.items() if name in parameters(target)}
@@ -318,10 +315,7 @@ def options_of(kind: str, target: Any) -> dict[str, Option]:
     Parameters that are given by the caller (an objective's `robot` and `goal_radius_m`, a risk measure's mixture)
     are none.
     """
-    skipped = _GIVEN.get(kind, ())
-    if kind == "risk" and not inspect.isclass(target):
-        skipped += tuple(parameters(target))[:1]
-    return list_options(target, skipped)
+    return list_options(target, _skipped(kind, target))
 
 
 def _checked(kind: str) -> str:
@@ -356,10 +350,16 @@ def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
     return next(iter(known.items()))
 
 
-def _typed_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
-    owner, known = f"{kind} {part.part!r}", options_of(kind, target)
-    refuse_unknown(owner, part.options, known, gone=gone_options(target, _GIVEN.get(kind, ())))
-    return {name: typed(owner, name, known[name], value) for name, value in part.options.items()}
+def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
+    gone = gone_options(target, _skipped(kind, target))
+    return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"), gone=gone)
+
+
+def _skipped(kind: str, target: Any) -> tuple[str, ...]:
+    """Parameters that are no options, since the program gives them."""
+    if kind == "risk" and not inspect.isclass(target):
+        return tuple(parameters(target))[:1]
+    return _GIVEN.get(kind, ())
 
 
 def _unknown(kind: str, source: str) -> ConfigError:

@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.core.options import hint, one_line
+from benchnav.core.settings import hint, one_line
 from benchnav.core.shipped import PACKAGE
 
 # Modules and names of earlier versions, with what users import from today.

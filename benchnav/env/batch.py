@@ -25,9 +25,8 @@ from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.realisation import check_known
-from benchnav.planning.world.settings import read_world
 from benchnav.planning.world.simulation import Simulation, SimulationState
-from benchnav.planning.world.world import World
+from benchnav.planning.world.world import World, read_world
 
 SUCCESS_REWARD = 10.0
 LOST_REWARD = -10.0

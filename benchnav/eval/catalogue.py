@@ -5,12 +5,13 @@ import json
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.core.options import dataclass_in, list_options, plain
 from benchnav.core.registry import Option
+from benchnav.core.settings import dataclass_in, list_options, plain
 from benchnav.core.tables import Table, print_table
 
 TITLES = {
@@ -120,8 +121,18 @@ def _option_lines(options: dict[str, Option], prefix: str = "") -> Iterator[str]
         if config and option.default is not None:
             yield from _option_lines(_with_values(list_options(config), option.default), f"{prefix}{name}.")
             continue
-        kind = "" if option.kind is Any else f": {registry.type_name(option.kind)}"
+        kind = "" if option.kind is Any else f": {_type_name(option.kind)}"
         yield f"{prefix}{name}{kind}{_default(option.default)}"
+
+
+def _type_name(kind: Any) -> str:
+    """A type as people write it in code."""
+    members = get_args(kind)
+    if get_origin(kind) in (Union, UnionType):
+        return " | ".join(map(_type_name, members))
+    if kind is NoneType:
+        return "None"
+    return kind.__name__ if isinstance(kind, type) and not members else str(kind).replace("typing.", "")
 
 
 def _with_values(options: dict[str, Option], value: Any) -> dict[str, Option]:

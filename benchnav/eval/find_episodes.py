@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.options import hint
+from benchnav.core.settings import hint
 from benchnav.eval.experiment.condition import NOT_USED, Condition
 from benchnav.eval.experiment.unit import Extent, Unit, units
 from benchnav.eval.folder.folder import open_run

@@ -1,16 +1,12 @@
 """Settings of the two learned halves of a model; light to import, so that commands start fast."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.options import list_options, refuse_unknown, typed
 
 DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
-
-Kind = TypeVar("Kind")
 
 _SEEDS = 2**63  # PyTorch's generators take no others
 
@@ -198,21 +194,6 @@ def check_seed(seed: int, count: int = 1) -> None:
     """
     if not 0 <= seed <= _SEEDS - count:
         raise ConfigError(f"Expected `seed` in 0–{_SEEDS - count}, got {seed}.")
-
-
-def rebuild(kind: type[Kind], settings: Mapping[str, Any]) -> Kind:
-    """Makes settings again of what a checkpoint holds of them.
-
-    Args:
-        kind: one of the classes here.
-        settings: its fields, as JSON has them; what is not there has its default.
-
-    Raises:
-        ConfigError: there are others, or a value is of another type or cannot be.
-    """
-    owner, known = kind.__name__, list_options(kind)
-    refuse_unknown(owner, settings, known)
-    return kind(**{name: typed(owner, name, known[name], value) for name, value in settings.items()})
 
 
 def _check_rate(name: str, value: float) -> None:

@@ -295,7 +295,7 @@ def test_faults_of_consecutive_maps_are_one_line(datagen: Call, capsys) -> None:
         (
             "maps: 40",
             "mapps: 40",
-            "`splits` among scenario, maps, solvable, got 'mapps'. Did you mean 'maps'?",
+            "`splits.train` among scenario, maps, solvable, got 'mapps'. Did you mean 'maps'?",
         ),
         (
             "{preset: hs, relief_m",
@@ -446,7 +446,7 @@ def test_show_of_a_dataset_of_synthesis_1_tells_of_no_soft_spots(datagen: Call, 
         ("occupancy=[1.0]", "`occupancy`"),
         (
             "classes.dune_sand.soft.wieght=0.3",
-            "`classes.soft` among weight, mean, std, got 'wieght'. Did you mean 'weight'?",
+            "`classes.dune_sand.soft` among weight, mean, std, got 'wieght'. Did you mean 'weight'?",
         ),
     ],
 )
@@ -519,7 +519,7 @@ def test_an_override_names_an_item_of_a_list_by_its_name() -> None:
     shipped = load_recipe("paper-v1", ["id=rough", "classes.gravel.noise=0.3"])
     assert {item.name: item for item in shipped.classes}["gravel"].noise == 0.3
     for wrong in ("classes.dune.noise=1", "classes.3.noise=1", "occupancy.first=1"):
-        with pytest.raises(ConfigError, match="something in the recipe"):
+        with pytest.raises(ConfigError, match="Expected a name among"):
             load_recipe("stakes-v1", ["id=deep", wrong])
 
 
@@ -527,7 +527,7 @@ def test_datasets_are_made_listed_and_shown_without_pytorch(tmp_path: Path) -> N
     code = (
         "import sys; from benchnav.datagen.cli import main\n"
         "try: main()\nexcept SystemExit as ended: assert not ended.code, ended.code\n"
-        "print('torch' in sys.modules)"
+        "print(any(name in sys.modules for name in ('torch', 'lightning', 'matplotlib')))"
     )
     for words in (
         ["create", "tiny-v1", *SMALL, "--splits", "[train]", "--out", "d.h5"],

@@ -71,10 +71,8 @@ class Publication:
 
     def __post_init__(self) -> None:
         """Checks what programs read."""
-        if not re.fullmatch(r"https?://\S+|[A-Za-z0-9][A-Za-z0-9.+-]*", self.license):
-            raise ConfigError(
-                f"Expected `license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {self.license!r}."
-            )
+        if not re.fullmatch(r"https?://\S+", self.license):
+            _check_licence(self.license)
         if not self.creator.strip():
             raise ConfigError("Expected `creator` to be a name, got an empty one.")
         if self.url and not re.fullmatch(r"https?://\S+", self.url):
@@ -89,6 +87,21 @@ class Publication:
         """Where the licence is to be read."""
         is_url = self.license.startswith("http")
         return self.license if is_url else f"https://spdx.org/licenses/{self.license}.html"
+
+
+def _check_licence(name: str) -> None:
+    """Refuses what is no single name of the SPDX list."""
+    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+
+    try:
+        listed = str(canonicalize_license_expression(name))
+    except InvalidLicenseExpression:
+        listed = ""
+    if listed != name or not re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", name):
+        near = f" Did you mean {listed!r}?" if listed not in ("", name) else ""
+        raise ConfigError(
+            f"Expected `license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {name!r}.{near}"
+        )
 
 
 def is_ours(dataset: TerrainDataset, splits: Sequence[str]) -> bool:

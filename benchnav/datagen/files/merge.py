@@ -18,8 +18,7 @@ from benchnav.core.store import building, real_place, restore, sole_writer
 from benchnav.datagen import schema
 from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, is_one_file, named_errors, whole
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
-from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
-from benchnav.datagen.recipe.rules import check_name
+from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (

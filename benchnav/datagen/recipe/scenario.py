@@ -6,7 +6,7 @@ scenario's `severity` s moves every number of it from `std` (s = 0) to the prese
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from benchnav.core.errors import ConfigError
-from benchnav.datagen.recipe.plain_data import parse, plain
+from benchnav.core.settings import of, plain, read
 
 RECIPES = Path(__file__).parent
 PRESETS = RECIPES / "presets.yaml"
@@ -117,9 +117,9 @@ def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
         raise ConfigError(
             f"Expected `severity` of scenario {name!r} to be a finite number, got {severity!r}."
         )
-    base, full = (parse(Scenario, presets[key]) for key in ("std", preset))
+    base, full = (read(Scenario, presets[key], of(f"preset {key!r}")) for key in ("std", preset))
     changes = {key: value for key, value in entry.items() if key not in ("preset", "severity")}
-    return {**plain(asdict(blend(base, full, severity))), **changes}
+    return {**plain(blend(base, full, severity)), **changes}
 
 
 def find_series(splits: Iterable[str]) -> SeriesOfShifts:

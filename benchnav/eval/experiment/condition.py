@@ -19,13 +19,13 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
+from benchnav.core.settings import of, read
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.sweep import each_mapping, each_part
-from benchnav.planning.free_space import FreeSpace, Rules
+from benchnav.planning.free_space import Rules
 from benchnav.planning.problem import Task
 from benchnav.planning.risk import RiskMeasure
-from benchnav.planning.world.settings import read_world
-from benchnav.planning.world.world import World
+from benchnav.planning.world.world import World, read_world
 
 PART_KINDS = ("model", "risk", "planner", "robot", "objective")
 # Columns of `Condition.labels`, in the order of tables.
@@ -131,13 +131,12 @@ def condition_from(about: Mapping[str, Any]) -> Condition:
         kind: Part(part=value[kind]["part"], label=labels[kind], options=value[kind]["options"])
         for kind in PART_KINDS
     }
-    rules = Rules(**{**value["rules"], "free_space": FreeSpace(**value["rules"]["free_space"])})
     return Condition(
         data=value["data"],
         scenario=value["split"].removeprefix("test/"),
         **parts,
-        rules=rules,
-        world=World.from_dict(value["world"]),
+        rules=read(Rules, value["rules"], of("rules")),
+        world=read(World, {"time_budget_s": None} | value["world"], of("world")),
         world_label=labels["world"],
         blind=labels["model"] == NOT_USED,
     )

@@ -3,7 +3,7 @@
 `condition` makes conditions of a suite. This module imports nothing heavy, so that the command's help is quick.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from benchnav.core.errors import ConfigError
@@ -97,7 +97,3 @@ class Suite:
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Gives the suite as plain data for JSON."""
-        return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(self).items()}

@@ -7,8 +7,8 @@ from typing import Any
 
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.core.options import typed
 from benchnav.core.registry import Part
+from benchnav.core.settings import of, read
 
 
 def each_part(kind: str, part: Part) -> list[Part]:
@@ -54,7 +54,7 @@ def each_mapping(given: Any) -> list[Any]:
 
 def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
     try:
-        typed(f"{kind} {source!r}", name, option, value)
+        read(option.kind, value, of(f"{kind} {source!r}"), name)
     except ConfigError:
         return False
     return True

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.options import one_line
+from benchnav.core.settings import one_line
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS

@@ -13,7 +13,7 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.options import one_line
+from benchnav.core.settings import one_line
 from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError
-from benchnav.core.options import one_line
+from benchnav.core.settings import one_line
 from benchnav.eval.run.clock import Clock
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions

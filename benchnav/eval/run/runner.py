@@ -14,6 +14,7 @@ from typing import Any
 
 from benchnav.core.device import find_device, gpu_name
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import plain
 from benchnav.core.store import Shard, sole_writer
 from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Suite
@@ -68,7 +69,7 @@ def run_suite(
         for line in caveats({"warnings": checked.warnings, "dropped": checked.dropped}):
             say(line)
         work = Work(
-            suite=suite.to_dict(),
+            suite=plain(suite),
             conditions=checked.conditions,
             dropped=checked.dropped,
             warnings=checked.warnings,

@@ -15,9 +15,10 @@ from torchmetrics import Metric
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import of, read
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER
-from benchnav.models.config import ClassifierConfig, rebuild
+from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.network import build_network
 from benchnav.models.nets.temperature import fit_temperature, sample_logits
 from benchnav.models.nets.trainable import TrainableNetwork
@@ -177,7 +178,7 @@ class TerrainClassifier(TrainableNetwork):
             RuntimeError: the tensors do not fit them.
         """
         settings = {name: value for name, value in config.items() if name != "temperature"}
-        built = rebuild(ClassifierConfig, {**settings, "pretrained": False})
+        built = read(ClassifierConfig, {**settings, "pretrained": False}, of("ClassifierConfig"))
         temperature = config.get("temperature", 1.0)
         if not isinstance(temperature, int | float) or not 0 < temperature < math.inf:
             raise ConfigError(f"Expected a `temperature` > 0, got {temperature!r}.")

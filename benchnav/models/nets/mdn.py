@@ -15,10 +15,11 @@ from torch import Tensor, nn
 from torchmetrics import MeanSquaredError, Metric
 
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.settings import of, read
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import Checkpoint, refitting
-from benchnav.models.config import ClassifierConfig, MDNConfig, rebuild
+from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import TrainableNetwork
 
@@ -185,7 +186,7 @@ class MixtureDensityNetwork(TrainableNetwork):
             ConfigError: the settings are not those of a mixture-density network.
             RuntimeError: the tensors do not fit them.
         """
-        built = rebuild(MDNConfig, {**config, "pretrained": False})
+        built = read(MDNConfig, {**config, "pretrained": False}, of("MDNConfig"))
         network = cls(built, torch.zeros(3), torch.ones(3), torch.ones(()))
         network.load_state_dict(tensors)
         return network.eval()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from benchnav.core.errors import ConfigError, quiet
-from benchnav.core.options import hint, one_line
+from benchnav.core.settings import hint, one_line
 from benchnav.models.config import DEEPEST, ClassifierConfig
 
 _DETAIL_CHANNELS = 32

@@ -56,6 +56,8 @@ def evaluate(
         raise ConfigError(f"Expected `maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
     _check_targets(out, json, overwrite)
     dataset = TerrainDataset(find_dataset(data))
+    if splits == []:
+        raise ConfigError(f"Expected `splits` among {', '.join(dataset.splits)}, got none.")
     for split in splits or ():
         dataset.map_count(split)  # refuses an unknown one before the slow imports
 

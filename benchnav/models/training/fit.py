@@ -27,7 +27,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from benchnav.core.device import find_device
 from benchnav.core.errors import CheckpointError, ConfigError, quiet
-from benchnav.core.options import one_line
+from benchnav.core.settings import one_line
 from benchnav.core.store import sole_writer, write_text
 from benchnav.models.training.callbacks import History, WholeFiles, measured, progress
 

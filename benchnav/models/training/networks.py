@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.options import one_line
+from benchnav.core.settings import one_line
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import Part, as_stored, member_names
 from benchnav.models.config import ClassifierConfig, MDNConfig

@@ -1,16 +1,19 @@
 """World: what traversability does to a robot, as a value; and the presets of world and rules."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import hint, plain, read
 from benchnav.planning.free_space import FreeSpace, Rules
 
 NOISES = ("resampled", "stored", "frozen")
+
+_BUDGETS = ("time_budget_s", "time_budget_ratio")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,20 +114,8 @@ class World:
 
     def to_dict(self) -> dict[str, Any]:
         """All that bears on what happens, as plain data for JSON; what the noise does not use is left out."""
-        plain = {name: value for name, value in asdict(self).items() if value is not None}
-        if self.noise != "frozen":
-            del plain["correlation_m"]
-        return plain
-
-    @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> "World":
-        """Reads what `to_dict` gave."""
-        settings = dict(plain)
-        if "immobile" in plain:
-            settings["immobile"] = Immobile(**plain["immobile"])
-        if "time_budget_ratio" in plain:
-            settings["time_budget_s"] = None
-        return cls(**settings)
+        unused = () if self.noise == "frozen" else ("correlation_m",)
+        return {n: value for n, value in plain(self).items() if value is not None and n not in unused}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,3 +145,60 @@ PRESETS: Mapping[str, Preset] = {
         rules=Rules(free_space=FreeSpace(by="mean", above=0.1), min_traversability=0.05),
     ),
 }
+
+
+def read_world(
+    world: Any, task: Any = None, short: Mapping[str, Any] | None = None
+) -> tuple[World, Rules, str]:
+    """Reads a world and the rules that go with it.
+
+    Args:
+        world: name of a preset, or a mapping of changes with the preset's name under `preset`; without it
+            they change the paper's.
+        task: a mapping of changes to the preset's rules, if there are any.
+        short: further changes to the world, for what `world` itself does not name.
+
+    Returns:
+        World, rules, and what tables call them: the preset's name and all that is changed.
+
+    Raises:
+        ConfigError: there is no such preset or field, or a value is of the wrong kind.
+    """
+    if not isinstance(world, Mapping | str):
+        raise ConfigError(f"Expected `world` as a mapping of settings, got {world!r}.")
+    given = {"preset": world} if isinstance(world, str) else dict(world)
+    name = given.pop("preset", "paper")
+    if name not in PRESETS:
+        raise ConfigError(
+            f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{hint(str(name), PRESETS)}"
+        )
+    preset = PRESETS[name]
+    has_budget = bool(set(_BUDGETS) & set(given))
+    given = {key: v for key, v in (short or {}).items() if not (has_budget and key in _BUDGETS)} | given
+    budgets = [key for key in _BUDGETS if given.get(key) is not None]
+    if len(budgets) == 1:  # of the two ways to give a time budget one takes the other's place
+        given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
+    changed_world = read(World, given, "`{}`".format, "world", preset.world)
+    if "correlation_m" in given and changed_world.noise != "frozen":
+        raise ConfigError(
+            f"Expected `world.correlation_m` with `world.noise` frozen, got it with {changed_world.noise!r}."
+        )
+    rules = read(Rules, {} if task is None else task, "`{}`".format, "task", preset.rules)
+    changes = _differences(preset.world, changed_world) + _differences(preset.rules, rules)
+    return changed_world, rules, " ".join([name, *changes])
+
+
+def _differences(preset: Any, made: Any) -> list[str]:
+    """What tables call the fields in which a value differs from its preset."""
+    changed = []
+    for f in fields(preset):
+        before, after = getattr(preset, f.name), getattr(made, f.name)
+        if before == after or (after is None and f.name != "immobile"):
+            continue
+        if isinstance(after, FreeSpace):
+            changed += _differences(before, after)
+        elif f.name == "immobile":
+            changed.append(f"immobile={after.below:g}/{after.for_s:g}s" if after else "immobile=none")
+        else:
+            changed.append(f"{f.name}={after:g}" if isinstance(after, float) else f"{f.name}={after}")
+    return changed

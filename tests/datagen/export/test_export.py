@@ -284,6 +284,13 @@ def test_what_is_there_is_refused_and_replaced_only_where_it_is_an_export(
         (["--fields", "[rbg]"], "`fields` among"),
         (["--maps-per-file", "-1"], "`maps_per_file` ≥ 0"),
         (["--license", "my own"], "`license` as a name"),
+        (
+            ["--license", "foo"],
+            "`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got 'foo'.",
+        ),
+        (["--license", "cc-by-4.0"], "got 'cc-by-4.0'. Did you mean 'CC-BY-4.0'?"),
+        (["--license", "LicenseRef-mine"], "got 'LicenseRef-mine'"),
+        (["--license", "MIT OR CC0-1.0"], "got 'MIT OR CC0-1.0'"),
         (["--creator", " "], "`creator` to be a name"),
         (["--url", "here"], "`url` to begin with https://"),
         (["--date", "tomorrow"], "`date` as YYYY-MM-DD"),

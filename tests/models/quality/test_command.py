@@ -139,6 +139,7 @@ def test_a_series_is_drawn_where_there_is_one(
         (["oracle", "--data", "DATA", "--out", "x", "--maps", "-1"], "maps"),
         (["oracle", "--data", "DATA", "--seed", "-1"], "Expected `seed` in 0–9223372036854775807, got -1."),
         (["oracle", "--data", "DATA", "--splits", "{a: 1}"], "got '{a: 1}'.\n"),
+        (["oracle", "--data", "DATA", "--splits", "[]"], "Expected `splits` among "),
         (["other", "--data", "DATA", "--out", "x"], "class table"),
         (["other", "--data", "DATA", "--out", "new/x", "--json", "y.json"], "class table"),
     ],

@@ -1,0 +1,377 @@
+"""Settings by type: plain data of YAML, JSON and command lines becomes dataclasses and options of parts, and back.
+
+The options of a class or function are its keyword parameters; where its one parameter is a dataclass named `config`,
+the fields of that are. A value is read by its annotated type: a dataclass here, key by key, so that a message can say
+which key is wrong; anything else by jsonargparse.
+"""
+
+import difflib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass, replace
+from enum import Enum
+from functools import cache, partial
+from pathlib import Path, PurePath
+from types import MappingProxyType, NoneType, SimpleNamespace, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from benchnav.core.errors import BenchnavError, ConfigError
+
+NO_DEFAULT = inspect.Parameter.empty
+
+# Names of earlier versions, with those of today.
+RENAMED = {
+    "instance": "map",
+    "instances": "maps",
+    "recorded": "record",
+    "slowest": "min_traversability",
+    "split": "splits",
+    "steps": "record",
+    "trials": "conditions",
+}
+
+Naming = Callable[[str], str]  # what users call a key; of an empty one, the whole
+
+_UNNAMED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+_WORDS = {
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    bool: "true or false",
+    NoneType: "null",
+    Any: "anything",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Option:
+    """One option.
+
+    Args:
+        kind: its type, as annotated; `Any` where it is not.
+        default: `NO_DEFAULT` where it has to be given.
+    """
+
+    kind: Any
+    default: Any
+
+
+# --- options of classes and functions ---------------------------------------------------------------
+
+
+def list_options(target: Callable[..., Any], skipped: Iterable[str] = ()) -> dict[str, Option]:
+    """Lists options by name, in order.
+
+    Args:
+        target: a class, or a function.
+        skipped: names of parameters that are no options.
+    """
+    target = config_class(target, skipped) or target
+    types = _types(target)
+    made: dict[str, Any] = {f.name: f.default_factory for f in fields(target)} if is_dataclass(target) else {}
+    return {
+        name: Option(
+            kind=types.get(name, Any),
+            default=parameter.default if made.get(name, MISSING) is MISSING else made[name](),
+        )
+        for name, parameter in parameters(target).items()
+        if name not in set(skipped)
+    }
+
+
+def config_class(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Any:
+    """The dataclass of a sole parameter `config`; None where there is no such parameter."""
+    if [name for name in parameters(target) if name not in set(skipped)] != ["config"]:
+        return None
+    return dataclass_in(_types(target).get("config"))
+
+
+def gone_options(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Mapping[str, str]:
+    """Options that were once there and what does their work now: `gone` of a class or of its `config`."""
+    return getattr(config_class(target, skipped) or target, "gone", {})
+
+
+def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Parameters that have names of their own; a class without a constructor has none."""
+    if inspect.isclass(target) and target.__init__ is object.__init__:
+        return {}
+    return {n: p for n, p in inspect.signature(target).parameters.items() if p.kind not in _UNNAMED}
+
+
+def _types(target: Any) -> dict[str, Any]:
+    """Types of parameters; one that cannot be told, such as a name imported for type checkers, is left out."""
+    if inspect.isclass(target) and not is_dataclass(target):
+        target = target.__init__
+    try:
+        return get_type_hints(target)
+    except Exception:
+        names = getattr(target, "__globals__", None) or vars(sys.modules.get(target.__module__, target))
+        found: dict[str, Any] = {}
+        for name, annotation in inspect.get_annotations(target).items():
+            with suppress(Exception):
+                found |= get_type_hints(SimpleNamespace(__annotations__={name: annotation}), names)
+        return found
+
+
+def call(what: str, target: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+    """Calls a user's class or function; whatever it raises ends in one line.
+
+    Raises:
+        ConfigError: it refuses its arguments.
+    """
+    try:
+        return target(**arguments)
+    except BenchnavError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"{what} could not be made: {one_line(error)}") from error
+
+
+# --- from plain data --------------------------------------------------------------------------------
+
+
+def of(owner: str) -> Naming:
+    """Names keys as those of an owner, such as "planner 'mppi'"."""
+    return lambda key: f"`{key}` of {owner}" if key else owner
+
+
+def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAULT) -> Any:
+    """Gives a value of a type.
+
+    Args:
+        kind: the type, as annotated.
+        value: plain data, or a value of the type; text is read as the command line reads it.
+        name: what users call a key.
+        key: where it stands, with dots; empty for the whole.
+        now: a value that this one takes the place of. Of a dataclass, what is not given stays as it is there.
+
+    Raises:
+        ConfigError: a key is unknown or missing, or a value is of another type or refused by its dataclass.
+    """
+    if kind is Any or (isinstance(kind, type) and type(value) is kind) or (value is None and now is None):
+        return value
+    config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
+    if config and isinstance(value, Mapping):
+        base = now if isinstance(now, config) else None
+        given = read_options(list_options(config), value, name, key, base, gone_options(config))
+        return call(name(key), partial(replace, base) if base else config, given)
+    if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):
+        if not all(isinstance(inner, str) for inner in value):
+            raise ConfigError(f"Expected names in {name(key)}, got {list(value)}. Quote numbers.")
+        return {inner: read(members[1], item, name, f"{key}.{inner}") for inner, item in value.items()}
+    if origin in (list, tuple) and any(map(dataclass_in, members[:1])) and isinstance(value, list | tuple):
+        named = zip(_names(value), value, strict=True)
+        return origin(read(members[0], item, name, f"{key}.{inner}") for inner, item in named)
+    if value is None and NoneType in members:
+        return None
+    try:
+        return _parsed(kind, value)
+    except ValueError as error:
+        got = "null" if value is None else repr(value)
+        near = hint(str(value), [member for member in members_of(kind) if isinstance(member, str)])
+        raise ConfigError(f"Expected {name(key)} as {in_words(kind)}, got {got}.{near}") from error
+
+
+def read_options(
+    known: Mapping[str, Option],
+    given: Mapping[str, Any],
+    name: Naming,
+    key: str = "",
+    base: Any = None,
+    gone: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Gives options of their types, by name.
+
+    Args:
+        known: what there is.
+        given: plain data by option.
+        name: what users call a key.
+        key: where they stand, with dots; empty for the whole.
+        base: a value whose attributes are what is not given.
+        gone: options that were once there, with what does their work now.
+
+    Raises:
+        ConfigError: as of `read`.
+    """
+    inner = f"{key}." if key else ""
+    for option in map(str, given):
+        if option not in known:
+            among = f"among {', '.join(known)}" if known else "none: it has none"
+            remedy = f" {gone[option]}" if option in gone else hint(option, known)
+            raise ConfigError(f"Expected keys of {name(key)} {among}, got {option!r}.{remedy}")
+    for option, about in known.items():
+        if about.default is NO_DEFAULT and option not in given and base is None:
+            raise ConfigError(f"Expected {name(inner + option)} as {in_words(about.kind)}, got none.")
+    return {
+        option: read(
+            known[option].kind, value, name, inner + option, getattr(base, option, known[option].default)
+        )
+        for option, value in given.items()
+    }
+
+
+def changed(data: Any, path: Sequence[str], value: Any) -> Any:
+    """A copy of plain data with one value set.
+
+    Args:
+        data: mappings, and lists whose items go by their `name`, as of terrain classes.
+        path: keys that lead to the value; mappings that are not there are made.
+        value: plain data.
+
+    Raises:
+        ConfigError: on the way is something that has no keys.
+    """
+    if not path:
+        return value
+    key, rest = path[0], path[1:]
+    if isinstance(data, list):
+        names = _names(data)
+        if key not in names:
+            raise ConfigError(f"Expected a name among {', '.join(names)}, got {key!r}.{hint(key, names)}")
+        return [changed(item, rest, value) if n == key else item for n, item in zip(names, data, strict=True)]
+    if not isinstance(data, Mapping | None):
+        raise ConfigError(f"Expected a mapping in which {'.'.join(path)!r} can be set, got {data!r}.")
+    return {**(data or {}), key: changed((data or {}).get(key), rest, value)}
+
+
+def load_yaml(text: str, place: str = "") -> Any:
+    """Reads YAML in which 1e-3 is a number.
+
+    Args:
+        text: the YAML.
+        place: where it stands, for messages.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    import yaml
+    from jsonargparse import get_loader
+
+    try:
+        content = get_loader("yaml")(text)
+        if isinstance(content, str) and isinstance(without_values := yaml.safe_load(text), dict):
+            return without_values  # which jsonargparse leaves as text
+        return content
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if place and mark else ""
+        wrong = getattr(error, "problem", None) or error
+        raise ConfigError(f"Expected YAML, got {place or repr(text)}{line}: {wrong}.") from error
+
+
+def read_yaml(path: Path) -> Any:
+    """Reads a YAML file; see `load_yaml`.
+
+    Raises:
+        ConfigError: it cannot be read, or is no YAML.
+    """
+    try:
+        return load_yaml(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise ConfigError(f"Expected a YAML file, got {str(path)!r}: {reason}.") from error
+
+
+def _names(items: Sequence[Any]) -> list[str]:
+    """What items of a list go by: their `name`, or their number."""
+    return [str(item.get("name", n)) if isinstance(item, Mapping) else str(n) for n, item in enumerate(items)]
+
+
+def _parsed(kind: Any, value: Any) -> Any:
+    from jsonargparse import ArgumentError
+
+    is_list = any(get_origin(member) in (list, tuple) for member in members_of(kind))
+    if (
+        isinstance(value, str)
+        and is_list
+        and str not in members_of(kind)
+        and not value.lstrip().startswith(("[", "("))
+    ):
+        value = f"[{value}]"
+    try:
+        parser = _parser(kind)
+        # The parser takes null, and anything but a mapping for a dataclass, for nothing given.
+        if value is None or is_dataclass(kind):
+            raise ValueError
+        return parser.instantiate(parser.parse_object({"value": value})).value
+    except (ArgumentError, TypeError) as error:
+        raise ValueError(one_line(error)) from error
+
+
+@cache
+def _parser(kind: Any) -> Any:
+    from jsonargparse import ArgumentParser
+
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_argument("--value", type=kind)
+    return parser
+
+
+# --- to plain data, and to words --------------------------------------------------------------------
+
+
+def plain(value: Any) -> Any:
+    """Gives a value as plain data for JSON.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    if isinstance(value, Mapping):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(item) for item in value]
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, bool | int | float | str | NoneType):
+        return value
+    raise ConfigError(f"Expected plain data (numbers, text, lists, mappings), got {value!r}.")
+
+
+def dataclass_in(kind: Any) -> Any:
+    """The dataclass that a type is or, as in `Config | None`, holds; None where there is none."""
+    return next((m for m in members_of(kind) if isinstance(m, type) and is_dataclass(m)), None)
+
+
+def members_of(kind: Any) -> tuple[Any, ...]:
+    """What a type allows: the types of a union, the values of a literal, or the type itself."""
+    if get_origin(kind) in (Union, UnionType):
+        return tuple(inner for member in get_args(kind) for inner in members_of(member))
+    return get_args(kind) if get_origin(kind) is Literal else (kind,)
+
+
+def in_words(kind: Any) -> str:
+    """A type as people call it."""
+    members, origin = get_args(kind), get_origin(kind)
+    if origin in (Union, UnionType):
+        return " or ".join(dict.fromkeys(map(in_words, members)))
+    if origin is Literal:
+        return " or ".join(map(repr, members))
+    if origin in (list, tuple):
+        inner = [in_words(member) for member in members if member is not ...]
+        return f"a list, each {inner[0]}" if len(inner) == 1 else f"a list [{', '.join(inner)}]"
+    if origin is dict or dataclass_in(kind):
+        return "a mapping"
+    return _WORDS.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def hint(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """A sentence with today's name or the nearest known one, beginning with a space; empty where none is near."""
+    known = list(known)
+    old = re.split(r"[-.]", name)[-1]
+    now = name.removesuffix(old) + RENAMED.get(old, old)
+    if now != name and now in known:
+        return f" It is now {prefix + now!r}."
+    close = difflib.get_close_matches(name, known, n=1)
+    return f" Did you mean {prefix + close[0]!r}?" if close else ""
+
+
+def one_line(error: BaseException) -> str:
+    """An error as one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
