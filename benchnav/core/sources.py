@@ -26,7 +26,8 @@ from benchnav.core.shipped import PACKAGE
 _MOVED = {
     **dict.fromkeys(("errors", "grid", "mixture", "registry", "terrain"), "benchnav"),
     "files": "benchnav.core.store",
-    **{name: f"benchnav.core.{name}" for name in ("copula", "cvar", "device", "drawing", "gridgraph", "rng")},
+    **{name: f"benchnav.core.{name}" for name in ("copula", "cvar", "device", "gridgraph", "rng")},
+    "drawing": "benchnav.core.figures",
     **{f"datagen.{name}": "benchnav.datagen" for name in ("create", "generate", "maps", "scenario", "store")},
     "datagen.latent": "benchnav.datagen.recipe.latent",
     **{f"models.predictor.{name}": "benchnav.models" for name in ("Model", "ModelFamily", "predict")},

@@ -107,7 +107,7 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
     ("eval run --device cpu", {"device": "cpu"}),
     ("datagen preview f --contact-sheet", {"file": "f", "contact_sheet": True}),
     ("datagen preview --contact_sheet f", {"file": "f", "contact_sheet": True}),
-    ("train all --data d --out o --half-precision=false", {"data": "d", "out": "o", "half_precision": False}),
+    ("train all --data d --out o --half-precision=false", {"data": "d", "out": "o", "options": {"half_precision": False}}),
     ("datagen create tiny-v1 --seed -3", {"recipe": "tiny-v1", "overrides": [], "seed": -3}),
     ("datagen create tiny-v1 --seed null", {"recipe": "tiny-v1", "overrides": []}),
     # lists
@@ -153,7 +153,7 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
     ("eval run --planner-options.single-class.a_b 1",
      {"suite": {"planner_options": {"single-class": {"a_b": 1}}}}),
     ("train mdn --data d --out o --trainer.devices 2 --trainer.precision 32-true",
-     {"data": "d", "out": "o", "trainer": {"devices": 2, "precision": "32-true"}}),
+     {"data": "d", "out": "o", "options": {"trainer": {"devices": 2, "precision": "32-true"}}}),
     ("train classifier --data d --out o --classifier.encoder resnet34 --classifier.pretrained",
      {"data": "d", "out": "o", "classifier": {"encoder": "resnet34", "pretrained": True}}),
     ("train classifier --data d --out o --classifier.decoder-channels 8,4",
@@ -183,7 +183,7 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
         "data": "d.h5", "out": "ckpt",
         "classifier": {"dice": 0.25, "decoder_channels": (8, 4), "encoder": "resnet34"}}),
     ("train classifier --config train.yaml --config seed.yaml", {
-        "data": "other.h5", "out": "ckpt", "seed": 3, "classifier": {"dice": 0.5, "decoder_channels": (8, 4)}}),
+        "data": "other.h5", "out": "ckpt", "options": {"seed": 3}, "classifier": {"dice": 0.5, "decoder_channels": (8, 4)}}),
 ]  # fmt: skip
 
 
