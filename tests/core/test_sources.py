@@ -242,3 +242,38 @@ def test_a_part_that_is_named_by_a_module_of_an_earlier_version_is_answered_too(
 def test_what_is_moved_is_where_the_table_says() -> None:
     for old, place in sources._MOVED.items():
         assert importlib.util.find_spec(place.partition(",")[0]), old
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package in place of this one: `unit` imports `rows`, late; nothing imports `drawing`."""
+    place = tmp_path / "benchnav"
+    place.mkdir()
+    (place / "__init__.py").write_text("from benchnav import drawing\n")
+    (place / "unit.py").write_text("def run():\n    from benchnav import rows\n    return rows\n")
+    (place / "rows.py").write_text(
+        '"""Rows."""\n\n\ndef row():\n    """One row."""\n    return 1  # of many\n'
+    )
+    (place / "drawing.py").write_text("colour = 'blue'\n")
+    monkeypatch.setattr(sources, "PACKAGE", place)
+    sources._module.cache_clear()
+    return place
+
+
+def digests() -> dict[str, str]:
+    sources._module.cache_clear()  # as a new process
+    return sources.package_modules(["benchnav.unit"])
+
+
+def test_modules_of_the_package_are_those_that_a_unit_imports(package: Path) -> None:
+    assert list(digests()) == ["benchnav.rows", "benchnav.unit"]
+
+
+def test_docstrings_comments_and_layout_change_no_module_digest_and_code_does(package: Path) -> None:
+    before, rows = digests(), package / "rows.py"
+    rows.write_text('def row():\n    """The one row, in other words."""\n\n    return (\n        1\n    )\n')
+    assert digests() == before
+    rows.write_text(rows.read_text().replace("1", "2"))
+    after = digests()
+    assert after["benchnav.rows"] != before["benchnav.rows"]
+    assert after["benchnav.unit"] == before["benchnav.unit"]
