@@ -1,6 +1,6 @@
 """Measures the series of shifts `shift-v1` for docs/scenarios.md: its tables and its figures.
 
-    .venv/bin/python docs/scenarios.py
+    .venv/bin/python benchmarks/scenarios.py
 
 takes some minutes on one thread, prints the tables and writes them between the markers of
 docs/scenarios.md, and draws docs/figures/scenarios-*.png. Every statistic is a function of means
@@ -31,7 +31,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import find_checkpoint
 from benchnav.models.quality.measure import pit
 
-DOCS, MODEL = Path(__file__).parent, "paper-v1"
+DOCS, MODEL = Path(__file__).parents[1] / "docs", "paper-v1"
 RESAMPLES, PAIRED_MAPS, CHUNK_MAPS, EXAMPLE = 1000, 200, 20, 13
 BEYOND: dict[str, Any] = {f"{preset}-150": {"preset": preset, "severity": 1.5} for preset in ("hg", "hs")}
 PAIRS: dict[str, Any] = {
@@ -386,7 +386,7 @@ def measure_series(model: FusedModel, recipe: Recipe) -> dict[str, Maps]:
     series: dict[str, Maps] = {}
     splits = {f"test/{name}": {"scenario": name, "maps": 100, "solvable": True} for name in BEYOND}
     data |= {"scenarios": data["scenarios"] | BEYOND, "splits": data["splits"] | splits}
-    longer = recipe_from_dict(data, "of docs/scenarios.py")
+    longer = recipe_from_dict(data, "of benchmarks/scenarios.py")
     for split in ["test/std", *sorted(set(longer.splits) - {"test/std"})]:
         spec = longer.splits[split]
         unasked = replace(longer, splits={split: replace(spec, solvable=False)})
