@@ -1,12 +1,19 @@
 """The command `benchnav-train`: train models and measure them."""
 
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from benchnav.core.command import INTERRUPTED, Command, Device, run
-from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig, check_seed
+from benchnav.models.config import (
+    ClassifierConfig,
+    LatentGPConfig,
+    MDNConfig,
+    NetworkConfig,
+    TrainOptions,
+    check_seed,
+)
 from benchnav.models.quality.command import evaluate
 
 if TYPE_CHECKING:
@@ -16,31 +23,6 @@ if TYPE_CHECKING:
 
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """How networks are trained.
-
-    Args:
-        seed: Root seed of weights, order and augmentation; members of an ensemble have SEED, SEED + 1, ….
-        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
-        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
-        workers: Processes that read maps ahead. The result is the same for any number.
-        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
-        half_precision: Store the weights of networks as float16.
-        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
-        overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
-    """
-
-    seed: int = 0
-    device: Device = "auto"
-    trainer: dict[str, Any] | None = None
-    workers: int = 0
-    in_memory: bool = False
-    half_precision: bool = True
-    resume: bool = False
-    overwrite: bool = False
 
 
 def train_classifier(
@@ -89,13 +71,13 @@ def train_gp(
 
     check_seed(seed)
     output_path(out)  # refuses addresses
-    options = FitOptions(device=device)
+    options = FitOptions(seed=seed, device=device, overwrite=overwrite)
     if data.endswith(ENDINGS):
-        train_gps_on_logs(data, out, gp, seed, options, overwrite)
+        train_gps_on_logs(data, out, gp, seed, options)
         return
     dataset = _open_dataset(data)
-    target = _open_target(out, dataset, ["gp"], options, overwrite)
-    target.add("gp", train_gps_on_maps(gp, dataset, seed, options))
+    target = _open_target(out, dataset, ["gp"], options)
+    target.add("gp", train_gps_on_maps(gp, dataset, seed, options.place))
 
 
 def train_all(
@@ -135,7 +117,7 @@ def _train(
     how: TrainOptions,
     data: str,
     out: str,
-    config: ClassifierConfig | MDNConfig,
+    config: NetworkConfig,
     gp: LatentGPConfig | None = None,
     members: int = 1,
 ) -> None:
@@ -154,22 +136,15 @@ def _train(
     dataset, trainer = _open_dataset(data), dict(how.trainer or {})
     # The length of training is the network's own setting, wherever it is said.
     config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
-    options = FitOptions(
-        folder=training_folder(out),
-        resume=how.resume,
-        trainer=trainer,
-        workers=how.workers,
-        in_memory=how.in_memory,
-        device=how.device,
-    )
+    options = FitOptions(**{**vars(how), "trainer": trainer, "folder": training_folder(out)})
     check_network(config, dataset, options)
     part = NETWORKS[type(config)].part
     parts = [member_name(index) for index in range(members)] if part == CLASSIFIER else [part]
     model = FUSED if part == CLASSIFIER else part
-    target = _open_target(out, dataset, [*([GP] if gp else []), *parts], options, how.overwrite, model)
-    if gp and not target.holds(GP, asdict(gp), how.seed, asdict(LatentGPConfig())):
-        target.add(GP, train_gps_on_maps(gp, dataset, how.seed, options))
-    train_parts(target, config, dataset, parts, how.seed, options, how.half_precision)
+    target = _open_target(out, dataset, [*([GP] if gp else []), *parts], options, model)
+    if gp and not target.holds(GP, gp, how.seed):
+        target.add(GP, train_gps_on_maps(gp, dataset, how.seed, options.place))
+    train_parts(target, config, dataset, parts)
     if not target.changed:
         print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
 
@@ -188,19 +163,14 @@ def _open_dataset(data: str) -> "TerrainDataset":
 
 
 def _open_target(
-    out: str,
-    dataset: "TerrainDataset",
-    parts: list[str],
-    options: "FitOptions",
-    overwrite: bool,
-    model: str = "fused",
+    out: str, dataset: "TerrainDataset", parts: list[str], options: "FitOptions", model: str = "fused"
 ) -> "Target":
     from benchnav.models.checkpoint import Checkpoint
     from benchnav.models.training.data import training_digest
     from benchnav.models.training.target import open_target
 
     fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
-    return open_target(Path(out), fresh, parts, training_digest(dataset), options, overwrite)
+    return open_target(Path(out), fresh, parts, training_digest(dataset), options)
 
 
 def main() -> None:

@@ -126,7 +126,8 @@ def test_each_command_uses_the_device_that_it_is_given(
         pass
 
     def begin(*given: Any, **named: Any) -> Any:
-        asked.append(next(value.place for value in given if isinstance(value, FitOptions)))
+        places = [value.place if isinstance(value, FitOptions) else value for value in given]
+        asked.append(next(value for value in places if isinstance(value, torch.device)))
         raise Enough
 
     def measure(model: Any, dataset: Any, splits: Any, seed: int, device: torch.device) -> Any:
@@ -135,10 +136,9 @@ def test_each_command_uses_the_device_that_it_is_given(
 
     # A trial of the network would ask the GPU that is not there.
     monkeypatch.setattr("benchnav.models.training.networks.check_network", lambda *_: None)
-    for name in ("networks.fit_network", "gps.fit"):
+    for name in ("networks.fit_network", "gps.fit_gps"):
         monkeypatch.setattr(f"benchnav.models.training.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
-    monkeypatch.setattr("benchnav.models.training.gps.find_soft_modes", lambda sums: (None, None))
     (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)
     data = str(tmp_path / "logs.csv") if command == "gp on logs" else str(dataset.path)
     cpu, cuda = ("--device", "cpu"), ("--device", "cuda")
@@ -230,12 +230,12 @@ def test_a_pool_is_calibrated_on_the_device(
     monkeypatch.setattr(networks, "fit_pool_temperature", fit_pool)
     monkeypatch.setattr(networks, "member_names", lambda checkpoint: ("classifier", "classifier-1"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    target = SimpleNamespace(
-        checkpoint=both, holds=lambda *words: True, set_pool_temperature=lambda value: None
-    )
     for device in ("cpu", "cuda"):
-        options = FitOptions(device=device)
-        networks.train_parts(
-            target, ClassifierConfig(), dataset, ["classifier", "classifier-2"], 0, options, True
-        )  # type: ignore[arg-type]
+        target = SimpleNamespace(
+            checkpoint=both,
+            options=FitOptions(device=device),
+            holds=lambda *words: True,
+            set_pool_temperature=lambda value: None,
+        )
+        networks.train_parts(target, ClassifierConfig(), dataset, ["classifier", "classifier-2"])  # type: ignore[arg-type]
     assert [place.type for place in given] == ["cpu", "cuda"]

@@ -208,7 +208,7 @@ def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pyte
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_write_bytes", killed)
+    monkeypatch.setattr(module, "write_text", killed)
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(folder, replace(there, model="new"))
     monkeypatch.undo()

@@ -223,7 +223,10 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
     [
         ("oracel", "Did you mean 'oracle'?"),
         ("./mine_of_tests.py:Constnat", "Did you mean 'Constant'?"),
-        ("./mine_of_tests.py:Constant:much", "as float such as 0.5, got 'much'"),
+        (
+            "./mine_of_tests.py:Constant:much",
+            "of model './mine_of_tests.py:Constant' as a number, got 'much'",
+        ),
         ("./mine_of_tests.py:Family", "which is a family of models"),
         (
             "./mine_of_tests.py:Nothing",

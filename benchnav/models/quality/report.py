@@ -169,13 +169,10 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
         if (whole or name not in _FILES_ONLY)
         and (name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values()))
     ]
-    headings = [COLUMNS[name][0] for name in names]
-    explained = [
-        (" ".join(heading.split()), COLUMNS[name][1]) for heading, name in zip(headings, names, strict=True)
-    ]
+    explained = [(" ".join(heading.split()), text) for heading, text in (COLUMNS[name] for name in names)]
     return Table(
         title=title,
-        headings=("split\n", "maps\n", *headings),
+        headings=("split\n", "maps\n", *(COLUMNS[name][0] for name in names)),
         numbers=True,
         rows=tuple(
             (split, str(qualities[split].maps), *(_decimal(row.get(name, math.nan)) for name in names))
@@ -197,7 +194,9 @@ def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> 
         scenario: [{"severity": severity, "split": split} for severity, split in pairs]
         for scenario, pairs in find_series(qualities).items()
     }
-    return json.dumps(_finite({**about, "splits": splits, "series": all_series}), indent=1) + "\n"
+    text = json.dumps({**about, "splits": splits, "series": all_series})
+    # JSON has no word for what is no number.
+    return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=1) + "\n"
 
 
 def quality_csv(qualities: Mapping[str, Quality]) -> str:
@@ -259,15 +258,6 @@ def _everything(quality: Quality) -> dict[str, Any]:
 
 def _decimal(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.4f}"
-
-
-def _finite(value: Any) -> Any:
-    """Puts None for what is no number, which JSON has no word for."""
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def caption(figure: str, splits: Iterable[str]) -> tuple[str, str]:

@@ -14,7 +14,7 @@ import signal
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,54 +29,47 @@ from benchnav.core.device import find_device
 from benchnav.core.errors import CheckpointError, ConfigError, quiet
 from benchnav.core.settings import one_line
 from benchnav.core.store import sole_writer, write_text
+from benchnav.models.config import TrainOptions
 from benchnav.models.training.callbacks import History, WholeFiles, measured, progress
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
+
+_PARTIAL = f".{STATE}.*.partial"  # what a kill in the middle of writing has left
 
 # Settings of Lightning's trainer that are made here, and those that the outcome does not depend on.
 _OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "accelerator", "fast_dev_run"}
 _OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "enable_autolog_hparams"}
 _OWN |= {"barebones", "num_sanity_val_steps", "use_distributed_sampler", "inference_mode"}
 _OWN |= {"model_registry", "profiler"}
+_DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
 _OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions:
+class FitOptions(TrainOptions):
     """How to train, whatever is trained.
 
     Args:
         folder: where logs and what is needed to go on are kept, in a folder for each part of a model;
             nothing is written when None.
-        resume: go on with the training that was interrupted there, if there is one.
-        trainer: settings of Lightning's trainer by name.
-        in_memory: hold all maps in memory, in place of reading them as they are asked for.
-        workers: processes that read maps ahead; the outcome is the same for any number.
-        device: where networks are trained, calibrated and measured: "cpu", "cuda", or "auto" for CUDA where there is
-            a GPU.
 
     Raises:
         ConfigError: `workers` is below 0; there is no such device; the trainer has no such setting, or it is set here.
     """
 
     folder: Path | None = None
-    resume: bool = False
-    trainer: Mapping[str, Any] = field(default_factory=dict)
-    in_memory: bool = False
-    workers: int = 0
-    device: str = "auto"
 
     def __post_init__(self) -> None:
         """Checks the settings by name."""
         if self.workers < 0:
             raise ConfigError(f"Expected `workers` ≥ 0, got {self.workers}.")
-        if "accelerator" in self.trainer:
+        asked = self.trainer or {}
+        if "accelerator" in asked:
             raise ConfigError("Expected no `trainer.accelerator`, which is now `device`: auto, cpu or cuda.")
-        known = sorted(set(inspect.signature(lightning.Trainer.__init__).parameters) - _OWN)
-        unknown = sorted(set(self.trainer) - set(known))
-        if unknown:
+        known = sorted(_DEFAULTS.keys() - _OWN)
+        if unknown := sorted(asked.keys() - known):
             raise ConfigError(f"Expected settings of `trainer` among {', '.join(known)}, got {unknown[0]!r}.")
-        devices, processors = self.trainer.get("devices", 1), os.cpu_count() or 1
+        devices, processors = asked.get("devices", 1), os.cpu_count() or 1
         if self.place.type == "cpu" and isinstance(devices, int) and not 1 <= devices <= processors:
             raise ConfigError(
                 f"Expected `trainer.devices` in 1–{processors}, as many as there are processors, got {devices}."
@@ -90,18 +83,18 @@ class FitOptions:
     @property
     def trainer_settings(self) -> dict[str, Any]:
         """The settings of the trainer on which the outcome of a network's training depends, as plain data."""
-        defaults = inspect.signature(lightning.Trainer.__init__).parameters
         chosen = {
             name: value
             for name, value in self.chosen().items()
-            if name not in _OF_NO_ACCOUNT and value != defaults[name].default
+            if name not in _OF_NO_ACCOUNT and value != _DEFAULTS[name].default
         }
         return json.loads(json.dumps(chosen, default=str, sort_keys=True))
 
     def chosen(self, **trainer: Any) -> dict[str, Any]:
         """All settings of the trainer, of those given here and others, by name."""
-        chosen: dict[str, Any] = {"devices": 1, **trainer, **self.trainer, "accelerator": self.place.type}
-        return {"precision": default_precision(self.place.type), **chosen}
+        kind = self.place.type
+        first = {"precision": default_precision(kind), "devices": 1}
+        return {**first, **trainer, **(self.trainer or {}), "accelerator": kind}
 
 
 def fit(
@@ -162,15 +155,15 @@ def is_first_process() -> bool:
     return not getattr(rank_zero_only, "rank", 0)
 
 
-def interrupted(folder: Path, parts: list[str]) -> list[str]:
-    """Names the parts whose training was interrupted in `folder`."""
-    return [part for part in parts if (folder / part / STATE).exists()]
+def interrupted(options: FitOptions, parts: list[str]) -> list[str]:
+    """Names the parts whose training was interrupted in the folder of some options."""
+    return [part for part in parts if options.folder and (options.folder / part / STATE).exists()]
 
 
-def forget(folder: Path, part: str) -> None:
+def forget(options: FitOptions, part: str) -> None:
     """Drops what was kept to go on with a part's training; its logs stay."""
-    for path in (folder / part / STATE, *_partial(folder / part)):
-        path.unlink(missing_ok=True)
+    if options.folder and is_first_process():
+        _drop(options.folder / part, STATE, _PARTIAL)
 
 
 def default_precision(accelerator: str) -> str:
@@ -197,15 +190,15 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
             )
         return state
     if is_first_process():
-        for old in (state, folder / HISTORY, *folder.glob("events.out.tfevents.*"), *_partial(folder)):
-            old.unlink(missing_ok=True)
+        _drop(folder, STATE, _PARTIAL, HISTORY, "events.out.tfevents.*")
         write_text(folder / SETTINGS, json.dumps(described, indent=1) + "\n")
     return None
 
 
-def _partial(folder: Path) -> Iterator[Path]:
-    """What a kill in the middle of writing has left."""
-    return folder.glob(f".{STATE}.*.partial")
+def _drop(folder: Path, *patterns: str) -> None:
+    for pattern in patterns:
+        for path in folder.glob(pattern):
+            path.unlink()
 
 
 def _run(

@@ -11,7 +11,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import Part, as_stored, member_names
-from benchnav.models.config import ClassifierConfig, MDNConfig
+from benchnav.models.config import ClassifierConfig, MDNConfig, NetworkConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityNetwork
 from benchnav.models.nets.temperature import fit_pool_temperature
@@ -22,7 +22,6 @@ from benchnav.models.training.data import (
     VALID,
     MapData,
     MapDataset,
-    check_known,
     check_maps,
     read_maps,
     training_digest,
@@ -32,7 +31,6 @@ from benchnav.models.training.target import Target
 
 _DEFAULT = FitOptions()
 
-Config = ClassifierConfig | MDNConfig
 NETWORKS: Mapping[type, type[TrainableNetwork]] = {
     ClassifierConfig: TerrainClassifier,
     MDNConfig: MixtureDensityNetwork,
@@ -40,7 +38,7 @@ NETWORKS: Mapping[type, type[TrainableNetwork]] = {
 
 
 def fit_network(
-    config: Config,
+    config: NetworkConfig,
     dataset: TerrainDataset,
     seed: int = 0,
     options: FitOptions = _DEFAULT,
@@ -72,7 +70,12 @@ def fit_network(
         network,
         part or kind.part,
         options,
-        {"config": asdict(config), "data": data.digest, "seed": seed, "half_precision": half_precision},
+        {
+            "config": asdict(config),
+            "data": training_digest(dataset),
+            "seed": seed,
+            "half_precision": half_precision,
+        },
         [KeepBest(), EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)],
         {"datamodule": data},
         max_epochs=config.max_epochs,
@@ -95,7 +98,7 @@ def measure(network: TrainableNetwork, maps: MapDataset) -> dict[str, float]:
     return network.measure(some for _, some in maps.chunks(network.device))
 
 
-def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) -> None:
+def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOptions) -> None:
     """Refuses what could not be trained before anything is: builds the trainer and tries the network on a batch.
 
     Raises:
@@ -103,8 +106,7 @@ def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) 
         DatasetError: there are too few maps, or none of their cells has what is learned.
     """
     kind = NETWORKS[type(config)]
-    check_maps(dataset)
-    check_known(dataset, kind.fields[-1])
+    check_maps(dataset, kind.fields[-1])
     network = kind.untrained(config, len(dataset.recipe.classes))
     with quietly():
         chosen = options.chosen(max_epochs=config.max_epochs)
@@ -137,20 +139,13 @@ def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) 
         ) from error
 
 
-def train_parts(
-    target: Target,
-    config: Config,
-    dataset: TerrainDataset,
-    parts: list[str],
-    seed: int,
-    options: FitOptions,
-    half_precision: bool,
-) -> None:
+def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, parts: list[str]) -> None:
     """Trains the networks that a checkpoint lacks, with the seeds `seed`, `seed` + 1, …, and pools classifiers."""
-    for number, part in enumerate(parts):
-        if target.holds(part, asdict(config), seed + number, asdict(type(config)()), half_precision):
+    options = target.options
+    for seed, part in enumerate(parts, options.seed):
+        if target.holds(part, config, seed):
             continue
-        network, metrics = fit_network(config, dataset, seed + number, options, part, half_precision)
+        network, metrics = fit_network(config, dataset, seed, options, part, options.half_precision)
         names = {"accuracy": "accuracy", "miou": "mIoU", "rmse": "RMSE", "loss": "loss"}
         shown = [
             f"{title} {metrics[f'valid_{name}']:.4f}"
@@ -163,19 +158,19 @@ def train_parts(
         trained = Part(
             config=network.settings(),
             tensors=dict(network.state_dict()),
-            seed=seed + number,
+            seed=seed,
             metrics=metrics,
             data_id=dataset.id,
             data_digest=training_digest(dataset),
-            half_precision=half_precision,
+            half_precision=options.half_precision,
             trainer=options.trainer_settings,
         )
         target.add(part, trained)
     if isinstance(config, ClassifierConfig):
-        _calibrate_pool(target, dataset, seed, options.place)
+        _calibrate_pool(target, dataset)
 
 
-def _calibrate_pool(target: Target, dataset: TerrainDataset, seed: int, device: torch.device) -> None:
+def _calibrate_pool(target: Target, dataset: TerrainDataset) -> None:
     """Fits the temperature of the pool of all classifiers that are there, as they are kept."""
     parts = [target.checkpoint.part(name) for name in member_names(target.checkpoint)]
     if len(parts) == 1 or not is_first_process():
@@ -185,6 +180,7 @@ def _calibrate_pool(target: Target, dataset: TerrainDataset, seed: int, device: 
         TerrainClassifier.from_tensors(part.config, classes, as_stored(part.tensors, part.half_precision))
         for part in parts
     ]
-    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), seed, device)
+    maps, options = read_maps(dataset, VALID), target.options
+    temperature = fit_pool_temperature(members, maps, options.seed, options.place)
     say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)
