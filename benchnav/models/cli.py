@@ -1,25 +1,15 @@
 """The command `benchnav-train`: train models and measure them."""
 
 import sys
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from benchnav.core.command import INTERRUPTED, Command, Device, run
 from benchnav.models.config import (
     ClassifierConfig,
     LatentGPConfig,
     MDNConfig,
-    NetworkConfig,
     TrainOptions,
-    check_seed,
 )
 from benchnav.models.quality.command import evaluate
-
-if TYPE_CHECKING:
-    from benchnav.datagen.files.reader import TerrainDataset
-    from benchnav.models.training.fit import FitOptions
-    from benchnav.models.training.target import Target
 
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
@@ -41,7 +31,9 @@ def train_classifier(
         classifier: Settings of the classifier.
         members: How many to train; their probabilities are averaged.
     """
-    _train(options, data, out, classifier, members=members)
+    from benchnav.models.training.networks import train_networks
+
+    train_networks(options, data, out, classifier, members=members)
 
 
 def train_gp(
@@ -64,20 +56,9 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
-    from benchnav.core.store import output_path
-    from benchnav.models.slope_gp.slip_logs import ENDINGS
-    from benchnav.models.training.fit import FitOptions
-    from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
+    from benchnav.models.training.gps import train_gps
 
-    check_seed(seed)
-    output_path(out)  # refuses addresses
-    options = FitOptions(seed=seed, device=device, overwrite=overwrite)
-    if data.endswith(ENDINGS):
-        train_gps_on_logs(data, out, gp, seed, options)
-        return
-    dataset = _open_dataset(data)
-    target = _open_target(out, dataset, ["gp"], options)
-    target.add("gp", train_gps_on_maps(gp, dataset, seed, options.place))
+    train_gps(data, out, gp, TrainOptions(seed=seed, device=device, overwrite=overwrite))
 
 
 def train_all(
@@ -98,7 +79,9 @@ def train_all(
         gp: Settings of the GPs.
         members: How many classifiers to train; their probabilities are averaged.
     """
-    _train(options, data, out, classifier, gp, members)
+    from benchnav.models.training.networks import train_networks
+
+    train_networks(options, data, out, classifier, gp, members)
 
 
 def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN) -> None:
@@ -110,67 +93,9 @@ def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFA
         out: Checkpoint folder. Logs go to OUT.training.
         mdn: Settings of the network.
     """
-    _train(options, data, out, mdn)
+    from benchnav.models.training.networks import train_networks
 
-
-def _train(
-    how: TrainOptions,
-    data: str,
-    out: str,
-    config: NetworkConfig,
-    gp: LatentGPConfig | None = None,
-    members: int = 1,
-) -> None:
-    """Trains what a checkpoint lacks of a model: the class-wise GPs where they are asked for, then networks."""
-    from benchnav.core.errors import ConfigError
-    from benchnav.core.store import output_path
-    from benchnav.models.checkpoint import CLASSIFIER, FUSED, GP, member_name, training_folder
-    from benchnav.models.training.fit import FitOptions
-    from benchnav.models.training.gps import train_gps_on_maps
-    from benchnav.models.training.networks import NETWORKS, check_network, train_parts
-
-    if members < 1:
-        raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
-    check_seed(how.seed, members)
-    output_path(out)  # refuses addresses
-    dataset, trainer = _open_dataset(data), dict(how.trainer or {})
-    # The length of training is the network's own setting, wherever it is said.
-    config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
-    options = FitOptions(**{**vars(how), "trainer": trainer, "folder": training_folder(out)})
-    check_network(config, dataset, options)
-    part = NETWORKS[type(config)].part
-    parts = [member_name(index) for index in range(members)] if part == CLASSIFIER else [part]
-    model = FUSED if part == CLASSIFIER else part
-    target = _open_target(out, dataset, [*([GP] if gp else []), *parts], options, model)
-    if gp and not target.holds(GP, gp, how.seed):
-        target.add(GP, train_gps_on_maps(gp, dataset, how.seed, options.place))
-    train_parts(target, config, dataset, parts)
-    if not target.changed:
-        print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
-
-
-def _open_dataset(data: str) -> "TerrainDataset":
-    from benchnav.core.errors import DatasetError
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-
-    dataset = TerrainDataset(find_dataset(data))
-    if not {"train", "valid"} <= set(dataset.splits):
-        raise DatasetError(
-            f"Expected splits train and valid in {dataset.path} to train on, got {sorted(dataset.splits)}. "
-            "Make a dataset with them, for example `benchnav-datagen create paper-v1`."
-        )
-    return dataset
-
-
-def _open_target(
-    out: str, dataset: "TerrainDataset", parts: list[str], options: "FitOptions", model: str = "fused"
-) -> "Target":
-    from benchnav.models.checkpoint import Checkpoint
-    from benchnav.models.training.data import training_digest
-    from benchnav.models.training.target import open_target
-
-    fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
-    return open_target(Path(out), fresh, parts, training_digest(dataset), options)
+    train_networks(options, data, out, mdn)
 
 
 def main() -> None:

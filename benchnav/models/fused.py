@@ -63,16 +63,15 @@ class FusedModel(ModelFamily):
         """Makes the prediction of what the members said of the observation, [M, B, C, H, W]."""
         weights = sharpen(member_probabilities.sum(0) / len(self.classifiers), self.pool_temperature)
         means, stds = self.table.lookup(observation.slope_deg.float())
-        classes = tuple(range(len(self.class_names)))
-        if self.table.soft is None:
-            return TraversabilityMixture(weights, means, stds, classes)
-        soft = self.table.soft.to(weights.device)
-        owners = soft.weight.nonzero().flatten()
-        share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
-        second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
-        pairs = zip((weights * (1 - share), means, stds), second, strict=True)
-        weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
-        return TraversabilityMixture(weights, means, stds, (*classes, *owners.tolist()))
+        group = tuple(range(len(self.class_names)))
+        if soft := self.table.soft:
+            owners = soft.weight.nonzero().flatten()
+            group += tuple(owners.tolist())
+            share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
+            second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
+            pairs = zip((weights * (1 - share), means, stds), second, strict=True)
+            weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
+        return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
         """Class probabilities of each member, before the pool's temperature.
@@ -83,7 +82,14 @@ class FusedModel(ModelFamily):
         Returns:
             float32, shape [M, B, C, H, W].
         """
-        return torch.stack([self._probabilities(member, observation) for member in self.classifiers])
+        rgb, (height, width) = observation.rgb, observation.grid.shape
+        chunks = rgb.split(max(1, CHUNK_CELLS // (height * width)))
+        members = []
+        with torch.inference_mode():
+            for member in self.classifiers:
+                member.to(rgb.device)
+                members.append(torch.cat([member(chunk).float().softmax(1) for chunk in chunks]))
+        return torch.stack(members)
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "FusedModel":
@@ -102,16 +108,3 @@ class FusedModel(ModelFamily):
                 TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
             ]
             return cls(classifiers, SlopeTable.from_tensors(tensors), names, checkpoint.pool_temperature)
-
-    def _probabilities(self, classifier: nn.Module, observation: Observation) -> Tensor:
-        rgb, (height, width), classes = observation.rgb, observation.grid.shape, len(self.class_names)
-        classifier.to(rgb.device)
-        probabilities = torch.empty(len(rgb), classes, height, width, device=rgb.device)
-        step = max(1, CHUNK_CELLS // (height * width))
-        with torch.inference_mode():
-            for start in range(0, len(rgb), step):
-                logits = classifier(rgb[start : start + step])
-                if logits.shape[1] != classes:
-                    raise ConfigError(f"Expected {classes} classes of the classifier, got {logits.shape[1]}.")
-                probabilities[start : start + step] = logits.float().softmax(1)
-        return probabilities

@@ -20,6 +20,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
 from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
@@ -27,7 +28,7 @@ from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
 from benchnav.models.training.data import VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.networks import fit_network, measure
+from benchnav.models.training.networks import fit_network
 from tests.elsewhere.device import elsewhere, waits
 from tests.models.conftest import checkpoint_path as _checkpoint_path
 from tests.models.conftest import dataset as _dataset
@@ -38,7 +39,7 @@ checkpoint_path, dataset = _checkpoint_path, _dataset  # fixtures
 def network() -> MixtureDensityNetwork:
     mean, std = torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30])
     config = MDNConfig(encoder="mobilenet_v2", hidden=16)
-    return MixtureDensityNetwork(config, mean, std, torch.tensor(10.0), 0).eval()
+    return MixtureDensityNetwork(config, 0, MapScale(mean, std, torch.tensor(10.0)), 0).eval()
 
 
 def pair(checkpoint_path: Path) -> FusedModel:
@@ -103,9 +104,9 @@ def test_networks_are_measured_in_training_on_another_device_as_here(
 ) -> None:
     classifier, mdn = pair(checkpoint_path).classifiers[0], network()
     maps, all_maps = read_maps(dataset, VALID), read_maps(dataset, VALID, ("slope_deg", "traversability"))
-    here = measure(classifier, maps) | measure(mdn, all_maps)
+    here = classifier.measure(maps) | mdn.measure(all_maps)
     with elsewhere() as device:
-        there = measure(classifier.to(device), maps) | measure(mdn.to(device), all_maps)
+        there = classifier.to(device).measure(maps) | mdn.to(device).measure(all_maps)
         assert waits
     assert_close(there, here)
 

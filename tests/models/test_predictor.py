@@ -341,7 +341,7 @@ def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
         save_checkpoint(path, there.with_part("classifier-2", there.part("classifier")))
     if kind == "mdn":
         config = MDNConfig(encoder="mobilenet_v2", hidden=8)
-        network = MixtureDensityNetwork(config, torch.zeros(3), torch.ones(3), torch.ones(()), 1)
+        network = MixtureDensityNetwork(config, 0, seed=1)
         part = Part(
             config=asdict(config),
             tensors=dict(network.state_dict()),

@@ -220,7 +220,7 @@ def measure(
         histogram += pit_counts(transformed)
         maps += len(terrain)
         if count:
-            tally = tally or _ClassTally(count, terrain.rgb.device, len(members) > 1, alike)
+            tally = tally or _ClassTally(count, terrain.rgb.device, alike)
             tally.add(class_probabilities(mixture, count), members, terrain.class_id, terrain.slope_deg)
     if not sums[0]:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
@@ -259,19 +259,16 @@ class _ClassTally:
     Args:
         count: number of classes C.
         device: where the maps are.
-        several: whether the model has several members.
         alike: of each class those that look like it, itself among them; empty where none do.
     """
 
-    def __init__(
-        self, count: int, device: torch.device, several: bool, alike: Sequence[tuple[int, ...]]
-    ) -> None:
+    def __init__(self, count: int, device: torch.device, alike: Sequence[tuple[int, ...]]) -> None:
         self.count, self.cells, self.brier = count, 0, 0.0
         self.confusion = torch.zeros(count, count, dtype=torch.int64, device=device)
         self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
         self.reliability = ReliabilityCurve(device)
         self.entropy = ErrorRanking(device)
-        self.information = ErrorRanking(device) if several else None
+        self.information = ErrorRanking(device)
         self.look_alikes = LookAlikeTally(alike, device) if any(len(own) > 1 for own in alike) else None
 
     def add(self, probabilities: Tensor, members: Tensor, class_id: Tensor, slope_deg: Tensor) -> None:
@@ -281,7 +278,7 @@ class _ClassTally:
             return
         if not bool(labelled.all()):
             probabilities = _in_a_row(probabilities[None], labelled)[0]
-            members = _in_a_row(members, labelled) if self.information else members
+            members = _in_a_row(members, labelled) if len(members) > 1 else members
             class_id, slope_deg = (layer[labelled][None, None] for layer in (class_id, slope_deg))
         found = probabilities.argmax(1)
         wrong = found != class_id
@@ -290,7 +287,7 @@ class _ClassTally:
         self.brier += float(brier_score(probabilities, class_id).double().sum())
         self.reliability.update(probabilities, class_id)
         self.entropy.update(predictive_entropy(probabilities), wrong)
-        if self.information:
+        if len(members) > 1:
             self.information.update(mutual_information(members), wrong)
         degree = slope_deg.floor().long().clamp(0, 89)
         counted = torch.bincount((90 * class_id + degree).flatten(), minlength=self.slope_cells.numel())
@@ -300,8 +297,9 @@ class _ClassTally:
 
     def quality(self) -> ClassQuality:
         accuracy, miou, miou_predicted = class_scores(self.confusion)
-        curve, (entropy, entropy_auroc) = self.reliability.compute(), self.entropy.compute()
-        information, information_auroc = self.information.compute() if self.information else (math.nan,) * 2
+        entropy, entropy_auroc = self.entropy.compute()
+        information, information_auroc = self.information.compute()
+        curve = self.reliability.compute()
         cells, confidence, right = curve.tolist()
         return ClassQuality(
             accuracy=accuracy,

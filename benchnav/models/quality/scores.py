@@ -247,14 +247,15 @@ class ErrorRanking:
         self.total += float(score.double().sum())
 
     def compute(self) -> tuple[float, float]:
-        """The mean, and the AUROC.
+        """The mean, and the AUROC; neither is a number where there are no cells.
 
-        That is in [0, 1], 0.5 for a score that tells nothing; not a number where all or none are wrong.
+        The AUROC is in [0, 1], 0.5 for a score that tells nothing; not a number where all or none are wrong.
         """
         right, wrong = self.counts.double()
         lower = right.cumsum(0) - right / 2
         auroc = (wrong * lower).sum() / (right.sum() * wrong.sum())
-        return self.total / int(self.counts.sum()), float(auroc)
+        cells = int(self.counts.sum())
+        return self.total / cells if cells else math.nan, float(auroc)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,20 +300,16 @@ class LookAlikeTally:
         merged.index_add_(1, self.merged, probabilities)
         self.confusion += multiclass_confusion_matrix(merged.argmax(1), self.merged[class_id], self.size)
         for group in self.groups:
-            self._add_shares(probabilities[:, list(group)], class_id, group)
-
-    def _add_shares(self, probabilities: Tensor, class_id: Tensor, group: tuple[int, ...]) -> None:
-        """Adds the shares within one set of look-alikes, [B, G, H, W], of the cells that are of them."""
-        match = class_id.unsqueeze(-1) == torch.tensor(group, device=class_id.device)  # [B, H, W, G]
-        here = match.any(-1)
-        own = probabilities.movedim(1, -1)[here].double()  # [N, G]
-        total = own.sum(1, keepdim=True)
-        shares = torch.where(total > 0, own / total, 1 / len(group))
-        place = match[here].int().argmax(1)
-        right = shares.gather(1, place.unsqueeze(1))
-        self.distance += float((right - 1 / len(group)).abs().sum())
-        self.cells += len(shares)
-        self.curve.update(shares.T[None, :, None], place[None, None])
+            match = class_id.unsqueeze(-1) == torch.tensor(group, device=class_id.device)  # [B, H, W, G]
+            here = match.any(-1)
+            own = probabilities[:, list(group)].movedim(1, -1)[here].double()  # [N, G]
+            total = own.sum(1, keepdim=True)
+            shares = torch.where(total > 0, own / total, 1 / len(group))
+            place = match[here].int().argmax(1)
+            right = shares.gather(1, place.unsqueeze(1))
+            self.distance += float((right - 1 / len(group)).abs().sum())
+            self.cells += len(shares)
+            self.curve.update(shares.T[None, :, None], place[None, None])
 
     def quality(self) -> LookAlikeQuality:
         """What was counted; the shares are not a number where no look-alike occurred."""

@@ -1,6 +1,7 @@
 """What happens beside a training where Lightning has no such thing: the best weights are kept, a table is written."""
 
 import sys
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,8 @@ import pandas as pd
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, RichProgressBar
-from torch import Tensor
 
+from benchnav.core.command import tell
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import replacing, write_text
 
@@ -24,42 +25,42 @@ class KeepBest(Callback):
 
     def __init__(self) -> None:
         """Starts with none."""
-        self.loss, self.validated = float("inf"), False
-        self.metrics: dict[str, float] = {}
-        self.weights: dict[str, Tensor] = {}
+        self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
+        self.validated = False
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Copies the weights when they are the best so far."""
         self.validated = True
-        found = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
-        if found["valid_loss"] < self.loss:
-            self.loss, self.metrics = found["valid_loss"], {**found, "epoch": trainer.current_epoch + 1}
-            self.weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
+        metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
+        if metrics["valid_loss"] < self.best["loss"]:
+            weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
+            metrics["epoch"] = trainer.current_epoch + 1
+            self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": weights}
 
     def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Puts the best weights back."""
-        if not self.weights and not self.validated:
-            raise ConfigError(
-                "Expected settings of `trainer` under which the split valid is measured, got an end of training before "
-                "it ever was. Train for longer, or validate more often."
-            )
-        if not self.weights:
+        if not self.best["weights"]:
             raise ConfigError(
                 "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
+                if self.validated
+                else "Expected settings of `trainer` under which the split valid is measured, got an end of training "
+                "before it ever was. Train for longer, or validate more often."
             )
-        module.load_state_dict(self.weights)
+        module.load_state_dict(self.best["weights"])
         # The trainer's own metrics are what comes back from processes that it has started.
-        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in self.metrics.items()})
+        metrics = self.best["metrics"].items()
+        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in metrics})
 
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
-        return {"loss": self.loss, "metrics": self.metrics, "weights": self.weights}
+        return self.best
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from an earlier state."""
-        self.loss, self.metrics, self.weights = state["loss"], state["metrics"], state["weights"]
+        self.best = state
 
 
+@dataclass(eq=False)
 class History(Callback):
     """Writes what was measured to a table, a row an epoch.
 
@@ -67,11 +68,11 @@ class History(Callback):
 
     Args:
         path: the table, CSV.
+        rows: what it holds.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Starts with no rows."""
-        self.path, self.rows = path, list[dict[str, float]]()
+    path: Path
+    rows: list[dict[str, float]] = field(default_factory=list)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Adds a row."""
@@ -90,6 +91,7 @@ class History(Callback):
         self.rows = list(state["rows"])
 
 
+@dataclass(eq=False)
 class EpochLines(Callback):
     """Says on standard error what each epoch brought, where there is no terminal for Lightning's bar.
 
@@ -97,9 +99,7 @@ class EpochLines(Callback):
         what: what is trained.
     """
 
-    def __init__(self, what: str) -> None:
-        """Says nothing yet."""
-        self.what = what
+    what: str
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Says it."""
@@ -108,7 +108,7 @@ class EpochLines(Callback):
         values = [f"{name.removeprefix('valid_')} {value:.4f}" for name, value in shown.items()]
         if trainer.is_global_zero:
             epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-            print(", ".join([epoch, *values]), file=sys.stderr, flush=True)
+            tell(", ".join([epoch, *values]))
 
 
 def progress(what: str) -> Callback:

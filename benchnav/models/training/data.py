@@ -6,6 +6,7 @@ processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import lightning
@@ -19,8 +20,9 @@ from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
+from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.models.nets.trainable import MapScale
 
 TRAIN, VALID = "train", "valid"
 
@@ -91,6 +93,7 @@ def apply_symmetry(maps: Tensor, which: int) -> Tensor:
     return turned.flip(-1) if which % 2 else turned
 
 
+@dataclass(eq=False)
 class MapSampler(Sampler[MapKey]):
     """Cuts the maps into batches of nearly equal size, in an order keyed by (seed, epoch).
 
@@ -102,23 +105,17 @@ class MapSampler(Sampler[MapKey]):
         jitter: largest relative change of brightness, contrast and saturation.
         shuffle: whether to change the order each epoch.
         share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
+        epoch: that the next iteration gives.
     """
 
-    def __init__(
-        self,
-        maps: int,
-        batch_size: int,
-        seed: int = 0,
-        *,
-        symmetries: tuple[int, ...] = (0,),
-        jitter: float = 0.0,
-        shuffle: bool = False,
-        share: tuple[int, int] = (0, 1),
-    ) -> None:
-        """Starts at epoch 0."""
-        self.maps, self.batch_size, self.seed = maps, batch_size, seed
-        self.symmetries, self.jitter, self.shuffle, self.share = symmetries, jitter, shuffle, share
-        self.epoch = 0
+    maps: int
+    batch_size: int
+    seed: int = 0
+    symmetries: tuple[int, ...] = (0,)
+    jitter: float = 0.0
+    shuffle: bool = False
+    share: tuple[int, int] = (0, 1)
+    epoch: int = 0
 
     def set_epoch(self, epoch: int) -> None:
         """Chooses the epoch that the next iteration gives; the trainer calls this."""
@@ -186,16 +183,22 @@ class MapData(lightning.LightningDataModule):
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
         self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
 
-    def colour_statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
-        counts = torch.zeros(3, 256, dtype=torch.int64)
+    def scale(self) -> MapScale:
+        """What the training maps' colours and slopes are scaled by; 1 of slopes that are not read."""
+        counts, squares = torch.zeros(3, 256, dtype=torch.int64), torch.zeros((), dtype=torch.float64)
         for _, maps in self.train.chunks():
             channels = maps["rgb"].unbind(1)
             counts += torch.stack([channel.flatten().bincount(minlength=256) for channel in channels])
+            if "slope_deg" in maps:
+                squares += maps["slope_deg"].double().square().sum()
         share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
         mean = (share * level).sum(1)
         variance = (share * level**2).sum(1) - mean**2
-        return mean.float(), variance.clamp(min=1).sqrt().float()
+        # Ground of one colour, or flat, would have no scale.
+        std, slope_deg = (
+            value.clamp(min=1).sqrt().float() for value in (variance, squares / counts[0].sum())
+        )
+        return MapScale(mean.float(), std, slope_deg)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
@@ -215,6 +218,21 @@ class MapData(lightning.LightningDataModule):
             maps, batch_size=None, sampler=sampler, generator=torch.Generator(),
             num_workers=self.workers, persistent_workers=self.workers > 0,
         )  # fmt: skip
+
+
+def open_dataset(data: str) -> TerrainDataset:
+    """Opens a dataset to train on, by path or id.
+
+    Raises:
+        DatasetError: it has no splits to train and to measure on.
+    """
+    dataset = TerrainDataset(find_dataset(data))
+    if not {TRAIN, VALID} <= set(dataset.splits):
+        raise DatasetError(
+            f"Expected splits train and valid in {dataset.path} to train on, got {sorted(dataset.splits)}. "
+            "Make a dataset with them, for example `benchnav-datagen create paper-v1`."
+        )
+    return dataset
 
 
 def check_maps(dataset: TerrainDataset, field: str) -> None:

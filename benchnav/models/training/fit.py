@@ -104,7 +104,7 @@ def fit(
     settings: Mapping[str, Any],
     callbacks: list[Callback],
     data: Mapping[str, Any],
-    **trainer: Any,
+    **usual: Any,
 ) -> dict[str, float]:
     """Trains a module in place.
 
@@ -116,7 +116,7 @@ def fit(
             gone on with.
         callbacks: what else is to happen.
         data: loaders or data module, as arguments of the trainer's `fit`.
-        trainer: settings of Lightning's trainer, where the options say nothing; of `precision`, which may be left
+        usual: settings of Lightning's trainer, where the options say nothing; of `precision`, which may be left
             out, `default_precision`.
 
     Returns:
@@ -139,9 +139,22 @@ def fit(
             )
             callbacks += [History(folder / HISTORY), last]
             kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
-        lightning_trainer = make_trainer(callbacks, **kept, **options.chosen(**trainer))
-        _run(lightning_trainer, module, data, state)
-        return measured(lightning_trainer)
+        trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
+        handler = signal.getsignal(signal.SIGINT)
+        try:
+            trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
+        except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
+            signal.signal(signal.SIGINT, handler)
+            raise KeyboardInterrupt from None
+        except MisconfigurationException as error:
+            raise _unusable(error) from error
+        except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
+            if state is None or trainer.global_step:
+                raise
+            raise CheckpointError(
+                f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
+            ) from error
+        return measured(trainer)
 
 
 def say(line: str) -> None:
@@ -201,30 +214,6 @@ def _drop(folder: Path, *patterns: str) -> None:
             path.unlink()
 
 
-def _run(
-    trainer: lightning.Trainer,
-    module: lightning.LightningModule,
-    data: Mapping[str, Any],
-    state: Path | None,
-) -> None:
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
-    except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
-        signal.signal(signal.SIGINT, handler)
-        raise KeyboardInterrupt from None
-    except MisconfigurationException as error:
-        raise ConfigError(
-            f"Expected settings of `trainer` that Lightning takes, got: {one_line(error)}"
-        ) from error
-    except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
-        if state is None or trainer.global_step:
-            raise
-        raise CheckpointError(
-            f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
-        ) from error
-
-
 def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
     """Makes Lightning's trainer.
 
@@ -241,7 +230,11 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
             **settings,
         )
     except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
-        raise ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {error}") from error
+        raise _unusable(error) from error
+
+
+def _unusable(error: Exception) -> ConfigError:
+    return ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {one_line(error)}")
 
 
 @contextmanager

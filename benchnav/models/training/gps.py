@@ -1,23 +1,24 @@
 """Training the class-wise GPs of a fused model, on maps or on a robot's slip logs."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
 
+from benchnav.core.command import tell
 from benchnav.core.device import CPU
+from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import GP, Checkpoint, Part
-from benchnav.models.config import LatentGPConfig
+from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
 from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, measure_latent, sum_split
 from benchnav.models.slope_gp.gp import LatentGPs
-from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.slip_logs import ENDINGS, read_slip_logs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
-from benchnav.models.training.data import TRAIN, VALID, training_digest
+from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, say
-from benchnav.models.training.target import existing, open_target
+from benchnav.models.training.target import existing, fresh_checkpoint, open_target
 
 _HELD_OUT = 0.1  # of slip logs
 _FEW_ROWS = 10  # of a class in slip logs
@@ -51,17 +52,34 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: torch.device = CPU)
             for optimizer in optimizers:
                 optimizer.step()
             total += loss.item() / cells
-        mean = total / config.epoch_steps
-        print(f"gp: epoch {epoch}/{config.epochs}, loss {mean:.4f}", file=sys.stderr, flush=True)
+        tell(f"gp: epoch {epoch}/{config.epochs}, loss {total / config.epoch_steps:.4f}")
     return model.cpu().eval()
 
 
-def train_gps_on_maps(
-    config: LatentGPConfig, dataset: TerrainDataset, seed: int, device: torch.device
-) -> Part:
+def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions) -> None:
+    """Trains the GPs on a dataset or on slip logs, into a checkpoint.
+
+    Args:
+        data: path or id of a dataset, or path of slip logs.
+        out: folder of the checkpoint.
+        config: what to train.
+        options: how to train.
+    """
+    check_seed(options.seed)
+    output_path(out)  # refuses addresses
+    how = FitOptions(**vars(options))
+    if data.endswith(ENDINGS):
+        _train_on_logs(data, out, config, how)
+        return
+    dataset = open_dataset(data)
+    target = open_target(out, fresh_checkpoint(dataset), [GP], training_digest(dataset), how)
+    target.add(GP, train_gps_on_maps(config, dataset, how))
+
+
+def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: FitOptions) -> Part:
     """Trains the GPs on the split `train` and gives them as a part of a checkpoint."""
     names = [item.name for item in dataset.recipe.classes]
-    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, device)
+    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options.place)
     known = dataset.truth_of(VALID) == "generated"
     found = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     errors = (
@@ -71,33 +89,32 @@ def train_gps_on_maps(
     )
     say(f"gp: validation {errors}NLL {found['nll']:.4f}")
     metrics = {f"valid_{name}": value for name, value in found.items()}
-    return _part(model, seed, metrics, dataset.id, training_digest(dataset))
+    return _part(model, options.seed, metrics, dataset.id, training_digest(dataset))
 
 
-def train_gps_on_logs(data: str, out: str, config: LatentGPConfig, seed: int, options: FitOptions) -> None:
+def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
     logs = read_slip_logs(data)
     there = existing(Path(out), options.overwrite)
     names = there.class_names if there else logs.class_names
     cells = logs.cells(names)
     sums, digest = SlopeSums.of(cells, len(names)), f"file:{logs.digest}"
-    target = open_target(Path(out), Checkpoint(class_names=names), [GP], digest, options)
+    target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
     if missing := [name for name, count in counts.items() if not count]:
-        replaced = there and GP in there.parts
-        _warn(
-            f"{data} has no rows of {len(missing)} of {len(counts)} classes ({', '.join(missing)}); their GPs become "
-            "the prior, which is vague"
-            + (f", and what {out} had learned of them is dropped" if replaced else "")
+        lost = f", and what {out} had learned of them is dropped" if there and GP in there.parts else ""
+        tell(
+            f"benchnav-train: warning: {data} has no rows of {len(missing)} of {len(counts)} classes "
+            f"({', '.join(missing)}); their GPs become the prior, which is vague{lost}"
         )
     if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
-        _warn(
-            f"{data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what is predicted of them "
-            "is little more than the prior"
+        tell(
+            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what "
+            "is predicted of them is little more than the prior"
         )
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
-        kept, held = hold_out(cells, _HELD_OUT, seed)
+        kept, held = hold_out(cells, _HELD_OUT, options.seed)
         trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.place)
         metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
         say(
@@ -106,7 +123,7 @@ def train_gps_on_logs(data: str, out: str, config: LatentGPConfig, seed: int, op
         )
     model = _fit_and_say(config, sums, names, options.place)
     say(f"gp: rows learned from: {', '.join(f'{name} {count}' for name, count in counts.items())}")
-    target.add(GP, _part(model, seed, metrics, Path(data).name, digest))
+    target.add(GP, _part(model, options.seed, metrics, Path(data).name, digest))
 
 
 def _fit_and_say(
@@ -132,7 +149,3 @@ def _part(model: LatentGPs, seed: int, metrics: dict[str, float], data_id: str, 
         data_id=data_id,
         data_digest=data_digest,
     )
-
-
-def _warn(line: str) -> None:
-    print(f"benchnav-train: warning: {line}", file=sys.stderr)

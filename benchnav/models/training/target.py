@@ -7,7 +7,7 @@ and writes.
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,11 @@ from rich.filesize import decimal
 
 from benchnav.core.errors import CheckpointError
 from benchnav.core.store import building, real_place, refuse_taken, restore
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     CONFIG,
+    FUSED,
     Checkpoint,
     Part,
     foreign,
@@ -29,6 +31,7 @@ from benchnav.models.config import NetworkConfig
 from benchnav.models.training.fit import FitOptions, forget, interrupted, is_first_process
 
 
+@dataclass
 class Target:
     """A checkpoint that parts are added to, one after the other, each saved as soon as it is trained.
 
@@ -37,12 +40,14 @@ class Target:
         checkpoint: what it holds so far.
         digest: of the data that parts are trained on.
         options: how they are trained.
+        changed: whether anything was saved.
     """
 
-    def __init__(self, folder: Path, checkpoint: Checkpoint, digest: str, options: FitOptions) -> None:
-        """Starts with what is there."""
-        self.folder, self.checkpoint = folder, checkpoint
-        self.digest, self.options, self.changed = digest, options, False
+    folder: Path
+    checkpoint: Checkpoint
+    digest: str
+    options: FitOptions
+    changed: bool = False
 
     def holds(self, name: str, config: Any, seed: int) -> bool:
         """Tells whether an interrupted run has left a part, trained in the same way.
@@ -105,13 +110,18 @@ class Target:
         print(f"wrote {self.folder} with {parts} ({decimal(size)})")
 
 
+def fresh_checkpoint(dataset: TerrainDataset, model: str = FUSED) -> Checkpoint:
+    """A checkpoint without parts, of a family of models and the classes of a dataset."""
+    return Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
+
+
 def open_target(
-    folder: Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions
+    out: str | Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions
 ) -> Target:
     """Opens the checkpoint that training goes into.
 
     Args:
-        folder: where it is, or will be.
+        out: folder where it is, or will be.
         fresh: without parts, of the family and classes that are to be trained.
         parts: names of the parts to train.
         digest: of the data that they are trained on.
@@ -121,7 +131,7 @@ def open_target(
         CheckpointError: what is there would be lost or does not fit.
         ConfigError: the folder is something else.
     """
-    folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
+    folder = real_place(Path(os.path.normpath(out)))  # a/../b is b, whether or not there is an a
     is_first, left = is_first_process(), interrupted(options, parts)
     if left and is_first and not (options.resume or options.overwrite):
         raise CheckpointError(

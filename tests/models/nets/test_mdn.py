@@ -29,6 +29,7 @@ from benchnav.models.nets.mdn import (
     MixtureDensityNetwork,
     censored_nll,
 )
+from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import networks
 from benchnav.models.training.callbacks import KeepBest
@@ -45,8 +46,8 @@ QUICK = ["--mdn.encoder", "mobilenet_v2", "--mdn.batch_size", "5", "--trainer.pr
 
 def build(seed: int = 0, **changes: object) -> MixtureDensityNetwork:
     config = replace(SMALL, **changes)  # type: ignore[arg-type]
-    mean, std, scale = torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30]), torch.tensor(10.0)
-    return MixtureDensityNetwork(config, mean, std, scale, seed).eval()
+    scale = MapScale(torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30]), torch.tensor(10.0))
+    return MixtureDensityNetwork(config, 0, scale, seed).eval()
 
 
 def observe(batch: int, height: int, width: int) -> Observation:
@@ -426,7 +427,7 @@ def test_a_checkpoint_gives_the_network_back() -> None:
     first, second = MixtureDensityModel(network).predict(seen), again.predict(seen)
     assert isinstance(again, MixtureDensityModel)
     assert not network.training
-    assert not MixtureDensityNetwork.from_tensors(asdict(network.config), network.state_dict()).training
+    assert not MixtureDensityNetwork.from_tensors(asdict(network.config), 0, network.state_dict()).training
     for name in ("weights", "means", "stds"):
         assert torch.equal(getattr(first, name), getattr(second, name))
 
@@ -434,7 +435,7 @@ def test_a_checkpoint_gives_the_network_back() -> None:
 def test_a_checkpoint_of_a_pretrained_network_downloads_nothing() -> None:
     network = build()
     settings = {**asdict(network.config), "pretrained": True}
-    again = MixtureDensityNetwork.from_tensors(settings, network.state_dict())
+    again = MixtureDensityNetwork.from_tensors(settings, 0, network.state_dict())
     assert not again.ground.config.pretrained
 
 
@@ -471,7 +472,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     assert (part.config["max_epochs"], part.config["components"], part.half_precision) == (2, 2, True)
     assert load_model("mine").predict(observe(1, 32, 32)).weights.shape == (1, 2, 32, 32)  # type: ignore[union-attr]
     # What it says of itself was measured on what is kept.
-    kept = MixtureDensityNetwork.from_tensors(part.config, part.tensors)
+    kept = MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors)
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
     assert measure(kept, valid).items() <= dict(part.metrics).items()
 

@@ -147,7 +147,7 @@ def test_settings_of_the_optimiser_reach_it(dataset: TerrainDataset) -> None:
 
     data = MapData(dataset, 4, 0)
     config = replace(SMALL, weight_decay=0.123, learning_rate=0.045)
-    model = TerrainClassifier(config, 10, *data.colour_statistics())
+    model = TerrainClassifier(config, 10, data.scale())
     options = FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(0.123, 0.045)]
@@ -316,7 +316,7 @@ def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
         device="cpu", trainer={**EXACT, "limit_train_batches": 1, "accumulate_grad_batches": 2}
     )
     data = MapData(dataset, 4, 0)
-    model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+    model = TerrainClassifier(SMALL, 10, data.scale())
     fit(model, "x", options, {}, [KeepBest(), Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(1, 2)]
     with pytest.raises(ConfigError, match="Lightning takes"):
@@ -347,7 +347,7 @@ def test_the_precision_is_that_of_what_is_trained_on(
     asked: list[str] = []
     monkeypatch.setattr(fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed")
     data = MapData(dataset, 4, 0)
-    model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+    model = TerrainClassifier(SMALL, 10, data.scale())
     options = FitOptions(device="cpu", trainer={"limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert asked == ["cpu"]
@@ -364,7 +364,7 @@ def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) ->
 
     data = MapData(dataset, 4, 0)
     for settings in ({}, {"gradient_clip_val": 1e-3}):
-        model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+        model = TerrainClassifier(SMALL, 10, data.scale())
         trainer = {**EXACT, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
         fit(
             model,
