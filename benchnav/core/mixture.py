@@ -189,25 +189,20 @@ class TraversabilityMixture:
         total = torch.where((value <= 0) | (value >= 1), total.clamp(max=0), total)
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.weights.dtype)
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws λ independently in each cell.
+    def class_probabilities(self, count: int) -> Tensor:
+        """Probability of each of `count` terrain classes: the sum of the weights of its components.
 
-        Args:
-            count: draws a cell.
-            generator: on the device of the parameters.
+        Without `group` the components are the classes.
 
         Returns:
-            Traversability in [0, 1], shape [count, *B, H, W].
+            Shape [*B, count, H, W]; the weights themselves where each class has one component, in order.
         """
-        shape, device = (count, *self.weights.movedim(-3, 0).shape[1:]), self.weights.device
-        pick = torch.rand(shape, generator=generator, device=device, dtype=self.weights.dtype)
-        edges = self.weights.cumsum(-3)
-        component = (pick.unsqueeze(-3) >= edges).sum(-3, keepdim=True).clamp(max=edges.shape[-3] - 1)
-        expanded = (count, *self.weights.shape)
-        mean = torch.gather(self.means.expand(expanded), -3, component).squeeze(-3)
-        std = torch.gather(self.stds.expand(expanded), -3, component).squeeze(-3)
-        noise = torch.randn(shape, generator=generator, device=device, dtype=self.weights.dtype)
-        return (mean + std * noise).clamp(0, 1)
+        if self.group in (None, tuple(range(count))):
+            return self.weights
+        weights = self.weights.movedim(-3, 0)
+        total = torch.zeros_like(weights[:1]).repeat(count, *(1,) * (weights.ndim - 1))
+        total.index_add_(0, torch.tensor(self.group, device=weights.device), weights)
+        return total.movedim(0, -3)
 
     def most_likely(self) -> "TraversabilityMixture":
         """Keeps the heaviest class of each cell alone, all its components: the paper's single-class option.
@@ -222,16 +217,13 @@ class TraversabilityMixture:
                 "Expected components that belong to terrain classes for the single-class option, got a "
                 "mixture without `group`. Take another risk measure, or give the mixture its `group`."
             )
-        classes = sorted(set(self.group))
-        members = [[k for k, own in enumerate(self.group) if own == c] for c in classes]
-        of_class = torch.stack([self.weights[..., own, :, :].sum(-3) for own in members], dim=-3)
-        best = of_class.argmax(dim=-3, keepdim=True)
-        if len(classes) == len(self.group):  # a component a class: the others need not be kept at no weight
-            order = torch.tensor([own[0] for own in members], device=best.device)[best]
-            means, stds = (torch.gather(t, -3, order) for t in (self.means, self.stds))
+        best = self.class_probabilities(max(self.group) + 1).argmax(-3, keepdim=True)
+        is_best = torch.tensor(self.group, device=best.device).view(-1, 1, 1) == best
+        if len(set(self.group)) == len(self.group):  # the others need not be kept at no weight
+            order = is_best.int().argmax(-3, keepdim=True)
+            means, stds = (torch.gather(values, -3, order) for values in (self.means, self.stds))
             return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))
-        class_of = torch.tensor([classes.index(own) for own in self.group], device=best.device)
-        kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
+        kept = torch.where(is_best, self.weights, 0.0)
         return replace(self, weights=kept / kept.sum(-3, keepdim=True))
 
     def _in_pieces(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:

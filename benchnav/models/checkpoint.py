@@ -44,6 +44,7 @@ CONFIG = "config.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
+_KEPT = ("config", "seed", "metrics", "half_precision", "versions", "trainer")  # of a part, as they are
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
 
 
@@ -284,16 +285,9 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         content = safetensors.torch.save(_to_store(part.tensors, part.half_precision))
         with replacing(folder / f"{name}.safetensors") as partial:
             partial.write_bytes(content)
-        parts[name] = {
-            "config": part.config,
-            "data": {"id": part.data_id, "digest": part.data_digest},
-            "seed": part.seed,
-            "metrics": part.metrics,
-            "versions": dict(part.versions),
-            "half_precision": part.half_precision,
-            **({} if part.trainer is None else {"trainer": dict(part.trainer)}),
-            "sha256": hashlib.sha256(content).hexdigest(),
-        }
+        kept = {name: value for name, value in vars(part).items() if name in _KEPT and value is not None}
+        digest = hashlib.sha256(content).hexdigest()
+        parts[name] = {**kept, "data": {"id": part.data_id, "digest": part.data_digest}, "sha256": digest}
     pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
     config = {
         "format": FORMAT,

@@ -15,7 +15,6 @@ from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import GP, Checkpoint, member_names, refitting
-from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_gp.table import SlopeTable
 
 CHUNK_CELLS = 2**17
@@ -108,3 +107,15 @@ class FusedModel(ModelFamily):
                 TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
             ]
             return cls(classifiers, SlopeTable.from_tensors(tensors), names, checkpoint.pool_temperature)
+
+
+def sharpen(probabilities: Tensor, temperature: float) -> Tensor:
+    """Divides the logarithms of class probabilities by a temperature, under 1 to make them surer.
+
+    Args:
+        probabilities: shape [B, C, H, W].
+        temperature: > 0; at 1 nothing is changed.
+    """
+    if temperature == 1:
+        return probabilities
+    return (probabilities.log() / temperature).softmax(1)

@@ -8,6 +8,7 @@ cells of all maps.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +25,6 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
 from benchnav.models.fused import FusedModel
 from benchnav.models.predictor import class_mismatch
-from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.scores import (
     PIT_BINS,
     ErrorRanking,
@@ -221,7 +221,7 @@ def measure(
         maps += len(terrain)
         if count:
             tally = tally or _ClassTally(count, terrain.rgb.device, alike)
-            tally.add(class_probabilities(mixture, count), members, terrain.class_id, terrain.slope_deg)
+            tally.add(mixture.class_probabilities(count), members, terrain.class_id, terrain.slope_deg)
     if not sums[0]:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
     squared_observed, nll, score, covered, in_tail = (sums[1:6] / sums[0]).tolist()
@@ -343,7 +343,7 @@ def _score_cells(
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
     errors = (expected - terrain.truth.at(known).mean())[0, labelled[known]].double().square()
-    sums = [
+    sums: list[Any] = [
         cells,
         (expected - observed).double().square().sum(),
         -mixture.log_prob(observed).double().sum(),

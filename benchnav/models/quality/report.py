@@ -215,20 +215,26 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 
     `std` stands at severity 0 with no scenario, as it begins every series.
     """
-    table = pd.DataFrame({split: numbers(quality) for split, quality in qualities.items()}).T
-    table = table.replace((math.inf, -math.inf), math.nan)
-    alike = any(item.look_alikes for quality in qualities.values() for item in quality.classes)
-    table = table.reindex(columns=[name for name in COLUMNS if alike or name not in LOOK_ALIKES])
     places = {
         split: (scenario if severity else "", severity)
         for scenario, series in find_series(qualities).items()
         for severity, split in series
     }
-    scenarios, severities = zip(*(places.get(split, ("", math.nan)) for split in qualities), strict=True)
-    table.insert(0, "scenario", scenarios)
-    table.insert(1, "severity", severities)
-    table.insert(2, "maps", [quality.maps for quality in qualities.values()])
-    return table.to_csv(index_label="split", float_format="%.6g")
+    rows = []
+    for split, quality in qualities.items():
+        scenario, severity = places.get(split, ("", math.nan))
+        place = {"split": split, "scenario": scenario, "severity": severity, "maps": quality.maps}
+        rows.append({**place, **numbers(quality)})
+    alike = any(LOOK_ALIKES[0] in row for row in rows)
+    columns = [
+        "split",
+        "scenario",
+        "severity",
+        "maps",
+        *(name for name in COLUMNS if alike or name not in LOOK_ALIKES),
+    ]
+    table = pd.DataFrame(rows, columns=columns).replace((math.inf, -math.inf), math.nan)
+    return table.to_csv(index=False, float_format="%.6g")
 
 
 def quality_markdown(
@@ -335,7 +341,7 @@ def quality_figures(
     if not isinstance(table, SlopeTable):
         absent.append("no latent functions: the model has no Gaussian processes over slope")
     elif by_class:
-        cells = sum(np.array(quality.slope_cells) for quality in by_class.values())
+        cells = np.sum([quality.slope_cells for quality in by_class.values()], 0)
         known = all(dataset.truth_of(split) == "generated" for split in qualities)
         drawn["latent"] = partial(figures.latent_figure, table, classes, cells.tolist(), known)
     if not all_series:

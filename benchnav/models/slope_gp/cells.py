@@ -164,13 +164,9 @@ class SlopeSums:
 
     def __add__(self, other: "SlopeSums") -> "SlopeSums":
         """The sums over both parts of the data."""
-        return SlopeSums(
-            cells=self.cells + other.cells,
-            slope=self.slope + other.slope,
-            total=self.total + other.total,
-            squares=self.squares + other.squares,
-            steepest_deg=torch.maximum(self.steepest_deg, other.steepest_deg),
-        )
+        added = {name: sums + getattr(other, name) for name, sums in vars(self).items()}
+        steepest = torch.maximum(self.steepest_deg, other.steepest_deg)
+        return SlopeSums(**{**added, "steepest_deg": steepest})
 
     @property
     def count(self) -> Tensor:

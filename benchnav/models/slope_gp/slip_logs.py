@@ -11,6 +11,7 @@ import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -174,8 +175,8 @@ def _read_classes(
             raise DatasetError(
                 f"Expected class ids as whole numbers in {path}, got {broken[0]}. Number or name the classes."
             )
-        ids = [int(name.partition(".")[0]) for name in found]
-        names = range(max(ids) + 1)
+        ids: Any = [int(name.partition(".")[0]) for name in found]
+        names: Any = range(max(ids) + 1)
     else:
         names, ids = np.unique(found, return_inverse=True)
     if len(names) > _MOST_CLASSES:

@@ -105,7 +105,7 @@ class SlopeTable:
             Parameters of shape [*B, K, H, W]: K = 1, or 2 where classes have second modes.
         """
         mean, std = self._read(class_id, slope_deg)
-        components = [(torch.ones_like(mean), mean, std)]
+        components: list[tuple[Tensor, ...]] = [(torch.ones_like(mean), mean, std)]
         if soft := self.soft:
             weight, *others = (v.to(slope_deg)[class_id] for v in (soft.weight, soft.mean, soft.std))
             components = [(1 - weight, mean, std), (weight, *others)]

@@ -127,16 +127,13 @@ class MapSampler(Sampler[MapKey]):
 
     def __iter__(self) -> Iterator[MapKey]:
         """Yields the batches of the epoch."""
-        order, symmetry = np.arange(self.maps), np.zeros(self.maps, dtype=np.int64)
-        factors = np.ones((self.maps, 3))
+        order, epoch = np.arange(self.maps), np.array([self.epoch])
         if self.shuffle:
-            epoch = np.array([self.epoch])
             order = rng.permutation(self._key("order"), epoch, self.maps)[0]
-            drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
-            symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        if self.jitter:
-            drawn = rng.uniform(self._key("jitter"), np.array([self.epoch]), (self.maps, 3))[0]
-            factors = 1 + self.jitter * (2 * drawn - 1)
+        drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
+        symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
+        drawn = rng.uniform(self._key("jitter"), epoch, (self.maps, 3))[0]
+        factors = 1 + self.jitter * (2 * drawn - 1)
         first, step = self.share
         pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
         for batch in zip(*pieces, strict=True):

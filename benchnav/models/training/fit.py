@@ -179,6 +179,13 @@ def forget(options: FitOptions, part: str) -> None:
         _drop(options.folder / part, STATE, _PARTIAL)
 
 
+def differing(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    """Names the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
+    wanted, there = (json.loads(json.dumps(settings, default=str)) for settings in (wanted, there))
+    others = sorted(name for name in {**wanted, **there} if wanted.get(name) != there.get(name))
+    return f"another {' and '.join(f'`{name}`' for name in others)}" if others else ""
+
+
 def default_precision(accelerator: str) -> str:
     """bf16-mixed where what is trained on, "cpu" or a GPU, has bfloat16 arithmetic, 32-true elsewhere."""
     if accelerator != "cpu":
@@ -191,20 +198,18 @@ def default_precision(accelerator: str) -> str:
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
     """Makes the folder; gives the state to go on from, if any."""
     folder.mkdir(parents=True, exist_ok=True)
-    state, described = folder / STATE, json.loads(json.dumps(settings, default=str))
+    state, described = folder / STATE, json.dumps(settings, default=str, indent=1) + "\n"
     if resume and state.exists():
         there = json.loads((folder / SETTINGS).read_text()) if (folder / SETTINGS).exists() else {}
-        names = {name for name in {*there, *described} if there.get(name) != described.get(name)}
-        if names:
+        if others := differing(settings, there):
             raise CheckpointError(
-                f"Expected the settings of the interrupted training in {folder} to resume it, got another "
-                f"{' and '.join(f'`{name}`' for name in sorted(names))}. Repeat its settings, or pass "
-                "--overwrite to begin anew."
+                f"Expected the settings of the interrupted training in {folder} to resume it, got {others}. "
+                "Repeat its settings, or pass --overwrite to begin anew."
             )
         return state
     if is_first_process():
         _drop(folder, STATE, _PARTIAL, HISTORY, "events.out.tfevents.*")
-        write_text(folder / SETTINGS, json.dumps(described, indent=1) + "\n")
+        write_text(folder / SETTINGS, described)
     return None
 
 

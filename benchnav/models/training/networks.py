@@ -39,8 +39,6 @@ from benchnav.models.training.fit import FitOptions, fit, is_first_process, make
 from benchnav.models.training.gps import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
-_DEFAULT = FitOptions()
-
 NETWORKS: Mapping[type, Any] = {
     network.kind: network for network in (TerrainClassifier, MixtureDensityNetwork)
 }
@@ -89,8 +87,8 @@ def train_networks(
 def fit_network(
     config: NetworkConfig,
     dataset: TerrainDataset,
-    seed: int = 0,
-    options: FitOptions = _DEFAULT,
+    seed: int,
+    options: FitOptions,
     part: str = "",
     half_precision: bool = False,
 ) -> tuple[Any, dict[str, float]]:

@@ -4,9 +4,7 @@ Every refusal comes before any work is done. Where processes train together, the
 and writes.
 """
 
-import json
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,7 @@ from benchnav.models.checkpoint import (
     save_checkpoint,
 )
 from benchnav.models.config import NetworkConfig
-from benchnav.models.training.fit import FitOptions, forget, interrupted, is_first_process
+from benchnav.models.training.fit import FitOptions, differing, forget, interrupted, is_first_process
 
 
 @dataclass
@@ -64,25 +62,22 @@ class Target:
         if part is None:
             return False
         # A part of an earlier version does not name settings that came later, nor those of the trainer.
-        wanted, there, options = asdict(config), {**asdict(type(config)()), **part.config}, self.options
-        names = [*wanted]
+        options, defaults = self.options, asdict(type(config)())
+        wanted, there = asdict(config), {key: part.config.get(key, usual) for key, usual in defaults.items()}
         if isinstance(config, NetworkConfig):
-            trainer = options.trainer_settings
-            known = trainer if part.trainer is None else part.trainer
-            wanted |= {"half_precision": options.half_precision, **_named(trainer)}
-            there |= {"half_precision": part.half_precision, **_named(known)}
-            names += ["half_precision", *sorted(_named({**trainer, **known}))]
-        wanted, there = (json.loads(json.dumps(settings)) for settings in (wanted, there))
-        others = [key for key in names if wanted.get(key) != there.get(key)]
-        if not others and (part.seed, part.data_digest) == (seed, self.digest):
-            forget(options, name)  # a kill may have come between saving and forgetting
-            return True
+            wanted["half_precision"], there["half_precision"] = options.half_precision, part.half_precision
+            if part.trainer is not None:
+                wanted |= {f"trainer.{key}": value for key, value in options.trainer_settings.items()}
+                there |= {f"trainer.{key}": value for key, value in part.trainer.items()}
+        named = f", {others}" if (others := differing(wanted, there)) else ""
+        if not named and part.seed == seed:
+            if part.data_digest == self.digest:
+                forget(options, name)  # a kill may have come between saving and forgetting
+                return True
+            named = ", other maps or another class table, or maps as recorded by benchnav before 0.7"
         remedy = "pass --overwrite instead of --resume"
         if interrupted(options, [name]):
             remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
-        named = f", another {' and '.join(f'`{key}`' for key in others)}" if others else ""
-        if not others and part.seed == seed:
-            named = ", other maps or another class table, or maps as recorded by benchnav before 0.7"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
             f"{part.seed} and {part.data_id}{named}. Repeat its settings, or {remedy}."
@@ -182,10 +177,6 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
         if overwrite:
             return None
         raise
-
-
-def _named(trainer: Mapping[str, Any]) -> dict[str, Any]:
-    return {f"trainer.{name}": value for name, value in trainer.items()}
 
 
 def _describe(checkpoint: Checkpoint) -> str:

@@ -213,7 +213,7 @@ def test_the_best_epoch_is_kept() -> None:
         best.on_validation_epoch_end(trainer, model)  # type: ignore[arg-type]
     best.on_fit_end(trainer, model)  # type: ignore[arg-type]
     assert model.weight.item() == 1
-    assert best.metrics == {"valid_loss": 1.0, "epoch": 2}
+    assert best.best["metrics"] == {"valid_loss": 1.0, "epoch": 2}
     assert trainer.callback_metrics == {"valid_loss": 1.0, "epoch": 2}
 
 
@@ -326,7 +326,7 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
         def forward(self, seen: torch.Tensor) -> torch.Tensor:
             return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
 
-    colour = Colour(ClassifierConfig(encoder="mobilenet_v2"), 4, torch.zeros(3), torch.ones(3)).eval()
+    colour = Colour(ClassifierConfig(encoder="mobilenet_v2"), 4).eval()
     found, wanted = (colour.measure(maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     assert 0 < found["valid_accuracy"] < 1

@@ -35,7 +35,7 @@ from benchnav.models.training import networks
 from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.networks import fit_network, measure
+from benchnav.models.training.networks import fit_network
 from tests.factories import normal
 from tests.models.support import make_terrain
 
@@ -364,9 +364,9 @@ def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: Ter
     for name, value in as_stored(whole.state_dict(), True).items():
         assert torch.equal(value, network.state_dict()[name]), name
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
-    assert measure(network, valid).items() <= metrics.items()
+    assert network.measure(valid).items() <= metrics.items()
     # Measured in the same way as in training, of which the rounding is all that changes it.
-    for name, value in measure(whole, valid).items():
+    for name, value in whole.measure(valid).items():
         assert value == pytest.approx(before[name], rel=1e-4), name
         assert value != metrics[name]
 
@@ -474,7 +474,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     # What it says of itself was measured on what is kept.
     kept = MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors)
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
-    assert measure(kept, valid).items() <= dict(part.metrics).items()
+    assert kept.measure(valid).items() <= dict(part.metrics).items()
 
     assert call(monkeypatch, "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0
     assert "test/std" in capfd.readouterr().out

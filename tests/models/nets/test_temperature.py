@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.fused import sharpen
 from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
-from benchnav.models.probabilities import sharpen
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 from benchnav.models.training.data import MapData, MapDataset
 

@@ -36,6 +36,7 @@ from benchnav.models.quality.scores import (
     predictive_entropy,
     tail_rate,
 )
+from tests.factories import draw
 from tests.models.stub import ColourModel
 
 
@@ -95,7 +96,7 @@ def test_crps_of_certain_predictions_is_their_distance() -> None:
 @pytest.mark.parametrize("mean", [0.5, 0.95, 0.05, 1.2])
 def test_what_is_drawn_from_the_prediction_is_calibrated(mean: float) -> None:
     mixture = single(mean, 0.15)
-    transformed = pit(mixture, mixture.sample(1, generator())[0], generator(1))
+    transformed = pit(mixture, draw(mixture, 1, generator())[0], generator(1))
     assert coverage(transformed) == pytest.approx(0.9, abs=0.006)
     assert tail_rate(transformed) == pytest.approx(0.1, abs=0.006)
     counts = pit_counts(transformed)
@@ -117,14 +118,14 @@ def test_pit_is_the_cdf_inside_and_within_the_atoms_at_the_ends() -> None:
 
 def test_tail_rate_counts_what_lies_under_the_var() -> None:
     mixture = single(0.5, 0.15)
-    observed = single(0.45, 0.25).sample(1, generator())[0]
+    observed = draw(single(0.45, 0.25), 1, generator())[0]
     share = float((observed < mixture.var(0.9)).double().mean())
     assert tail_rate(pit(mixture, observed, generator(1))) == pytest.approx(share, abs=1e-9)
     assert share > 0.2
 
 
 def test_a_prediction_too_narrow_covers_too_little() -> None:
-    transformed = pit(single(0.5, 0.05), single(0.5, 0.15).sample(1, generator())[0], generator(1))
+    transformed = pit(single(0.5, 0.05), draw(single(0.5, 0.15), 1, generator())[0], generator(1))
     assert coverage(transformed) < 0.5
 
 
