@@ -311,10 +311,6 @@ def _to_store(tensors: Mapping[str, Tensor], half: bool) -> dict[str, Tensor]:
 
 
 def _read_part(path: Path, data: Mapping[str, str], sha256: str, **entry: Any) -> Part:
-    if not path.is_file():
-        raise CheckpointError(
-            f"Expected {path.name} in checkpoint {path.parent}, got none. Copy it again whole."
-        )
     try:
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != sha256:

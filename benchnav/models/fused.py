@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
@@ -41,8 +40,6 @@ class FusedModel(ModelFamily):
         pool_temperature: float = 1.0,
     ) -> None:
         """Sets the classifiers to evaluation."""
-        if len(class_names) != len(table.mean):
-            raise ConfigError(f"Expected a GP for each of {len(class_names)} classes, got {len(table.mean)}.")
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
         self.table, self.class_names, self.pool_temperature = table, class_names, pool_temperature
 

@@ -122,11 +122,6 @@ def test_any_slope_has_a_prediction(slope: float) -> None:
     assert bool(mixture.cvar(0.9).isfinite().all())
 
 
-def test_classes_and_gps_have_to_be_as_many() -> None:
-    with pytest.raises(ConfigError, match="GP for each of 2"):
-        FusedModel([Linear(0)], linear_table(), NAMES[:2])
-
-
 def test_a_classifier_of_other_classes_is_refused() -> None:
     class Two(nn.Module):
         def forward(self, rgb: Tensor) -> Tensor:

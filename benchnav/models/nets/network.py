@@ -58,7 +58,19 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
         ConfigError: there is no such architecture or encoder, or they do not take these settings.
     """
     _check_names(config)
-    size = _size(config)
+    known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
+    own = known["decoder_channels"].default if "decoder_channels" in known else None
+    if config.decoder_channels and not isinstance(own, tuple):
+        raise ConfigError(
+            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
+            f"got {list(config.decoder_channels)}. Leave them out."
+        )
+    # What is not asked for is left to the architecture; at a lesser depth it would have too many channels.
+    size: dict[str, Any] = {"decoder_channels": config.decoder_channels} if config.decoder_channels else {}
+    if config.encoder_depth < DEEPEST:
+        size["encoder_depth"] = config.encoder_depth
+        if isinstance(own, tuple):
+            size.setdefault("decoder_channels", own[-config.encoder_depth :])
     # The hub's own lines on each trial to reach it would bury the error.
     with torch.random.fork_rng(devices=[]), quiet("huggingface_hub"):
         torch.default_generator.manual_seed(seed)
@@ -108,25 +120,6 @@ def _check_names(config: ClassifierConfig) -> None:
             "Expected `encoder` to be one of segmentation-models-pytorch, such as resnet18, or of timm, such as "
             f"tu-resnet18, got {encoder!r}.{hint(encoder, known)}"
         )
-
-
-def _size(config: ClassifierConfig) -> dict[str, Any]:
-    """The settings of the network's size, without those that are left to the architecture."""
-    known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
-    own = known["decoder_channels"].default if "decoder_channels" in known else None
-    if config.decoder_channels and not isinstance(own, tuple):
-        raise ConfigError(
-            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
-            f"got {list(config.decoder_channels)}. Leave them out."
-        )
-    size: dict[str, Any] = {}
-    if config.encoder_depth < DEEPEST:
-        size["encoder_depth"] = config.encoder_depth
-        if isinstance(own, tuple):
-            size["decoder_channels"] = own[-config.encoder_depth :]
-    if config.decoder_channels:
-        size["decoder_channels"] = config.decoder_channels
-    return size
 
 
 def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:

@@ -199,12 +199,9 @@ def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, 
 
 def _smooth(count: Tensor, total: Tensor, std: Tensor) -> Tensor:
     """f of least squares, its bends held small, from counts and sums of λ by bins of slope, [S, B]."""
-    bins = count.shape[1]
-    bends = torch.eye(bins, dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD if bins > 2 else None
+    bends = torch.eye(count.shape[1], dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD
     variance = std**2
     # A little of the level of all cells settles what the data leave open.
     level = (total.sum(1) / count.sum(1)).unsqueeze(1)
-    precision = torch.diag_embed(count / variance + 1e-3)
-    if bends is not None:
-        precision = precision + bends.T @ bends
+    precision = torch.diag_embed(count / variance + 1e-3) + bends.T @ bends
     return torch.linalg.solve(precision, (total / variance + 1e-3 * level).unsqueeze(-1)).squeeze(-1)

@@ -25,7 +25,6 @@ from benchnav.models.config import ClassifierConfig, LatentGPConfig, NetworkConf
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityNetwork
 from benchnav.models.nets.temperature import fit_pool_temperature
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import (
     TRAIN,
     VALID,
@@ -35,7 +34,15 @@ from benchnav.models.training.data import (
     read_maps,
     training_digest,
 )
-from benchnav.models.training.fit import FitOptions, fit, is_first_process, make_trainer, quietly, say
+from benchnav.models.training.fit import (
+    FitOptions,
+    KeepBest,
+    fit,
+    is_first_process,
+    make_trainer,
+    quietly,
+    say,
+)
 from benchnav.models.training.gps import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 

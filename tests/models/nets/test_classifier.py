@@ -15,8 +15,7 @@ from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
 from benchnav.models.nets.network import build_network
 from benchnav.models.nets.trainable import MapScale
-from benchnav.models.training.callbacks import KeepBest
-from benchnav.models.training.fit import FitOptions
+from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.networks import fit_network
 
 CPU = FitOptions(device="cpu", trainer={"precision": "32-true"})

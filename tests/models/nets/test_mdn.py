@@ -32,9 +32,8 @@ from benchnav.models.nets.mdn import (
 from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import networks
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions
+from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.networks import fit_network
 from tests.factories import normal
 from tests.models.support import make_terrain

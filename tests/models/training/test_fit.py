@@ -25,9 +25,8 @@ from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.temperature import fit_temperature, sample_logits
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, default_precision, fit
+from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
 from benchnav.models.training.networks import check_network, fit_network
 
 EXACT = {"precision": "32-true"}
