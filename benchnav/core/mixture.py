@@ -238,18 +238,13 @@ class TraversabilityMixture:
             Shape [*B, H, W], in the dtype of the parameters.
         """
         parameters = [values.movedim(-3, 0).flatten(1) for values in (self.weights, self.means, self.stds)]
-        flat = [layer.flatten() for layer in layers]
-        count, total = parameters[0].shape
-        numbers = _NUMBERS_AT_ONCE if parameters[0].device.type == "cpu" else _NUMBERS_ON_A_GPU
-        size = max(1, numbers // count)
+        numbers = _NUMBERS_AT_ONCE if self.weights.device.type == "cpu" else _NUMBERS_ON_A_GPU
+        size = max(1, numbers // len(parameters[0]))
+        pieces = (values.split(size, -1) for values in (*parameters, *(layer.flatten() for layer in layers)))
         done = []
-        for start in range(0, max(1, total), size):
-            piece = slice(start, start + size)
-            weights, means, stds = (values[:, piece].to(torch.float64) for values in parameters)
-            cells = Cells(
-                weights / added(weights), means, math.sqrt(0.5) / stds.clamp(min=_SMALLEST_STD), deep
-            )
-            done.append(work(cells, *(layer[piece] for layer in flat)))
+        for weights, means, stds, *others in zip(*pieces, strict=True):
+            weights, scales = weights.double(), math.sqrt(0.5) / stds.double().clamp(min=_SMALLEST_STD)
+            done.append(work(Cells(weights / added(weights), means.double(), scales, deep), *others))
         return torch.cat(done).view(self.weights.select(-3, 0).shape).to(self.weights.dtype)
 
     def _in_tail(self, work: Callable[[Cells, Tensor], Tensor], tail: float) -> Tensor:

@@ -168,22 +168,17 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         checkpoint: what to write.
 
     Raises:
-        CheckpointError: it cannot be written.
+        OSError: it cannot be written.
         ConfigError: the name is that of something else.
         BenchnavError: another process is writing it.
     """
     folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
-    try:
-        with sole_writer(folder, str(folder)):
-            restore(folder)
-            refuse_taken(folder, True, foreign)
-            with building(folder) as partial:
-                _write(partial, checkpoint)
-                take_place(partial, folder, last=CONFIG)
-    except OSError as error:
-        raise CheckpointError(
-            f"Could not write checkpoint {folder}: {error.strerror or error}. Choose another `out`."
-        ) from error
+    with sole_writer(folder, str(folder)):
+        restore(folder)
+        refuse_taken(folder, True, foreign)
+        with building(folder) as partial:
+            _write(partial, checkpoint)
+            take_place(partial, folder, last=CONFIG)
 
 
 def foreign(folder: Path) -> str:

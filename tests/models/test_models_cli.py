@@ -63,7 +63,7 @@ def test_halves_are_trained_into_one_checkpoint(
     assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER) == 0
     out, err = capfd.readouterr()
     assert "validation RMSE of the latent mean" in out
-    assert "validation accuracy" in out
+    assert re.search(r"best epoch 1, validation loss [\d.]+, accuracy [\d.]+, miou [\d.]+, temperature", out)
     assert "wrote new/mine with classifier and gp" in out
     assert re.search(r"wrote new/mine with gp \(\d+\.\d kB\)", out)
     assert [line.split(":")[0] for line in err.strip().splitlines()] == ["gp", "classifier"], err

@@ -30,12 +30,11 @@ class MeanIoU(MulticlassJaccardIndex):
 
     Args:
         class_count: C.
-        ignore_index: class of the cells that are left out.
     """
 
-    def __init__(self, class_count: int, ignore_index: int | None = None) -> None:
+    def __init__(self, class_count: int) -> None:
         """Starts with no cells."""
-        super().__init__(class_count, average="none", ignore_index=ignore_index)
+        super().__init__(class_count, average="none", ignore_index=UNLABELLED)
 
     def compute(self) -> Tensor:
         """The mean over all cells so far."""
@@ -100,7 +99,7 @@ class TerrainClassifier(TrainableNetwork):
         """Share of the labelled cells that are right, and mean intersection over union."""
         return {
             "accuracy": MulticlassAccuracy(self.class_count, average="micro", ignore_index=UNLABELLED),
-            "miou": MeanIoU(self.class_count, ignore_index=UNLABELLED),
+            "miou": MeanIoU(self.class_count),
         }
 
     def settings(self) -> dict[str, Any]:

@@ -186,20 +186,17 @@ class SlopeSums:
         """
         cells = self.cells.sum(2).double()
         size = max([0, *cells.sum(0).nonzero().flatten().tolist()]) + 1
-        zeros, ones = self.cells[..., 0].double(), self.cells[..., -1].double()
+        at_0, at_1 = self.cells[..., 0].double(), self.cells[..., -1].double()
+        zeros, ones = at_0 * censored, at_1 * censored
         middle = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * BIN_DEG
         sums = {
             "slope_deg": torch.where(cells > 0, self.slope / cells.clamp(min=1), middle),
             "zeros": zeros,
             "ones": ones,
             "inside": cells - zeros - ones,
-            "total": self.total,
-            "squares": self.squares,
+            "total": self.total + (at_1 - ones),
+            "squares": self.squares + (at_1 - ones),
         }
-        if not censored:
-            none = torch.zeros_like(zeros)
-            sums |= {"zeros": none, "ones": none, "inside": cells}
-            sums |= {"total": self.total + ones, "squares": self.squares + ones}
         return {**{name: values[:, :size].clone() for name, values in sums.items()}, "count": self.count}
 
 

@@ -57,11 +57,11 @@ class MapDataset(TerrainMaps):
         }
         return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
 
-    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
+    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[list[int], Batch]]:
         """All maps as they are, in order, some at a time, with their indices; on a device."""
-        step = max(1, CHUNK_CELLS // (self.shape[0] * self.shape[1]))
-        for first in range(0, len(self), step):
-            indices = range(first, min(first + step, len(self)))
+        height, width = self.shape
+        for chunk in torch.arange(len(self)).split(max(1, CHUNK_CELLS // (height * width))):
+            indices = chunk.tolist()
             yield indices, {name: values.to(device) for name, values in self.read(indices).items()}
 
 

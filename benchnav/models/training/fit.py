@@ -131,7 +131,9 @@ def fit(
     """
     folder = options.folder / part if options.folder else None
     held = sole_writer(folder, str(folder)) if folder and is_first_process() else nullcontext()
-    callbacks, state = [*callbacks, progress(part)], None
+    in_terminal = sys.stderr.isatty()
+    shown = RichProgressBar(console_kwargs={"stderr": True}) if in_terminal else EpochLines(part)
+    callbacks, state = [*callbacks, shown], None
     kept: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     with quietly(), held:
         if folder:
@@ -340,19 +342,9 @@ class EpochLines(Callback):
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Says it."""
-        found = measured(trainer)
-        shown = {name: value for name, value in found.items() if name.startswith("valid_")} or found
-        values = [f"{name.removeprefix('valid_')} {value:.4f}" for name, value in shown.items()]
+        found, epoch = measured(trainer), f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
         if trainer.is_global_zero:
-            epoch = f"{self.what}: epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-            tell(", ".join([epoch, *values]))
-
-
-def progress(what: str) -> Callback:
-    """Shows how far training is: Lightning's bar in a terminal, a line an epoch elsewhere."""
-    if sys.stderr.isatty():
-        return RichProgressBar(console_kwargs={"stderr": True})
-    return EpochLines(what)
+            tell(f"{self.what}: {epoch}, {in_words(found, 'valid_') or in_words(found)}")
 
 
 class WholeFiles(TorchCheckpointIO):
@@ -370,3 +362,9 @@ class WholeFiles(TorchCheckpointIO):
 def measured(trainer: lightning.Trainer) -> dict[str, float]:
     """What was measured so far, by name."""
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def in_words(metrics: Mapping[str, float], prefix: str = "") -> str:
+    """Those of some measures whose names begin with a prefix, without it."""
+    chosen = {name.removeprefix(prefix): value for name, value in metrics.items() if name.startswith(prefix)}
+    return ", ".join(f"{name} {value:.4f}" for name, value in chosen.items())

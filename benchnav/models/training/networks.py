@@ -38,6 +38,7 @@ from benchnav.models.training.fit import (
     FitOptions,
     KeepBest,
     fit,
+    in_words,
     is_first_process,
     make_trainer,
     quietly,
@@ -190,11 +191,11 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
         if target.holds(part, config, seed):
             continue
         network, metrics = fit_network(config, dataset, seed, options, part, options.half_precision)
-        names = {"accuracy": "accuracy", "miou": "mIoU", "rmse": "RMSE", "loss": "loss"}
-        values = {title: metrics.get(f"valid_{name}") for name, title in names.items()}
-        shown = [f"{title} {value:.4f}" for title, value in values.items() if value is not None]
-        calibrated = set(network.settings()) - set(asdict(config))
-        shown += [f"{name} {getattr(network, name):.3f}" for name in sorted(calibrated)]
+        calibrated = sorted(set(network.settings()) - set(asdict(config)))
+        shown = [
+            in_words(metrics, "valid_"),
+            *(f"{name} {getattr(network, name):.3f}" for name in calibrated),
+        ]
         say(f"{part}: best epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")
         trained = Part(
             config=network.settings(),

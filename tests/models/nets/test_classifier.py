@@ -292,7 +292,7 @@ def test_mean_iou_is_over_the_classes_that_occur_in_truth() -> None:
     found[:4], found[500:502] = torch.tensor([2, 3, 4, 5]), 0
     ious = (496 / 502, 498 / 500)
     assert float(MulticlassJaccardIndex(6)(found, class_id)) == pytest.approx(sum(ious) / 6)
-    metric = MeanIoU(6, ignore_index=UNLABELLED)
+    metric = MeanIoU(6)
     unknown = torch.full((50,), UNLABELLED)
     for some, true in ((found, class_id), (torch.full((50,), 4), unknown)):
         metric.update(some, true)
