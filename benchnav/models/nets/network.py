@@ -84,7 +84,7 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
                 **size,
             )
             if config.encoder_depth < DEEPEST:
-                _drop_unused_stages(network, network.encoder)
+                _drop_unused_stages(network)
         except (OSError, KeyError, RuntimeError) as error:
             if not config.pretrained:
                 raise
@@ -122,7 +122,7 @@ def _check_names(config: ClassifierConfig) -> None:
         )
 
 
-def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:
+def _drop_unused_stages(network: Any) -> None:
     """Takes out what a lesser depth leaves idle in a network's encoder: it would be stored all the same.
 
     Idle is what has weights of which none is given a gradient.
@@ -134,7 +134,7 @@ def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:
     if answer.shape[-1] != _CONDITION_SIDE:
         raise ValueError(f"it answers {_CONDITION_SIDE} cells with {answer.shape[-1]}.")
     answer.sum().backward()
-    for part in list(encoder.modules()):
+    for part in list(network.encoder.modules()):
         for name, inner in list(part.named_children()):
             weights = list(inner.parameters())
             if weights and all(weight.grad is None for weight in weights):

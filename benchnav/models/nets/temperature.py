@@ -77,7 +77,7 @@ def sample_logits(
         DatasetError: there is no such cell.
     """
     cells = maps.shape[0] * maps.shape[1]
-    kept = min(cells, max(1, _MOST_CELLS // len(maps)))
+    kept = max(1, _MOST_CELLS // len(maps))
     key = rng.stream_key(seed, "models", "temperature")
     found, classifier = [], classifier.to(device)
     with torch.inference_mode(), exact_convolutions():

@@ -54,7 +54,7 @@ class TrainableNetwork(lightning.LightningModule):
         super().__init__()
         self.config: Any = config
         # A loss that is no number is to be seen, not left out.
-        metrics: dict[str, Metric | MetricCollection] = {
+        metrics: dict[str, Any] = {
             "loss": MeanMetric(nan_strategy=math.nan),
             **self.configure_metrics(),
         }

@@ -41,15 +41,13 @@ class SoftModes:
 
     def __post_init__(self) -> None:
         """Checks shapes and values."""
-        if not self.weight.shape == self.mean.shape == self.std.shape:
-            raise ConfigError(
-                "Expected `weight`, `mean` and `std` of soft modes of one shape [C], got "
-                f"{list(self.weight.shape)}, {list(self.mean.shape)} and {list(self.std.shape)}."
-            )
+        is_whole = self.weight.shape == self.mean.shape == self.std.shape
         shares = (self.weight >= 0) & (self.weight < 1)
-        if not bool((shares & self.mean.isfinite() & self.std.isfinite() & (self.std > 0)).all()):
+        if not is_whole or not bool(
+            (shares & self.mean.isfinite() & self.std.isfinite() & (self.std > 0)).all()
+        ):
             raise ConfigError(
-                "Expected soft modes of `weight` in [0, 1), finite `mean` and `std` > 0, got others."
+                "Expected soft modes of one shape [C], of `weight` in [0, 1), finite `mean` and `std` > 0, got others."
             )
 
 

@@ -41,7 +41,7 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: torch.device = CPU)
         soft, share = find_soft_modes(sums)
         bins = main_bins(sums, soft, share) if soft else bins
     bins = {name: values.to(device) for name, values in bins.items()}
-    model = LatentGPs(config, len(sums.count), sums.steepest_deg, soft).to(device)
+    model = LatentGPs(config, sums.steepest_deg, soft).to(device)
     optimizers, cells = model.optimizers(), max(1, int(sums.count.sum()))
     for epoch in range(1, config.epochs + 1):
         total = 0.0

@@ -156,8 +156,8 @@ def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOp
     with quietly():
         chosen = options.chosen(max_epochs=config.max_epochs)
         trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
-    every = trainer.check_val_every_n_epoch
-    if every is not None and every > config.max_epochs:
+    every = trainer.check_val_every_n_epoch or 0
+    if every > config.max_epochs:
         raise ConfigError(
             f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
             f"got {every}."

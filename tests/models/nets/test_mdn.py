@@ -1,4 +1,5 @@
 import json
+import re
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
