@@ -135,9 +135,8 @@ def open_target(
         )
     restore(folder)
     refuse_taken(folder, True, foreign)
-    with building(
-        folder
-    ):  # whether a checkpoint can be written there shows now rather than after the training
+    # Whether a checkpoint can be written there shows now rather than after the training.
+    with building(folder):
         checkpoint = existing(folder, options.overwrite) or fresh
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
         if not options.overwrite:
