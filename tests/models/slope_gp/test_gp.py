@@ -464,7 +464,7 @@ def errors_of_lookup(model: LatentGPs, slopes: torch.Tensor) -> tuple[torch.Tens
     """Largest errors of the table's mean and standard deviation at some slopes, each of shape [C]."""
     mean, std = model.tabulate().lookup(slopes[None].double())
     with torch.no_grad():
-        exact = model(slopes.expand(model.class_count, -1))
+        exact = model(slopes.expand(len(model.steepest_deg), -1))
         total = (exact.variance + model.likelihood.noise).sqrt()
     return (mean[:, 0] - exact.mean).abs().amax(-1), (std[:, 0] - total).abs().amax(-1)
 
