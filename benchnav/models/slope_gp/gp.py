@@ -22,12 +22,14 @@ clipped there. Source: Tobin (1958), "Estimation of relationships for limited de
 import math
 
 import gpytorch
+import lightning
 import numpy as np
 import torch
 from gpytorch.constraints import Interval
 from gpytorch.distributions import MultivariateNormal
 from gpytorch.variational import NaturalVariationalDistribution, UnwhitenedVariationalStrategy
-from torch import Tensor, nn
+from torch import Tensor
+from torch.utils.data import DataLoader
 
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes, table_slopes
@@ -94,7 +96,7 @@ class SlopeGP(gpytorch.models.ApproximateGP):
         return prior.mean, prior.covariance_matrix + strategy.jitter_val * eye
 
 
-class LatentGPs(nn.Module):
+class LatentGPs(lightning.LightningModule):
     """Learns the latent traversability functions of all classes at once.
 
     Args:
@@ -112,6 +114,7 @@ class LatentGPs(nn.Module):
     ) -> None:
         """Builds the GPs at their prior, in float64."""
         super().__init__()
+        self.automatic_optimization = False
         self.config, self.soft = config, soft
         self.steepest_deg = [round(slope, 4) for slope in steepest_deg.tolist()]
         reach = torch.tensor(self.steepest_deg, dtype=torch.float64)
@@ -125,7 +128,7 @@ class LatentGPs(nn.Module):
         self.double()
         self.gp.start()
 
-    def optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
+    def configure_optimizers(self) -> tuple[torch.optim.Optimizer, torch.optim.Optimizer]:
         """Natural gradients for the inducing values, Rprop for kernel and noise."""
         natural = gpytorch.optim.NGD(self.gp.variational_parameters(), num_data=1, lr=_NATURAL_RATE)
         others = [*self.gp.hyperparameters(), *self.likelihood.parameters()]
@@ -135,10 +138,24 @@ class LatentGPs(nn.Module):
         """The latent functions at slopes of each class, shape [C, N]."""
         return self.gp((slope_deg.double() / _SLOPE_UNIT_DEG).unsqueeze(-1))
 
+    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
+        """Takes one step up the evidence lower bound of each class, over all its cells.
+
+        A class without any is left at its prior. A batch is what `SlopeSums.bins` gives.
+        """
+        bound = self.bound(batch)
+        optimizers = self.optimizers()
+        assert isinstance(optimizers, list)
+        natural, others = optimizers
+        self.zero_grad()
+        self.manual_backward(-bound.sum())
+        natural.step()
+        others.optimizer.step()  # past Lightning, which would count a second step
+        loss = -bound.detach().sum() / batch["count"].sum()
+        self.log("loss", loss, on_step=False, on_epoch=True, batch_size=1)
+
     def bound(self, bins: dict[str, Tensor]) -> Tensor:
         """The evidence lower bound of each class's cells and its noise, shape [C]; 0 without cells.
-
-        Without cells it has no gradient: the class is left at its prior.
 
         Args:
             bins: from `SlopeSums.bins`.
@@ -153,7 +170,7 @@ class LatentGPs(nn.Module):
     def tabulate(self) -> SlopeTable:
         """Evaluates mean, spread and noise at the nodes of the table, float32."""
         self.eval()
-        slopes = table_slopes().to(self.likelihood.noise.device).expand(len(self.steepest_deg), -1)
+        slopes = table_slopes().to(self.device).expand(len(self.steepest_deg), -1)
         with torch.no_grad():
             latent = self(slopes)
             noise = self.likelihood.noise
@@ -169,6 +186,17 @@ class LatentGPs(nn.Module):
         """Gives the table and all parameters by name, for a checkpoint."""
         state = {f"state.{name}": value for name, value in self.state_dict().items()}
         return {**self.tabulate().to_tensors(), **state}
+
+
+def load_batches(config: LatentGPConfig, bins: dict[str, Tensor]) -> DataLoader[dict[str, Tensor]]:
+    """Makes the loader of training batches, each of them all cells.
+
+    Args:
+        config: what is trained.
+        bins: from `SlopeSums.bins`.
+    """
+    # A generator of its own keeps the loader from drawing on PyTorch's global one.
+    return DataLoader([bins] * config.epoch_steps, batch_size=None, generator=torch.Generator())  # type: ignore[arg-type]
 
 
 def expected_log_prob(bins: dict[str, Tensor], mean: Tensor, variance: Tensor, noise: Tensor) -> Tensor:

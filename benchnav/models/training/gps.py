@@ -4,27 +4,24 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import torch
-
-from benchnav.core.command import tell
-from benchnav.core.device import CPU
+from benchnav.core.command import Device, tell
 from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import GP, Checkpoint, Part
 from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
 from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, measure_latent, sum_split
-from benchnav.models.slope_gp.gp import LatentGPs
+from benchnav.models.slope_gp.gp import LatentGPs, load_batches
 from benchnav.models.slope_gp.slip_logs import ENDINGS, read_slip_logs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
-from benchnav.models.training.fit import FitOptions, say
+from benchnav.models.training.fit import FitOptions, fit, say
 from benchnav.models.training.target import existing, fresh_checkpoint, open_target
 
 _HELD_OUT = 0.1  # of slip logs
 _FEW_ROWS = 10  # of a class in slip logs
 
 
-def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: torch.device = CPU) -> LatentGPs:
+def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu") -> LatentGPs:
     """Trains the class-wise GPs on sums over cells, in float64 on one device; nothing is drawn.
 
     Args:
@@ -40,19 +37,17 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: torch.device = CPU)
     if config.second_component and censored:
         soft, share = find_soft_modes(sums)
         bins = main_bins(sums, soft, share) if soft else bins
-    bins = {name: values.to(device) for name, values in bins.items()}
-    model = LatentGPs(config, sums.steepest_deg, soft).to(device)
-    optimizers, cells = model.optimizers(), max(1, int(sums.count.sum()))
-    for epoch in range(1, config.epochs + 1):
-        total = 0.0
-        for _ in range(config.epoch_steps):
-            loss = -model.bound(bins).sum()
-            model.zero_grad()
-            loss.backward()
-            for optimizer in optimizers:
-                optimizer.step()
-            total += loss.item() / cells
-        tell(f"gp: epoch {epoch}/{config.epochs}, loss {total / config.epoch_steps:.4f}")
+    model = LatentGPs(config, sums.steepest_deg, soft)
+    fit(
+        model,
+        GP,
+        FitOptions(device=device),
+        {},
+        [],
+        {"train_dataloaders": load_batches(config, bins)},
+        max_epochs=config.epochs,
+        precision="64-true",
+    )
     return model.cpu().eval()
 
 
@@ -79,7 +74,7 @@ def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions
 def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: FitOptions) -> Part:
     """Trains the GPs on the split `train` and gives them as a part of a checkpoint."""
     names = [item.name for item in dataset.recipe.classes]
-    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options.place)
+    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options.device)
     known = dataset.truth_of(VALID) == "generated"
     found = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     errors = (
@@ -115,19 +110,19 @@ def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOpti
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
         kept, held = hold_out(cells, _HELD_OUT, options.seed)
-        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.place)
+        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.device)
         metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
         say(
             f"gp: NLL of {len(held)} rows held out, which follow one another in each class, "
             f"{metrics['held_out_nll']:.4f}; now with all rows"
         )
-    model = _fit_and_say(config, sums, names, options.place)
+    model = _fit_and_say(config, sums, names, options.device)
     say(f"gp: rows learned from: {', '.join(f'{name} {count}' for name, count in counts.items())}")
     target.add(GP, _part(model, options.seed, metrics, Path(data).name, digest))
 
 
 def _fit_and_say(
-    config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], device: torch.device
+    config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], device: Device
 ) -> LatentGPs:
     """Trains the GPs, and names the classes that were found to have a second mode."""
     model = fit_gps(config, sums, device)

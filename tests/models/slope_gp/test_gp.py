@@ -391,6 +391,12 @@ def test_training_draws_nothing() -> None:
     assert torch.equal(before, torch.random.get_rng_state())
 
 
+def test_the_trainer_counts_every_step_once() -> None:
+    # Its count moves the progress bar.
+    model = fit_gps(LatentGPConfig(epochs=2, epoch_steps=5), make_sums(50))
+    assert model.trainer.global_step == 10
+
+
 def test_each_epoch_is_told_with_its_loss(capfd: pytest.CaptureFixture[str]) -> None:
     fit_gps(LatentGPConfig(epochs=2, epoch_steps=5), make_sums(50))
     lines = capfd.readouterr().err.splitlines()
