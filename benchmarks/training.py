@@ -24,9 +24,8 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, default_precision, fit
+from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
 
 EPOCHS = 2
 
@@ -55,7 +54,7 @@ class Stopwatch(Callback):
 def ours(data: MapData, config: ClassifierConfig, precision: str, classes: int) -> tuple[float, float]:
     """Images a second of training, and of whole epochs; the best of the epochs but the first."""
     watch = Stopwatch()
-    model = TerrainClassifier(config, classes, *data.colour_statistics())
+    model = TerrainClassifier(config, classes, data.scale())
     with tempfile.TemporaryDirectory() as folder:
         options = FitOptions(folder=Path(folder), trainer={"precision": precision})
         fit(model, "bench", options, {}, [KeepBest(), watch], {"datamodule": data}, max_epochs=EPOCHS)
@@ -65,7 +64,7 @@ def ours(data: MapData, config: ClassifierConfig, precision: str, classes: int) 
 
 def plain(data: MapData, config: ClassifierConfig, classes: int, autocast: bool) -> float:
     """Images a second of a plain loop."""
-    model = TerrainClassifier(config, classes, *data.colour_statistics()).train()
+    model = TerrainClassifier(config, classes, data.scale()).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
     best = float("inf")
     for _ in range(EPOCHS):

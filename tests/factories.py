@@ -25,6 +25,20 @@ def normal(mean: torch.Tensor, std: torch.Tensor) -> TraversabilityMixture:
     return TraversabilityMixture(torch.ones_like(means), means, std.unsqueeze(1), (0,))
 
 
+def draw(mixture: TraversabilityMixture, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Draws λ independently in each cell, component first, shape [count, *B, H, W]."""
+    shape, expanded = (count, *mixture.weights.movedim(-3, 0).shape[1:]), (count, *mixture.weights.shape)
+    pick = torch.rand(shape, generator=generator, dtype=mixture.weights.dtype)
+    edges = mixture.weights.cumsum(-3)
+    component = (pick.unsqueeze(-3) >= edges).sum(-3, keepdim=True).clamp(max=edges.shape[-3] - 1)
+    mean, std = (
+        torch.gather(values.expand(expanded), -3, component).squeeze(-3)
+        for values in (mixture.means, mixture.stds)
+    )
+    noise = torch.randn(shape, generator=generator, dtype=mixture.weights.dtype)
+    return (mean + std * noise).clamp(0, 1)
+
+
 def terrain(mean: torch.Tensor, std: float = 0.1) -> Terrain:
     """Flat terrain of one class with the given latent traversability, shape [B, H, W]."""
     batch, height, width = mean.shape

@@ -45,9 +45,6 @@ _REACH = {
 _MOST_ODDS = 16.0  # logarithms; beyond them float32 holds no share but 0 and 1
 _LOGISTIC_STD = math.sqrt(3) / math.pi  # standard deviations a unit of log odds
 
-# Takes F − tail, how far off that is by the density, and the tail; tells which roots are near enough.
-Near = Callable[[Tensor, Tensor, Tensor], Tensor]
-
 
 @dataclass(frozen=True)
 class Cells:
@@ -122,11 +119,7 @@ def value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
         cells: in float64.
         tail: p in (0, 1), shape [N].
     """
-
-    def near(excess: Tensor, off: Tensor, tail: Tensor) -> Tensor:
-        return (off.abs() < _VAR_ERROR) & (excess.abs() < _SHARE_ERROR * tail)
-
-    root = _root(cells, tail, _first_root(cells, tail), near)
+    root = _root(cells, tail, _first_root(cells, tail), is_var=True)
     return torch.where(cells.means.isnan().any(0), torch.nan, root)
 
 
@@ -137,10 +130,6 @@ def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
         cells: in float64.
         tail: p in (0, 1), shape [N].
     """
-
-    def near(excess: Tensor, off: Tensor, tail: Tensor) -> Tensor:
-        return excess.abs() < _SHARE_ERROR * tail
-
     value = _first_root(cells, tail)
     share, density, std, integral = cells.around(value)
     with torch.no_grad():
@@ -148,7 +137,7 @@ def conditional_value_at_risk(cells: Cells, tail: Tensor) -> Tensor:
         off = excess / density
         is_near = ((excess * off).abs() < _CVAR_ERROR * tail) & (off.abs() < _STRAIGHT * std)
         far = ~(is_near | _at_an_end(value, excess))
-        value = _replaced(value, far, lambda some, p, x: _root(some, p, x, near), cells, tail, value)
+        value = _replaced(value, far, _root, cells, tail, value)
     integral = _replaced(integral, far, Cells.integral, cells, value)
     return (value - (integral - cells.integral(0.0)) / tail).clamp(min=0).minimum(value)
 
@@ -186,25 +175,24 @@ def _first_root(cells: Cells, tail: Tensor) -> Tensor:
     low, high, slopes = torch.zeros_like(value), torch.ones_like(value), short.weights * short.scales
     for count in range(_SHORT_SEARCH):
         _, _, value, low, high = _move(
-            short, slopes, p, odds, value, low, high, halve=count == _SHORT_SEARCH - 1, settle=True
+            short, slopes, p, odds, value, low, high, halve=count == _SHORT_SEARCH - 1
         )
     return value.to(tail)
 
 
-def _root(cells: Cells, tail: Tensor, value: Tensor, near: Near) -> Tensor:
-    """Seeks x in [0, 1] with F(x) = tail, from values on, until they are near or all steps are taken."""
+def _root(cells: Cells, tail: Tensor, value: Tensor, is_var: bool = False) -> Tensor:
+    """Seeks x in [0, 1] with F(x) = tail, from values on, until F and, of a VaR, x are near or all steps are taken."""
     found, left = value.clone(), torch.arange(len(value), device=value.device)
     settled = torch.zeros_like(value, dtype=torch.bool)
     low, high, odds = torch.zeros_like(value), torch.ones_like(value), torch.logit(tail)
     for count in range(_LONG_SEARCH):
         halve, slopes = count >= _FREE_STEPS and count % 2 == 1, cells.weights * cells.scales
-        excess, off, moved, low, high = _move(
-            cells, slopes, tail, odds, value, low, high, halve, settle=False
-        )
+        excess, off, moved, low, high = _move(cells, slopes, tail, odds, value, low, high, halve)
+        near = excess.abs() < _SHARE_ERROR * tail
+        if is_var:
+            near &= off.abs() < _VAR_ERROR
         # Cells that are not known, whose parameters are not numbers, have no root.
-        ended = (
-            near(excess, off, tail) | _at_an_end(value, excess) | (high - low < _LEAST_GAP) | excess.isnan()
-        )
+        ended = near | _at_an_end(value, excess) | (high - low < _LEAST_GAP) | excess.isnan()
         value = torch.where(ended, value, moved)
         if not _may_wait(value):
             found, settled = torch.where(settled, found, value), settled | ended
@@ -227,7 +215,6 @@ def _move(
     low: Tensor,
     high: Tensor,
     halve: bool,
-    settle: bool,
 ) -> tuple[Tensor, ...]:
     """Takes one step of Newton's method on the log odds of F, or halves the bounds.
 
@@ -246,7 +233,7 @@ def _move(
     moved = (value + step).clamp(0, 1)
     inside = (moved >= low) & (moved <= high)
     if halve:
-        inside &= settle & (step.abs() < 0.1 * (high - low))
+        inside &= (step.abs() < 0.1 * (high - low)) & (z.dtype == torch.float32)
     return excess, excess / density, torch.where(inside, moved, (low + high) / 2), low, high
 
 

@@ -17,8 +17,8 @@ dimensions.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass, is_dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -27,9 +27,13 @@ from torch import Tensor
 from benchnav.core.cvar import Cells, added, conditional_value_at_risk, mean, value_at_risk
 from benchnav.core.errors import ConfigError
 
+Value = TypeVar("Value", bound=Any)
+
 _SMALLEST_STD = 1e-9
 _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
-_QUADRATURE_NODES = 24
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+_LEGENDRE = list(zip((0.5 + 0.5 * _NODES).tolist(), (0.5 * _WEIGHTS).tolist(), strict=True))  # on [0, 1]
 _DEEP_TAIL = 1e-6  # under which F has to be exact to its own last bits
 _NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
 _NUMBERS_ON_A_GPU = 2**24  # where few large pieces are quicker than many small ones
@@ -95,11 +99,9 @@ class TraversabilityMixture:
         Returns:
             Traversability, shape [*B, H, W].
         """
-        tail = 1 - _check_level(level)
-        if tail == 1:
-            return torch.ones_like(self.weights.select(-3, 0))
-        return self._in_pieces(
-            lambda cells: value_at_risk(cells, torch.full_like(cells.means[0], tail)), deep=tail < _DEEP_TAIL
+        tail = _tail(level)
+        return (
+            torch.ones_like(self.weights.select(-3, 0)) if tail == 1 else self._in_tail(value_at_risk, tail)
         )
 
     def cvar(self, level: float) -> Tensor:
@@ -111,13 +113,8 @@ class TraversabilityMixture:
         Returns:
             Traversability, shape [*B, H, W].
         """
-        tail = 1 - _check_level(level)
-        if tail == 1:
-            return self.mean()
-        return self._in_pieces(
-            lambda cells: conditional_value_at_risk(cells, torch.full_like(cells.means[0], tail)),
-            deep=tail < _DEEP_TAIL,
-        )
+        tail = _tail(level)
+        return self.mean() if tail == 1 else self._in_tail(conditional_value_at_risk, tail)
 
     def chance(self, value: float) -> Tensor:
         """P(λ ≥ value), shape [*B, H, W].
@@ -161,9 +158,7 @@ class TraversabilityMixture:
 
     def select(self, members: Tensor) -> "TraversabilityMixture":
         """Keeps some maps of the first dimension, by index, shape [M]."""
-        return TraversabilityMixture(
-            self.weights[members], self.means[members], self.stds[members], self.group
-        )
+        return map_tensors(self, lambda values: values[members])
 
     def at(self, cells: Tensor) -> "TraversabilityMixture":
         """Keeps some cells as a map of one row, [K, 1, N].
@@ -171,14 +166,11 @@ class TraversabilityMixture:
         Args:
             cells: which of them, bool, shape [B, H, W].
         """
-        parameters = (self.weights, self.means, self.stds)
-        weights, means, stds = (values.movedim(1, 0)[:, cells].unsqueeze(1) for values in parameters)
-        return TraversabilityMixture(weights, means, stds, self.group)
+        return map_tensors(self, lambda values: values.movedim(1, 0)[:, cells].unsqueeze(1))
 
     def to(self, device: torch.device | str) -> "TraversabilityMixture":
         """The mixture on a device."""
-        weights, means, stds = (values.to(device) for values in (self.weights, self.means, self.stds))
-        return TraversabilityMixture(weights, means, stds, self.group)
+        return map_tensors(self, lambda values: values.to(device))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1); log probability mass at 0 and at 1; −∞ elsewhere.
@@ -191,36 +183,26 @@ class TraversabilityMixture:
         """
         value = value.to(torch.float64)
         weights, means, stds = self._parameters()
-        z = (value.unsqueeze(-3) - means) / stds
-        density = -0.5 * z**2 - stds.log() - 0.5 * math.log(2 * math.pi)
-        mass_at_0 = torch.special.log_ndtr(-means / stds)
-        mass_at_1 = torch.special.log_ndtr((means - 1) / stds)
-        at = value.unsqueeze(-3)
-        component = torch.where(at <= 0, mass_at_0, torch.where(at >= 1, mass_at_1, density))
+        component = component_log_prob(means, stds, value.unsqueeze(-3), torch.special.log_ndtr)
         total = torch.logsumexp(component + weights.log(), dim=-3)
         # At an end it is a probability, which rounding must not bring above 1.
         total = torch.where((value <= 0) | (value >= 1), total.clamp(max=0), total)
         return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.weights.dtype)
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws λ independently in each cell.
+    def class_probabilities(self, count: int) -> Tensor:
+        """Probability of each of `count` terrain classes: the sum of the weights of its components.
 
-        Args:
-            count: draws a cell.
-            generator: on the device of the parameters.
+        Without `group` the components are the classes.
 
         Returns:
-            Traversability in [0, 1], shape [count, *B, H, W].
+            Shape [*B, count, H, W]; the weights themselves where each class has one component, in order.
         """
-        shape, device = (count, *self.weights.movedim(-3, 0).shape[1:]), self.weights.device
-        pick = torch.rand(shape, generator=generator, device=device, dtype=self.weights.dtype)
-        edges = self.weights.cumsum(-3)
-        component = (pick.unsqueeze(-3) >= edges).sum(-3, keepdim=True).clamp(max=edges.shape[-3] - 1)
-        expanded = (count, *self.weights.shape)
-        mean = torch.gather(self.means.expand(expanded), -3, component).squeeze(-3)
-        std = torch.gather(self.stds.expand(expanded), -3, component).squeeze(-3)
-        noise = torch.randn(shape, generator=generator, device=device, dtype=self.weights.dtype)
-        return (mean + std * noise).clamp(0, 1)
+        if self.group in (None, tuple(range(count))):
+            return self.weights
+        weights = self.weights.movedim(-3, 0)
+        total = torch.zeros_like(weights[:1]).repeat(count, *(1,) * (weights.ndim - 1))
+        total.index_add_(0, torch.tensor(self.group, device=weights.device), weights)
+        return total.movedim(0, -3)
 
     def most_likely(self) -> "TraversabilityMixture":
         """Keeps the heaviest class of each cell alone, all its components: the paper's single-class option.
@@ -235,16 +217,13 @@ class TraversabilityMixture:
                 "Expected components that belong to terrain classes for the single-class option, got a "
                 "mixture without `group`. Take another risk measure, or give the mixture its `group`."
             )
-        classes = sorted(set(self.group))
-        members = [[k for k, own in enumerate(self.group) if own == c] for c in classes]
-        of_class = torch.stack([self.weights[..., own, :, :].sum(-3) for own in members], dim=-3)
-        best = of_class.argmax(dim=-3, keepdim=True)
-        if len(classes) == len(self.group):  # a component a class: the others need not be kept at no weight
-            order = torch.tensor([own[0] for own in members], device=best.device)[best]
-            means, stds = (torch.gather(t, -3, order) for t in (self.means, self.stds))
+        best = self.class_probabilities(max(self.group) + 1).argmax(-3, keepdim=True)
+        is_best = torch.tensor(self.group, device=best.device).view(-1, 1, 1) == best
+        if len(set(self.group)) == len(self.group):  # the others need not be kept at no weight
+            order = is_best.int().argmax(-3, keepdim=True)
+            means, stds = (torch.gather(values, -3, order) for values in (self.means, self.stds))
             return TraversabilityMixture(torch.ones_like(means), means, stds, (0,))
-        class_of = torch.tensor([classes.index(own) for own in self.group], device=best.device)
-        kept = torch.where(class_of.view(-1, 1, 1) == best, self.weights, 0.0)
+        kept = torch.where(is_best, self.weights, 0.0)
         return replace(self, weights=kept / kept.sum(-3, keepdim=True))
 
     def _in_pieces(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
@@ -259,19 +238,20 @@ class TraversabilityMixture:
             Shape [*B, H, W], in the dtype of the parameters.
         """
         parameters = [values.movedim(-3, 0).flatten(1) for values in (self.weights, self.means, self.stds)]
-        flat = [layer.flatten() for layer in layers]
-        count, total = parameters[0].shape
-        numbers = _NUMBERS_AT_ONCE if parameters[0].device.type == "cpu" else _NUMBERS_ON_A_GPU
-        size = max(1, numbers // count)
+        numbers = _NUMBERS_AT_ONCE if self.weights.device.type == "cpu" else _NUMBERS_ON_A_GPU
+        size = max(1, numbers // len(parameters[0]))
+        pieces = (values.split(size, -1) for values in (*parameters, *(layer.flatten() for layer in layers)))
         done = []
-        for start in range(0, max(1, total), size):
-            piece = slice(start, start + size)
-            weights, means, stds = (values[:, piece].to(torch.float64) for values in parameters)
-            cells = Cells(
-                weights / added(weights), means, math.sqrt(0.5) / stds.clamp(min=_SMALLEST_STD), deep
-            )
-            done.append(work(cells, *(layer[piece] for layer in flat)))
+        for weights, means, stds, *others in zip(*pieces, strict=True):
+            weights, scales = weights.double(), math.sqrt(0.5) / stds.double().clamp(min=_SMALLEST_STD)
+            done.append(work(Cells(weights / added(weights), means.double(), scales, deep), *others))
         return torch.cat(done).view(self.weights.select(-3, 0).shape).to(self.weights.dtype)
+
+    def _in_tail(self, work: Callable[[Cells, Tensor], Tensor], tail: float) -> Tensor:
+        """Does some work on the worst share `tail` of λ."""
+        return self._in_pieces(
+            lambda cells: work(cells, torch.full_like(cells.means[0], tail)), deep=tail < _DEEP_TAIL
+        )
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
@@ -283,6 +263,37 @@ class TraversabilityMixture:
         return (weights * _probability((at - means) / stds)).sum(-3).clamp(0, 1)
 
 
+def component_log_prob(
+    means: Tensor, stds: Tensor, value: Tensor, log_ndtr: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Log density of each component inside (0, 1), and log of its mass that is clipped at 0 and at 1.
+
+    Args:
+        means: before clipping, shape [*B, K, H, W].
+        stds: before clipping, > 0, shape [*B, K, H, W].
+        value: λ, shape [*B, 1, H, W].
+        log_ndtr: log Φ.
+
+    Returns:
+        Shape [*B, K, H, W].
+    """
+    z = (value - means) / stds
+    density = -0.5 * z**2 - stds.log() - 0.5 * math.log(2 * math.pi)
+    mass = log_ndtr(torch.where(value <= 0, -means, means - 1) / stds)
+    return torch.where((value <= 0) | (value >= 1), mass, density)
+
+
+def map_tensors(item: Value, change: Callable[[Tensor], Tensor]) -> Value:
+    """Gives a dataclass in which each tensor is changed, also those of dataclasses in it."""
+    changed: dict[str, Any] = {}
+    for name, value in vars(item).items():
+        if isinstance(value, Tensor):
+            changed[name] = change(value)
+        elif is_dataclass(value):
+            changed[name] = map_tensors(value, change)
+    return replace(item, **changed)
+
+
 def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
     """`harmonic_mean` of N cells, in float32: to within 1e-6."""
     short = cells.float()
@@ -291,7 +302,7 @@ def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
     low, high = (short.means - reach).clamp(floor, 1), (short.means + reach).clamp(floor, 1)
     start, span = low.log(), high.log() - low.log()
     time = 1 + (1 / high - 1)
-    for node, share in _legendre():
+    for node, share in _LEGENDRE:
         log_x = start + span * node
         below = torch.erf((log_x.exp() - short.means).mul_(short.scales)).add_(1)
         time = torch.addcmul(time, span * (0.5 * share), below.mul_(torch.exp(-log_x)))
@@ -303,14 +314,7 @@ def _probability(z: Tensor) -> Tensor:
     return 0.5 * torch.erfc(z * -math.sqrt(0.5))
 
 
-def _check_level(level: float) -> float:
+def _tail(level: float) -> float:
     if not 0 <= level < 1:
         raise ConfigError(f"Expected `level` in [0, 1), got {level}. CVaR at level 0 is the mean.")
-    return float(level)
-
-
-@cache
-def _legendre() -> tuple[tuple[float, float], ...]:
-    """Nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
-    return tuple((float(0.5 + 0.5 * x), float(0.5 * w)) for x, w in zip(nodes, weights, strict=True))
+    return 1 - float(level)

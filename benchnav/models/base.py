@@ -100,13 +100,11 @@ def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityMixtu
     with exact_convolutions():
         mixture: Any = model.predict(terrain.observe())
     height, width = terrain.grid.shape
-    if not isinstance(mixture, TraversabilityMixture):
-        got = type(mixture).__name__
-    else:
-        shape = list(mixture.weights.shape)
-        if [*shape[:-3], *shape[-2:]] == [len(terrain), height, width]:
+    got: Any = type(mixture).__name__
+    if isinstance(mixture, TraversabilityMixture):
+        got = list(mixture.weights.shape)
+        if [*got[:-3], *got[-2:]] == [len(terrain), height, width]:
             return mixture
-        got = str(shape)
     raise ConfigError(
         f"Expected the model to give a TraversabilityMixture of shape [{len(terrain)}, K, {height}, {width}], "
         f"got {got}."

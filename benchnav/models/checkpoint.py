@@ -27,11 +27,13 @@ from benchnav.core.store import (
     building,
     real_place,
     refuse_taken,
+    replacing,
     restore,
     seal,
     sole_writer,
     take_place,
     unseal,
+    write_text,
 )
 
 FORMAT = "benchnav-checkpoint"
@@ -42,6 +44,7 @@ CONFIG = "config.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
+_KEPT = ("config", "seed", "metrics", "half_precision", "versions", "trainer")  # of a part, as they are
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
 
 
@@ -56,7 +59,7 @@ def refitting() -> Iterator[None]:
         yield
     except CheckpointError:
         raise
-    except (BenchnavError, KeyError, RuntimeError) as error:
+    except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
         ) from error
@@ -154,8 +157,7 @@ def as_stored(tensors: Mapping[str, Tensor], half_precision: bool) -> dict[str, 
         tensors: by name.
         half_precision: whether kernels are kept as float16.
     """
-    kept = {name: _to_store(value, half_precision) for name, value in tensors.items()}
-    return {name: _as_read(value) for name, value in kept.items()}
+    return _as_read(_to_store(tensors, half_precision))
 
 
 def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
@@ -166,22 +168,17 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         checkpoint: what to write.
 
     Raises:
-        CheckpointError: it cannot be written.
+        OSError: it cannot be written.
         ConfigError: the name is that of something else.
         BenchnavError: another process is writing it.
     """
     folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
-    try:
-        with sole_writer(folder, str(folder)):
-            restore(folder)
-            refuse_taken(folder, True, foreign)
-            with building(folder) as partial:
-                _write(partial, checkpoint)
-                take_place(partial, folder, last=CONFIG)
-    except OSError as error:
-        raise CheckpointError(
-            f"Could not write checkpoint {folder}: {error.strerror or error}. Choose another `out`."
-        ) from error
+    with sole_writer(folder, str(folder)):
+        restore(folder)
+        refuse_taken(folder, True, foreign)
+        with building(folder) as partial:
+            _write(partial, checkpoint)
+            take_place(partial, folder, last=CONFIG)
 
 
 def foreign(folder: Path) -> str:
@@ -199,32 +196,18 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     config = read_config(folder)
     try:
         parts = {
-            name: Part(
-                config=dict(entry["config"]),
-                tensors=_read_tensors(folder / f"{name}.safetensors", entry["sha256"]),
-                seed=int(entry["seed"]),
-                metrics=dict(entry["metrics"]),
-                data_id=str(entry["data"]["id"]),
-                data_digest=str(entry["data"]["digest"]),
-                half_precision=bool(entry["half_precision"]),
-                versions=dict(entry["versions"]),
-                trainer=None if entry.get("trainer") is None else dict(entry["trainer"]),
-            )
+            name: _read_part(folder / f"{name}.safetensors", **entry)
             for name, entry in config["parts"].items()
         }
-        names = config["class_names"]
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError("class_names is no list of names")
-        if config["class_count"] != len(set(names)) or len(set(names)) != len(names):
-            raise ValueError("class_count is not the number of different class_names")
-        pooled = float(config.get("pool_temperature", 1.0))
+        names, pooled = config["class_names"], float(config.get("pool_temperature", 1.0))
+        if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
+            raise ValueError("class_names are no names of different classes")
+        if config["class_count"] != len(names):
+            raise ValueError("class_count is not the number of class_names")
         if not 0 < pooled < float("inf"):
             raise ValueError(f"pool_temperature is {pooled}")
         return Checkpoint(
-            class_names=tuple(names),
-            parts=parts,
-            model=config["model"],
-            pool_temperature=pooled,
+            class_names=tuple(names), parts=parts, model=config["model"], pool_temperature=pooled
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
@@ -281,11 +264,12 @@ def read_config(folder: Path) -> dict[str, Any]:
             f"Expected format {FORMAT!r} in {path}, got {kind!r}. Name a benchnav checkpoint."
         )
     if version > FORMAT_VERSION or version < OLDEST_VERSION:
-        remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
+        remedy = "Train the model again with this version."
+        if version > FORMAT_VERSION:
+            remedy = "Read it with a newer benchnav: pip install --upgrade benchnav."
         raise CheckpointError(
             f"Expected format version {'.'.join(map(str, FORMAT_VERSION))} in {path}, got "
-            f"{config['format_version']}. "
-            + (remedy if version > FORMAT_VERSION else "Train the model again with this version.")
+            f"{config['format_version']}. {remedy}"
         )
     return config
 
@@ -293,19 +277,12 @@ def read_config(folder: Path) -> dict[str, Any]:
 def _write(folder: Path, checkpoint: Checkpoint) -> None:
     parts = {}
     for name, part in checkpoint.parts.items():
-        tensors = {key: _to_store(value, part.half_precision) for key, value in part.tensors.items()}
-        content = safetensors.torch.save(tensors)
-        _write_bytes(folder / f"{name}.safetensors", content)
-        parts[name] = {
-            "config": part.config,
-            "data": {"id": part.data_id, "digest": part.data_digest},
-            "seed": part.seed,
-            "metrics": part.metrics,
-            "versions": dict(part.versions),
-            "half_precision": part.half_precision,
-            **({} if part.trainer is None else {"trainer": dict(part.trainer)}),
-            "sha256": hashlib.sha256(content).hexdigest(),
-        }
+        content = safetensors.torch.save(_to_store(part.tensors, part.half_precision))
+        with replacing(folder / f"{name}.safetensors") as partial:
+            partial.write_bytes(content)
+        kept = {name: value for name, value in vars(part).items() if name in _KEPT and value is not None}
+        digest = hashlib.sha256(content).hexdigest()
+        parts[name] = {**kept, "data": {"id": part.data_id, "digest": part.data_digest}, "sha256": digest}
     pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
     config = {
         "format": FORMAT,
@@ -316,42 +293,31 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         **pooled,
         "parts": parts,
     }
-    _write_bytes(folder / CONFIG, (seal(config) + "\n").encode())
+    write_text(folder / CONFIG, seal(config) + "\n")
 
 
-def _write_bytes(path: Path, content: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _to_store(value: Tensor, half: bool) -> Tensor:
+def _to_store(tensors: Mapping[str, Tensor], half: bool) -> dict[str, Tensor]:
     # Kernels alone: running variances and biases are few, and may leave float16's range.
-    value = value.detach().cpu().contiguous()
-    return value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
+    kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    return {
+        name: value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
+        for name, value in kept.items()
+    }
 
 
-def _read_tensors(path: Path, digest: str) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise CheckpointError(
-            f"Expected {path.name} in checkpoint {path.parent}, got none. Copy it again whole."
-        )
+def _read_part(path: Path, data: Mapping[str, str], sha256: str, **entry: Any) -> Part:
     try:
         content = path.read_bytes()
-    except OSError as error:
-        raise _damaged(path, error.strerror or str(error)) from error
-    if hashlib.sha256(content).hexdigest() != digest:
-        raise _damaged(path, "its SHA-256 is not the one in config.json")
-    try:
-        tensors = safetensors.torch.load(content)
-    except safetensors.SafetensorError as error:
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise _damaged(path, "its SHA-256 is not the one in config.json")
+        tensors = _as_read(safetensors.torch.load(content))
+    except (OSError, safetensors.SafetensorError) as error:
         raise _damaged(path, str(error)) from error
-    return {name: _as_read(value) for name, value in tensors.items()}
+    return Part(**entry, tensors=tensors, data_id=data["id"], data_digest=data["digest"])
 
 
-def _as_read(value: Tensor) -> Tensor:
-    return value.float() if value.dtype == torch.float16 else value
+def _as_read(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.float() if value.dtype == torch.float16 else value for name, value in tensors.items()}
 
 
 def _damaged(path: Path, why: str) -> CheckpointError:

@@ -1,46 +1,18 @@
 """The command `benchnav-train`: train models and measure them."""
 
 import sys
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from benchnav.core.command import INTERRUPTED, Command, Device, run
-from benchnav.models.config import ClassifierConfig, LatentGPConfig, MDNConfig, check_seed
+from benchnav.models.config import (
+    ClassifierConfig,
+    LatentGPConfig,
+    MDNConfig,
+    TrainOptions,
+)
 from benchnav.models.quality.command import evaluate
-
-if TYPE_CHECKING:
-    from benchnav.datagen.files.reader import TerrainDataset
-    from benchnav.models.training.fit import FitOptions
-    from benchnav.models.training.target import Target
 
 _RESUMABLE = ("classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """How networks are trained.
-
-    Args:
-        seed: Root seed of weights, order and augmentation; members of an ensemble have SEED, SEED + 1, ….
-        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
-        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
-        workers: Processes that read maps ahead. The result is the same for any number.
-        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
-        half_precision: Store the weights of networks as float16.
-        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
-        overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
-    """
-
-    seed: int = 0
-    device: Device = "auto"
-    trainer: dict[str, Any] | None = None
-    workers: int = 0
-    in_memory: bool = False
-    half_precision: bool = True
-    resume: bool = False
-    overwrite: bool = False
 
 
 def train_classifier(
@@ -59,7 +31,9 @@ def train_classifier(
         classifier: Settings of the classifier.
         members: How many to train; their probabilities are averaged.
     """
-    _train(options, data, out, classifier, members=members)
+    from benchnav.models.training.networks import train_networks
+
+    train_networks(options, data, out, classifier, members=members)
 
 
 def train_gp(
@@ -82,20 +56,9 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
-    from benchnav.core.store import output_path
-    from benchnav.models.slope_gp.slip_logs import ENDINGS
-    from benchnav.models.training.fit import FitOptions
-    from benchnav.models.training.gps import train_gps_on_logs, train_gps_on_maps
+    from benchnav.models.training.gps import train_gps
 
-    check_seed(seed)
-    output_path(out)  # refuses addresses
-    options = FitOptions(device=device)
-    if data.endswith(ENDINGS):
-        train_gps_on_logs(data, out, gp, seed, options, overwrite)
-        return
-    dataset = _open_dataset(data)
-    target = _open_target(out, dataset, ["gp"], options, overwrite)
-    target.add("gp", train_gps_on_maps(gp, dataset, seed, options))
+    train_gps(data, out, gp, TrainOptions(seed=seed, device=device, overwrite=overwrite))
 
 
 def train_all(
@@ -116,7 +79,9 @@ def train_all(
         gp: Settings of the GPs.
         members: How many classifiers to train; their probabilities are averaged.
     """
-    _train(options, data, out, classifier, gp, members)
+    from benchnav.models.training.networks import train_networks
+
+    train_networks(options, data, out, classifier, gp, members)
 
 
 def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN) -> None:
@@ -128,79 +93,9 @@ def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFA
         out: Checkpoint folder. Logs go to OUT.training.
         mdn: Settings of the network.
     """
-    _train(options, data, out, mdn)
+    from benchnav.models.training.networks import train_networks
 
-
-def _train(
-    how: TrainOptions,
-    data: str,
-    out: str,
-    config: ClassifierConfig | MDNConfig,
-    gp: LatentGPConfig | None = None,
-    members: int = 1,
-) -> None:
-    """Trains what a checkpoint lacks of a model: the class-wise GPs where they are asked for, then networks."""
-    from benchnav.core.errors import ConfigError
-    from benchnav.core.store import output_path
-    from benchnav.models.checkpoint import CLASSIFIER, FUSED, GP, member_name, training_folder
-    from benchnav.models.training.fit import FitOptions
-    from benchnav.models.training.gps import train_gps_on_maps
-    from benchnav.models.training.networks import NETWORKS, check_network, train_parts
-
-    if members < 1:
-        raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
-    check_seed(how.seed, members)
-    output_path(out)  # refuses addresses
-    dataset, trainer = _open_dataset(data), dict(how.trainer or {})
-    # The length of training is the network's own setting, wherever it is said.
-    config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
-    options = FitOptions(
-        folder=training_folder(out),
-        resume=how.resume,
-        trainer=trainer,
-        workers=how.workers,
-        in_memory=how.in_memory,
-        device=how.device,
-    )
-    check_network(config, dataset, options)
-    part = NETWORKS[type(config)].part
-    parts = [member_name(index) for index in range(members)] if part == CLASSIFIER else [part]
-    model = FUSED if part == CLASSIFIER else part
-    target = _open_target(out, dataset, [*([GP] if gp else []), *parts], options, how.overwrite, model)
-    if gp and not target.holds(GP, asdict(gp), how.seed, asdict(LatentGPConfig())):
-        target.add(GP, train_gps_on_maps(gp, dataset, how.seed, options))
-    train_parts(target, config, dataset, parts, how.seed, options, how.half_precision)
-    if not target.changed:
-        print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
-
-
-def _open_dataset(data: str) -> "TerrainDataset":
-    from benchnav.core.errors import DatasetError
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-
-    dataset = TerrainDataset(find_dataset(data))
-    if not {"train", "valid"} <= set(dataset.splits):
-        raise DatasetError(
-            f"Expected splits train and valid in {dataset.path} to train on, got {sorted(dataset.splits)}. "
-            "Make a dataset with them, for example `benchnav-datagen create paper-v1`."
-        )
-    return dataset
-
-
-def _open_target(
-    out: str,
-    dataset: "TerrainDataset",
-    parts: list[str],
-    options: "FitOptions",
-    overwrite: bool,
-    model: str = "fused",
-) -> "Target":
-    from benchnav.models.checkpoint import Checkpoint
-    from benchnav.models.training.data import training_digest
-    from benchnav.models.training.target import open_target
-
-    fresh = Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
-    return open_target(Path(out), fresh, parts, training_digest(dataset), options, overwrite)
+    train_networks(options, data, out, mdn)
 
 
 def main() -> None:

@@ -2,8 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
+from benchnav.core.command import Device
 from benchnav.core.errors import ConfigError
 
 DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
@@ -12,21 +13,38 @@ _SEEDS = 2**63  # PyTorch's generators take no others
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClassifierConfig:
-    """What the classifier is and how it is trained.
+class TrainOptions:
+    """How networks are trained.
+
+    Args:
+        seed: Root seed of weights, order and augmentation; members of an ensemble have SEED, SEED + 1, ….
+        device: Where it is trained and calibrated; auto takes CUDA where there is a GPU.
+        trainer: Settings of Lightning's trainer, for example --trainer.devices 2 --trainer.precision 32-true.
+        workers: Processes that read maps ahead. The result is the same for any number.
+        in_memory: Hold all maps in memory, in place of reading them as they are asked for.
+        half_precision: Store the weights of networks as float16.
+        resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
+        overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
+    """
+
+    seed: int = 0
+    device: Device = "auto"
+    trainer: dict[str, Any] | None = None
+    workers: int = 0
+    in_memory: bool = False
+    half_precision: bool = True
+    resume: bool = False
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """What any network is and how it is trained.
 
     Args:
         architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
         encoder: one of its encoders, for example resnet18.
-        encoder_depth: stages of the encoder, each of which halves the image; fewer make a smaller network
-            that looks less far around a cell.
-        decoder_channels: channels of the decoder's stages, from coarse to fine, as many as there are of the
-            encoder's; where none are given, the architecture's own.
         pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
-        full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
-            it, so that without this every class boundary is guessed from cells twice as large.
-        dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a proper score.
-        label_smoothing: probability spread over all classes in the targets of the cross-entropy.
         jitter: largest relative change of brightness, contrast and saturation of a training map. At 0
             low light stays unseen in training.
         learning_rate: highest rate of the one-cycle schedule.
@@ -38,12 +56,7 @@ class ClassifierConfig:
 
     architecture: str = "unet"
     encoder: str = "resnet18"
-    encoder_depth: int = 5
-    decoder_channels: tuple[int, ...] = ()
     pretrained: bool = False
-    full_resolution: bool = True
-    dice: float = 0.0
-    label_smoothing: float = 0.0
     jitter: float = 0.0
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
@@ -53,20 +66,41 @@ class ClassifierConfig:
 
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
-        _check_rate("learning_rate", self.learning_rate)
-        if not self.dice >= 0:
-            raise ConfigError(f"Expected `dice` ≥ 0, got {self.dice}.")
-        for name in ("label_smoothing", "jitter", "weight_decay"):
-            _check_share(name, getattr(self, name))
-        _check_least(
-            encoder_depth=(self.encoder_depth, 1),
-            batch_size=(self.batch_size, 2),
-            max_epochs=(self.max_epochs, 1),
-            patience=(self.patience, 1),
-            **{f"decoder_channels[{place}]": (count, 1) for place, count in enumerate(self.decoder_channels)},
-        )
-        if self.encoder_depth > DEEPEST:
-            raise ConfigError(f"Expected `encoder_depth` ≤ {DEEPEST}, got {self.encoder_depth}.")
+        _check(self, 0 < self.learning_rate < 1, "learning_rate", "in (0, 1)")
+        for name in ("jitter", "weight_decay"):
+            _check(self, 0 <= getattr(self, name) < 1, name, "in [0, 1)")
+        _check_least(self, 2, "batch_size")
+        _check_least(self, 1, "max_epochs", "patience")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassifierConfig(NetworkConfig):
+    """What the classifier is and how it is trained.
+
+    Args:
+        encoder_depth: stages of the encoder, each of which halves the image; fewer make a smaller network
+            that looks less far around a cell.
+        decoder_channels: channels of the decoder's stages, from coarse to fine, as many as there are of the
+            encoder's; where none are given, the architecture's own.
+        full_resolution: give the last layers the image at full resolution too. Encoders begin by halving
+            it, so that without this every class boundary is guessed from cells twice as large.
+        dice: weight of a soft Dice loss beside the cross-entropy; 0 leaves the loss a proper score.
+        label_smoothing: probability spread over all classes in the targets of the cross-entropy.
+    """
+
+    encoder_depth: int = 5
+    decoder_channels: tuple[int, ...] = ()
+    full_resolution: bool = True
+    dice: float = 0.0
+    label_smoothing: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that cannot train."""
+        super().__post_init__()
+        _check(self, self.dice >= 0, "dice", "≥ 0")
+        _check(self, 0 <= self.label_smoothing < 1, "label_smoothing", "in [0, 1)")
+        _check(self, 1 <= self.encoder_depth <= DEEPEST, "encoder_depth", f"in 1–{DEEPEST}")
+        _check(self, min(self.decoder_channels, default=1) >= 1, "decoder_channels", "≥ 1 each")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,74 +146,39 @@ class LatentGPConfig:
 
     def __post_init__(self) -> None:
         """Refuses settings that cannot train."""
-        if self.likelihood not in ("censored", "gaussian"):
-            raise ConfigError(f"Expected `likelihood` censored or gaussian, got {self.likelihood!r}.")
-        _check_least(
-            inducing_points=(self.inducing_points, 2),
-            epochs=(self.epochs, 1),
-            epoch_steps=(self.epoch_steps, 1),
-        )
+        _check_least(self, 2, "inducing_points")
+        _check_least(self, 1, "epochs", "epoch_steps")
         for name in ("prior_level", "prior_fall"):
-            if not math.isfinite(getattr(self, name)):
-                raise ConfigError(f"Expected a finite `{name}`, got {getattr(self, name)}.")
+            _check(self, math.isfinite(getattr(self, name)), name, "to be finite")
         for name in ("prior_fall_std", "noise_spread"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"Expected `{name}` > 0, got {getattr(self, name)}.")
+            _check(self, 0 < getattr(self, name) < math.inf, name, "> 0")
         for name, limits in (
             ("prior_std", "prior_std_range"),
             ("length_deg", "length_range_deg"),
             ("noise_std", "noise_std_range"),
         ):
             low, high = getattr(self, limits)
-            if not 0 < low < getattr(self, name) < high < math.inf:
-                raise ConfigError(
-                    f"Expected `{name}` between the bounds of `{limits}`, both > 0, "
-                    f"got {getattr(self, name)} for {low} to {high}."
-                )
+            fits = 0 < low < getattr(self, name) < high < math.inf
+            _check(self, fits, name, f"between the bounds of `{limits}`, both > 0, {low} and {high}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class MDNConfig:
+class MDNConfig(NetworkConfig):
     """What the mixture-density network is and how it is trained.
 
     Args:
         components: K, Gaussians of a cell's mixture.
         hidden: channels of the layers in which slope joins what the image tells of a cell.
-        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
-        encoder: one of its encoders, for example resnet18.
-        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
-        jitter: largest relative change of brightness, contrast and saturation of a training map.
-        learning_rate: highest rate of the one-cycle schedule.
-        weight_decay: of AdamW.
-        batch_size: most maps a batch.
-        max_epochs: length of the schedule.
-        patience: epochs without a better validation loss after which training stops.
     """
 
     components: int = 3
     hidden: int = 64
-    architecture: str = "unet"
-    encoder: str = "resnet18"
-    pretrained: bool = False
-    jitter: float = 0.0
-    learning_rate: float = 2e-3
-    weight_decay: float = 1e-3
-    batch_size: int = 16
     max_epochs: int = 15
-    patience: int = 10
 
     def __post_init__(self) -> None:
         """Refuses numbers that cannot train."""
-        _check_rate("learning_rate", self.learning_rate)
-        for name in ("jitter", "weight_decay"):
-            _check_share(name, getattr(self, name))
-        _check_least(
-            components=(self.components, 1),
-            hidden=(self.hidden, 1),
-            batch_size=(self.batch_size, 2),
-            max_epochs=(self.max_epochs, 1),
-            patience=(self.patience, 1),
-        )
+        super().__post_init__()
+        _check_least(self, 1, "components", "hidden")
 
 
 def check_seed(seed: int, count: int = 1) -> None:
@@ -196,17 +195,12 @@ def check_seed(seed: int, count: int = 1) -> None:
         raise ConfigError(f"Expected `seed` in 0–{_SEEDS - count}, got {seed}.")
 
 
-def _check_rate(name: str, value: float) -> None:
-    if not 0 < value < 1:
-        raise ConfigError(f"Expected `{name}` in (0, 1), got {value}.")
+def _check(config: object, fits: bool, name: str, expected: str) -> None:
+    if not fits:
+        raise ConfigError(f"Expected `{name}` {expected}, got {getattr(config, name)!r}.")
 
 
-def _check_share(name: str, value: float) -> None:
-    if not 0 <= value < 1:
-        raise ConfigError(f"Expected `{name}` in [0, 1), got {value}.")
-
-
-def _check_least(**limits: tuple[int, int]) -> None:
-    for name, (value, least) in limits.items():
-        if not isinstance(value, int) or value < least:
-            raise ConfigError(f"Expected `{name}` to be an integer ≥ {least}, got {value!r}.")
+def _check_least(config: object, least: int, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        _check(config, isinstance(value, int) and value >= least, name, f"to be an integer ≥ {least}")

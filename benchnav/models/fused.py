@@ -10,12 +10,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import GP, Checkpoint, member_names, refitting
-from benchnav.models.probabilities import sharpen
 from benchnav.models.slope_gp.table import SlopeTable
 
 CHUNK_CELLS = 2**17
@@ -42,8 +40,6 @@ class FusedModel(ModelFamily):
         pool_temperature: float = 1.0,
     ) -> None:
         """Sets the classifiers to evaluation."""
-        if len(class_names) != len(table.mean):
-            raise ConfigError(f"Expected a GP for each of {len(class_names)} classes, got {len(table.mean)}.")
         self.classifiers = tuple(classifier.eval() for classifier in classifiers)
         self.table, self.class_names, self.pool_temperature = table, class_names, pool_temperature
 
@@ -63,16 +59,15 @@ class FusedModel(ModelFamily):
         """Makes the prediction of what the members said of the observation, [M, B, C, H, W]."""
         weights = sharpen(member_probabilities.sum(0) / len(self.classifiers), self.pool_temperature)
         means, stds = self.table.lookup(observation.slope_deg.float())
-        classes = tuple(range(len(self.class_names)))
-        if self.table.soft is None:
-            return TraversabilityMixture(weights, means, stds, classes)
-        soft = self.table.soft.to(weights.device)
-        owners = soft.weight.nonzero().flatten()
-        share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
-        second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
-        pairs = zip((weights * (1 - share), means, stds), second, strict=True)
-        weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
-        return TraversabilityMixture(weights, means, stds, (*classes, *owners.tolist()))
+        group = tuple(range(len(self.class_names)))
+        if soft := self.table.soft:
+            owners = soft.weight.nonzero().flatten()
+            group += tuple(owners.tolist())
+            share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
+            second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
+            pairs = zip((weights * (1 - share), means, stds), second, strict=True)
+            weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
+        return TraversabilityMixture(weights, means, stds, group)
 
     def member_probabilities(self, observation: Observation) -> Tensor:
         """Class probabilities of each member, before the pool's temperature.
@@ -83,7 +78,14 @@ class FusedModel(ModelFamily):
         Returns:
             float32, shape [M, B, C, H, W].
         """
-        return torch.stack([self._probabilities(member, observation) for member in self.classifiers])
+        rgb, (height, width) = observation.rgb, observation.grid.shape
+        chunks = rgb.split(max(1, CHUNK_CELLS // (height * width)))
+        members = []
+        with torch.inference_mode():
+            for member in self.classifiers:
+                member.to(rgb.device)
+                members.append(torch.cat([member(chunk).float().softmax(1) for chunk in chunks]))
+        return torch.stack(members)
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "FusedModel":
@@ -103,15 +105,14 @@ class FusedModel(ModelFamily):
             ]
             return cls(classifiers, SlopeTable.from_tensors(tensors), names, checkpoint.pool_temperature)
 
-    def _probabilities(self, classifier: nn.Module, observation: Observation) -> Tensor:
-        rgb, (height, width), classes = observation.rgb, observation.grid.shape, len(self.class_names)
-        classifier.to(rgb.device)
-        probabilities = torch.empty(len(rgb), classes, height, width, device=rgb.device)
-        step = max(1, CHUNK_CELLS // (height * width))
-        with torch.inference_mode():
-            for start in range(0, len(rgb), step):
-                logits = classifier(rgb[start : start + step])
-                if logits.shape[1] != classes:
-                    raise ConfigError(f"Expected {classes} classes of the classifier, got {logits.shape[1]}.")
-                probabilities[start : start + step] = logits.float().softmax(1)
+
+def sharpen(probabilities: Tensor, temperature: float) -> Tensor:
+    """Divides the logarithms of class probabilities by a temperature, under 1 to make them surer.
+
+    Args:
+        probabilities: shape [B, C, H, W].
+        temperature: > 0; at 1 nothing is changed.
+    """
+    if temperature == 1:
         return probabilities
+    return (probabilities.log() / temperature).softmax(1)

@@ -127,8 +127,14 @@ def find_checkpoint(source: str | Path) -> Path:
         return Path(source)  # to be refused by the reader, which says what is missing there
     for path in places:
         refuse_unfinished(path)
-    known = sorted({*registry.names("model"), *(path.name for path in list_checkpoints())})
-    near = registry.hint(str(source), known) or _near_path(Path(source))
+    path, names = Path(source), [path.name for path in list_checkpoints()]
+    known = sorted({*registry.names("model"), *names})
+    siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
+    near = (
+        registry.hint(str(source), known)
+        or registry.hint(path.name, siblings, f"{path.parent}/")
+        or registry.hint(path.name, names)
+    )
     raise ConfigError(
         f"Expected a model among {', '.join(known)}, the folder of a checkpoint, package.module:Name or "
         f"path/to/file.py:Name, got {str(source)!r}.{near}"
@@ -227,10 +233,3 @@ def _as_part(source: Source) -> registry.Part | Path:
 
 def _checkpoint_folders() -> tuple[Path, Path]:
     return Path("checkpoints"), shipped_folder("checkpoints")
-
-
-def _near_path(path: Path) -> str:
-    """A hint with the nearest checkpoint in the folder of a mistyped path, or of its name elsewhere."""
-    siblings = [config.parent.name for config in path.parent.glob(f"*/{CONFIG}")]
-    near = registry.hint(path.name, siblings, f"{path.parent}/")
-    return near or registry.hint(path.name, (found.name for found in list_checkpoints()))

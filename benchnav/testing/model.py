@@ -21,7 +21,6 @@ from benchnav.datagen.recipe.recipe import Split, load_recipe
 from benchnav.datagen.synth.generate import generate
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import load_model
-from benchnav.models.probabilities import class_probabilities
 from benchnav.testing.breaches import NOTHING, Breaches, close
 
 SHAPES = ((32, 32), (20, 37))
@@ -126,7 +125,7 @@ def _check_classes(
     if members is None or members is NOTHING:
         return
     expect(names > 0, "Expected `class_names` beside `member_probabilities`, got none.")
-    weights = class_probabilities(mixture, names) if names else mixture.weights
+    weights = mixture.class_probabilities(names) if names else mixture.weights
     got = list(members.shape) if isinstance(members, Tensor) else type(members).__name__
     fits = isinstance(members, Tensor) and members.shape[1:] == weights.shape and len(members) > 0
     shape = f"[M, {str(list(weights.shape))[1:]}"

@@ -11,6 +11,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
+from tests.factories import draw
 
 DRAWS = 10**6
 
@@ -33,7 +34,7 @@ def single(mean: float, std: float, dtype: torch.dtype = torch.float64) -> Trave
 
 @lru_cache
 def monte_carlo() -> torch.Tensor:
-    return random_mixture().sample(DRAWS, torch.Generator().manual_seed(1)).sort(dim=0).values
+    return draw(random_mixture(), DRAWS, torch.Generator().manual_seed(1)).sort(dim=0).values
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.99])
@@ -396,3 +397,24 @@ def test_rows_at_a_time_change_no_bit(shape: tuple[int, ...], monkeypatch: pytes
         monkeypatch.setattr("benchnav.core.mixture._NUMBERS_AT_ONCE", numbers)
         for found, wanted in zip((mixture.cvar(0.7), mixture.var(0.6), mixture.mean()), whole, strict=True):
             assert torch.equal(found, wanted)
+
+
+def grouped(group: tuple[int, ...] | None, components: int = 3) -> TraversabilityMixture:
+    weights = torch.rand(2, components, 4, 5, generator=torch.Generator().manual_seed(0))
+    weights = weights / weights.sum(1, keepdim=True)
+    return TraversabilityMixture(weights, weights, weights, group)
+
+
+def test_the_components_of_a_class_are_added_up_in_the_order_of_the_classes() -> None:
+    made = grouped((2, 0, 2))
+    found = made.class_probabilities(4)
+    assert found.shape == (2, 4, 4, 5)
+    torch.testing.assert_close(found[:, 2], made.weights[:, 0] + made.weights[:, 2])
+    assert torch.equal(found[:, 0], made.weights[:, 1])
+    assert not bool(found[:, [1, 3]].any())
+
+
+@pytest.mark.parametrize("group", [None, (0, 1, 2)])
+def test_one_component_a_class_is_left_as_it_is(group: tuple[int, ...] | None) -> None:
+    made = grouped(group)
+    assert made.class_probabilities(3) is made.weights

@@ -20,6 +20,7 @@ from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
 from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
@@ -27,7 +28,7 @@ from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
 from benchnav.models.training.data import VALID, MapDataset, read_maps
 from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.networks import fit_network, measure
+from benchnav.models.training.networks import fit_network
 from tests.elsewhere.device import elsewhere, waits
 from tests.models.conftest import checkpoint_path as _checkpoint_path
 from tests.models.conftest import dataset as _dataset
@@ -38,7 +39,7 @@ checkpoint_path, dataset = _checkpoint_path, _dataset  # fixtures
 def network() -> MixtureDensityNetwork:
     mean, std = torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30])
     config = MDNConfig(encoder="mobilenet_v2", hidden=16)
-    return MixtureDensityNetwork(config, mean, std, torch.tensor(10.0), 0).eval()
+    return MixtureDensityNetwork(config, 0, MapScale(mean, std, torch.tensor(10.0)), 0).eval()
 
 
 def pair(checkpoint_path: Path) -> FusedModel:
@@ -103,9 +104,9 @@ def test_networks_are_measured_in_training_on_another_device_as_here(
 ) -> None:
     classifier, mdn = pair(checkpoint_path).classifiers[0], network()
     maps, all_maps = read_maps(dataset, VALID), read_maps(dataset, VALID, ("slope_deg", "traversability"))
-    here = measure(classifier, maps) | measure(mdn, all_maps)
+    here = classifier.measure(maps) | mdn.measure(all_maps)
     with elsewhere() as device:
-        there = measure(classifier.to(device), maps) | measure(mdn.to(device), all_maps)
+        there = classifier.to(device).measure(maps) | mdn.to(device).measure(all_maps)
         assert waits
     assert_close(there, here)
 
@@ -126,7 +127,8 @@ def test_each_command_uses_the_device_that_it_is_given(
         pass
 
     def begin(*given: Any, **named: Any) -> Any:
-        asked.append(next(value.place for value in given if isinstance(value, FitOptions)))
+        places = [value.place if isinstance(value, FitOptions) else value for value in given]
+        asked.append(next(value for value in places if isinstance(value, torch.device)))
         raise Enough
 
     def measure(model: Any, dataset: Any, splits: Any, seed: int, device: torch.device) -> Any:
@@ -135,10 +137,9 @@ def test_each_command_uses_the_device_that_it_is_given(
 
     # A trial of the network would ask the GPU that is not there.
     monkeypatch.setattr("benchnav.models.training.networks.check_network", lambda *_: None)
-    for name in ("networks.fit_network", "gps.fit"):
+    for name in ("networks.fit_network", "gps.fit_gps"):
         monkeypatch.setattr(f"benchnav.models.training.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
-    monkeypatch.setattr("benchnav.models.training.gps.find_soft_modes", lambda sums: (None, None))
     (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)
     data = str(tmp_path / "logs.csv") if command == "gp on logs" else str(dataset.path)
     cpu, cuda = ("--device", "cpu"), ("--device", "cuda")
@@ -230,12 +231,12 @@ def test_a_pool_is_calibrated_on_the_device(
     monkeypatch.setattr(networks, "fit_pool_temperature", fit_pool)
     monkeypatch.setattr(networks, "member_names", lambda checkpoint: ("classifier", "classifier-1"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    target = SimpleNamespace(
-        checkpoint=both, holds=lambda *words: True, set_pool_temperature=lambda value: None
-    )
     for device in ("cpu", "cuda"):
-        options = FitOptions(device=device)
-        networks.train_parts(
-            target, ClassifierConfig(), dataset, ["classifier", "classifier-2"], 0, options, True
-        )  # type: ignore[arg-type]
+        target = SimpleNamespace(
+            checkpoint=both,
+            options=FitOptions(device=device),
+            holds=lambda *words: True,
+            set_pool_temperature=lambda value: None,
+        )
+        networks.train_parts(target, ClassifierConfig(), dataset, ["classifier", "classifier-2"])  # type: ignore[arg-type]
     assert [place.type for place in given] == ["cpu", "cuda"]

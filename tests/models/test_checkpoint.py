@@ -208,7 +208,7 @@ def test_a_killed_save_leaves_the_old_checkpoint(folder: Path, monkeypatch: pyte
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "_write_bytes", killed)
+    monkeypatch.setattr(module, "write_text", killed)
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(folder, replace(there, model="new"))
     monkeypatch.undo()
@@ -244,9 +244,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Terrain, Trav
     members = {
         name: Part(
             config={**asdict(config), "temperature": 0.5 + seed},
-            tensors=dict(
-                TerrainClassifier(config, len(classes), torch.zeros(3), torch.ones(3), seed).state_dict()
-            ),
+            tensors=dict(TerrainClassifier(config, len(classes), seed=seed).state_dict()),
             seed=seed,
             metrics={"valid_loss": 0.5},
             data_id="tiny-v1",

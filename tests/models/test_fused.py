@@ -6,8 +6,7 @@ from torch import Tensor, nn
 
 from benchnav.core.errors import ConfigError
 from benchnav.models import fused
-from benchnav.models.fused import FusedModel
-from benchnav.models.probabilities import class_probabilities
+from benchnav.models.fused import FusedModel, sharpen
 from benchnav.models.slope_gp.table import SoftModes
 from tests.models.support import NAMES, linear_table, make_terrain
 
@@ -65,7 +64,7 @@ def test_a_class_with_soft_spots_has_a_component_more() -> None:
     mixture = FusedModel([Linear(0)], replace(linear_table(), soft=SOFT), NAMES).predict(observation)
     assert plain.group == (0, 1, 2)
     assert mixture.group == (0, 1, 2, 0, 2)
-    torch.testing.assert_close(class_probabilities(mixture, 3), plain.weights)
+    torch.testing.assert_close(mixture.class_probabilities(3), plain.weights)
     torch.testing.assert_close(mixture.weights[:, 0], 0.8 * plain.weights[:, 0])
     assert torch.equal(mixture.weights[:, 1], plain.weights[:, 1])
     torch.testing.assert_close(mixture.weights[:, 3], 0.2 * plain.weights[:, 0])
@@ -123,15 +122,23 @@ def test_any_slope_has_a_prediction(slope: float) -> None:
     assert bool(mixture.cvar(0.9).isfinite().all())
 
 
-def test_classes_and_gps_have_to_be_as_many() -> None:
-    with pytest.raises(ConfigError, match="GP for each of 2"):
-        FusedModel([Linear(0)], linear_table(), NAMES[:2])
-
-
 def test_a_classifier_of_other_classes_is_refused() -> None:
     class Two(nn.Module):
         def forward(self, rgb: Tensor) -> Tensor:
             return rgb[:, :2].float()
 
-    with pytest.raises(ConfigError, match="Expected 3 classes of the classifier, got 2"):
+    with pytest.raises(ConfigError, match="of one shape"):
         FusedModel([Two()], linear_table(), NAMES).predict(make_terrain().observe())
+
+
+def test_a_temperature_divides_the_logarithms() -> None:
+    logits = torch.randn(2, 5, 3, 3, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(sharpen(logits.softmax(1), 0.4), (logits / 0.4).softmax(1))
+    probabilities = logits.softmax(1)
+    assert sharpen(probabilities, 1.0) is probabilities
+
+
+def test_a_class_without_probability_keeps_none() -> None:
+    probabilities = torch.tensor([0.0, 0.25, 0.75]).view(1, 3, 1, 1)
+    expected = torch.tensor([0.0, 0.1, 0.9])
+    torch.testing.assert_close(sharpen(probabilities, 0.5).flatten(), expected)

@@ -223,7 +223,10 @@ def test_a_model_whose_training_was_interrupted_is_told_with_the_command_to_go_o
     [
         ("oracel", "Did you mean 'oracle'?"),
         ("./mine_of_tests.py:Constnat", "Did you mean 'Constant'?"),
-        ("./mine_of_tests.py:Constant:much", "as float such as 0.5, got 'much'"),
+        (
+            "./mine_of_tests.py:Constant:much",
+            "of model './mine_of_tests.py:Constant' as a number, got 'much'",
+        ),
         ("./mine_of_tests.py:Family", "which is a family of models"),
         (
             "./mine_of_tests.py:Nothing",
@@ -338,7 +341,7 @@ def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
         save_checkpoint(path, there.with_part("classifier-2", there.part("classifier")))
     if kind == "mdn":
         config = MDNConfig(encoder="mobilenet_v2", hidden=8)
-        network = MixtureDensityNetwork(config, torch.zeros(3), torch.ones(3), torch.ones(()), 1)
+        network = MixtureDensityNetwork(config, 0, seed=1)
         part = Part(
             config=asdict(config),
             tensors=dict(network.state_dict()),

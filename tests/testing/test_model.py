@@ -16,6 +16,7 @@ from benchnav.models.base import TraversabilityModel, is_family
 from benchnav.models.checkpoint import load_checkpoint, member_name
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
+from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import load_model, open_checkpoint
 from benchnav.testing import check_model
 
@@ -297,6 +298,6 @@ def test_fused_models_keep_the_contract(checkpoint_path: Path, members: int) -> 
 
 
 def test_a_mixture_density_model_keeps_the_contract() -> None:
-    mean, std, scale = torch.full((3,), 90.0), torch.full((3,), 40.0), torch.tensor(9.0)
-    network = MixtureDensityNetwork(MDNConfig(encoder="mobilenet_v2"), mean, std, scale)
+    scale = MapScale(torch.full((3,), 90.0), torch.full((3,), 40.0), torch.tensor(9.0))
+    network = MixtureDensityNetwork(MDNConfig(encoder="mobilenet_v2"), 0, scale)
     check_model(MixtureDensityModel(network))

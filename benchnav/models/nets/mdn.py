@@ -8,20 +8,19 @@ limited dependent variables". Letters in shapes: B maps, H×W cells, K component
 """
 
 import math
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torchmetrics import MeanSquaredError, Metric
 
-from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.settings import of, read
+from benchnav.core.mixture import TraversabilityMixture, component_log_prob
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
 from benchnav.models.checkpoint import Checkpoint, refitting
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.nets.trainable import TrainableNetwork
+from benchnav.models.nets.trainable import NO_SCALE, MapScale, TrainableNetwork
 
 MDN = "mdn"
 LEAST_STD = 0.01
@@ -70,10 +69,7 @@ def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Ten
     seen = observed.isfinite()
     # A cell left out needs some value that is finite: NaN times 0 would reach the gradients.
     at = torch.where(seen, observed, 0.5).unsqueeze(1)
-    z = (at - means) / stds
-    density = -0.5 * z**2 - stds.log() - 0.5 * math.log(2 * math.pi)
-    mass = LogNormalCDF.apply(torch.where(at <= 0, -means, means - 1) / stds)
-    component = torch.where((at <= 0) | (at >= 1), mass, density)
+    component = component_log_prob(means, stds, at, LogNormalCDF.apply)
     total = torch.logsumexp(component + log_weights, dim=1)
     return -torch.where(seen, total, 0.0).sum() / seen.sum().clamp(min=1)
 
@@ -83,67 +79,43 @@ class MixtureDensityNetwork(TrainableNetwork):
 
     Args:
         config: what it is.
-        colour_mean: of the training maps, 0–255, shape [3].
-        colour_std: of the training maps, shape [3].
-        slope_scale_deg: by which slopes are divided; the root mean square of the training maps'.
+        class_count: which does not matter.
+        scale: of the training maps.
         seed: root seed of the initial weights.
     """
 
-    part = MDN
+    part, kind = MDN, MDNConfig
     fields = ("slope_deg", "traversability")
     slope_scale_deg: Tensor
 
     def __init__(
-        self,
-        config: MDNConfig,
-        colour_mean: Tensor,
-        colour_std: Tensor,
-        slope_scale_deg: Tensor,
-        seed: int = 0,
+        self, config: MDNConfig, class_count: int, scale: MapScale = NO_SCALE, seed: int = 0
     ) -> None:
         """Builds the network with fresh weights."""
         super().__init__(config)
-        self.register_buffer("slope_scale_deg", slope_scale_deg.clone())
+        self.register_buffer("slope_scale_deg", scale.slope_deg.clone())
         image = ClassifierConfig(
             architecture=config.architecture, encoder=config.encoder, pretrained=config.pretrained
         )
         # The classifier's network, whose outputs tell of the ground by features rather than by classes.
-        self.ground = TerrainClassifier(image, _FEATURES, colour_mean, colour_std, seed)
-        self.joint, self.head = self.configure_head(seed)
-
-    @classmethod
-    def untrained(cls, config: Any, class_count: int, data: Any = None, seed: int = 0) -> Self:
-        """Builds it with fresh weights, for images of the colours and slopes of `data`; classes do not matter."""
-        if data is None:
-            return cls(config, torch.zeros(3), torch.ones(3), torch.ones(()), seed)
-        squares = sum(maps["slope_deg"].double().square().sum() for _, maps in data.train.chunks())
-        cells = len(data.train) * data.train.shape[0] * data.train.shape[1]
-        # Flat ground alone would have no scale.
-        scale = (torch.as_tensor(squares) / cells).sqrt().clamp(min=1).float()
-        mean, std = data.colour_statistics()
-        return cls(config, mean, std, scale, seed)
+        self.ground = TerrainClassifier(image, _FEATURES, scale, seed)
+        count, hidden = config.components, config.hidden
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            self.joint = nn.Sequential(
+                nn.Conv2d(_FEATURES + 1, hidden, 1), nn.SiLU(), nn.Conv2d(hidden, hidden, 1), nn.SiLU()
+            )
+            self.head = nn.Conv2d(hidden, 3 * count, 1)
+        self.joint.to(memory_format=torch.channels_last)
+        # Components begin with means evenly over [0, 1], and with nearly the same weight and width.
+        means = (torch.arange(count) + 0.5) / count
+        width = math.log(math.expm1(_FIRST_STD - LEAST_STD))  # softplus⁻¹
+        first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
+        self.head.load_state_dict({"weight": _FIRST_SPREAD * self.head.weight, "bias": first})
 
     def configure_metrics(self) -> dict[str, Metric]:
         """The error of the expectation, in root mean square over the observed cells."""
         return {"rmse": MeanSquaredError(squared=False)}
-
-    def configure_head(self, seed: int) -> tuple[nn.Module, nn.Module]:
-        """Builds the layers that join features and slope; leaves PyTorch's global generator as it was.
-
-        Components begin with means evenly over [0, 1], and with nearly the same weight and width.
-        """
-        count, hidden = self.config.components, self.config.hidden
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
-            joint = nn.Sequential(
-                nn.Conv2d(_FEATURES + 1, hidden, 1), nn.SiLU(), nn.Conv2d(hidden, hidden, 1), nn.SiLU()
-            )
-            head = nn.Conv2d(hidden, 3 * count, 1)
-        means = (torch.arange(count) + 0.5) / count
-        width = math.log(math.expm1(_FIRST_STD - LEAST_STD))  # softplus⁻¹
-        first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
-        head.load_state_dict({"weight": _FIRST_SPREAD * head.weight, "bias": first})
-        return joint.to(memory_format=torch.channels_last), head
 
     def forward(self, rgb: Tensor, slope_deg: Tensor) -> Parameters:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.
@@ -174,23 +146,6 @@ class MixtureDensityNetwork(TrainableNetwork):
             self.metrics["rmse"].update(expected[seen], observed[seen])
         return loss, int(seen.sum())
 
-    @classmethod
-    def from_tensors(cls, config: dict[str, Any], tensors: dict[str, Tensor]) -> "MixtureDensityNetwork":
-        """Rebuilds a trained network, downloading nothing.
-
-        Args:
-            config: fields of `MDNConfig`.
-            tensors: a state dict.
-
-        Raises:
-            ConfigError: the settings are not those of a mixture-density network.
-            RuntimeError: the tensors do not fit them.
-        """
-        built = read(MDNConfig, {**config, "pretrained": False}, of("MDNConfig"))
-        network = cls(built, torch.zeros(3), torch.ones(3), torch.ones(()))
-        network.load_state_dict(tensors)
-        return network.eval()
-
 
 class MixtureDensityModel(ModelFamily):
     """A trained mixture-density network as a model.
@@ -212,17 +167,14 @@ class MixtureDensityModel(ModelFamily):
         Returns:
             Mixture with float32 parameters of shape [B, K, H, W].
         """
-        rgb, slope_deg, (height, width) = observation.rgb, observation.slope_deg, observation.grid.shape
+        rgb, (height, width) = observation.rgb, observation.grid.shape
         self.network.to(rgb.device)
-        shape = (len(rgb), self.network.config.components, height, width)
-        weights, means, stds = (torch.empty(shape, device=rgb.device) for _ in range(3))
-        step = max(1, _CHUNK_CELLS // (height * width))
+        size = max(1, _CHUNK_CELLS // (height * width))
         with torch.inference_mode():
-            for start in range(0, len(rgb), step):
-                some = slice(start, start + step)
-                log_weights, means[some], stds[some] = self.network(rgb[some], slope_deg[some])
-                weights[some] = log_weights.exp()
-        return TraversabilityMixture(weights, means, stds)
+            chunks = zip(rgb.split(size), observation.slope_deg.split(size), strict=True)
+            parts = [self.network(*chunk) for chunk in chunks]
+        log_weights, means, stds = (torch.cat(values) for values in zip(*parts, strict=True))
+        return TraversabilityMixture(log_weights.exp(), means, stds)
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Checkpoint) -> "MixtureDensityModel":
@@ -233,4 +185,4 @@ class MixtureDensityModel(ModelFamily):
         """
         part = checkpoint.part(MDN)
         with refitting():
-            return cls(MixtureDensityNetwork.from_tensors(part.config, part.tensors))
+            return cls(MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors))

@@ -58,7 +58,19 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
         ConfigError: there is no such architecture or encoder, or they do not take these settings.
     """
     _check_names(config)
-    size = _size(config)
+    known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
+    own = known["decoder_channels"].default if "decoder_channels" in known else None
+    if config.decoder_channels and not isinstance(own, tuple):
+        raise ConfigError(
+            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
+            f"got {list(config.decoder_channels)}. Leave them out."
+        )
+    # What is not asked for is left to the architecture; at a lesser depth it would have too many channels.
+    size: dict[str, Any] = {"decoder_channels": config.decoder_channels} if config.decoder_channels else {}
+    if config.encoder_depth < DEEPEST:
+        size["encoder_depth"] = config.encoder_depth
+        if isinstance(own, tuple):
+            size.setdefault("decoder_channels", own[-config.encoder_depth :])
     # The hub's own lines on each trial to reach it would bury the error.
     with torch.random.fork_rng(devices=[]), quiet("huggingface_hub"):
         torch.default_generator.manual_seed(seed)
@@ -72,7 +84,7 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
                 **size,
             )
             if config.encoder_depth < DEEPEST:
-                _drop_unused_stages(network, network.encoder)
+                _drop_unused_stages(network)
         except (OSError, KeyError, RuntimeError) as error:
             if not config.pretrained:
                 raise
@@ -110,26 +122,7 @@ def _check_names(config: ClassifierConfig) -> None:
         )
 
 
-def _size(config: ClassifierConfig) -> dict[str, Any]:
-    """The settings of the network's size, without those that are left to the architecture."""
-    known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
-    own = known["decoder_channels"].default if "decoder_channels" in known else None
-    if config.decoder_channels and not isinstance(own, tuple):
-        raise ConfigError(
-            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
-            f"got {list(config.decoder_channels)}. Leave them out."
-        )
-    size: dict[str, Any] = {}
-    if config.encoder_depth < DEEPEST:
-        size["encoder_depth"] = config.encoder_depth
-        if isinstance(own, tuple):
-            size["decoder_channels"] = own[-config.encoder_depth :]
-    if config.decoder_channels:
-        size["decoder_channels"] = config.decoder_channels
-    return size
-
-
-def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:
+def _drop_unused_stages(network: Any) -> None:
     """Takes out what a lesser depth leaves idle in a network's encoder: it would be stored all the same.
 
     Idle is what has weights of which none is given a gradient.
@@ -141,7 +134,7 @@ def _drop_unused_stages(network: nn.Module, encoder: nn.Module) -> None:
     if answer.shape[-1] != _CONDITION_SIDE:
         raise ValueError(f"it answers {_CONDITION_SIDE} cells with {answer.shape[-1]}.")
     answer.sum().backward()
-    for part in list(encoder.modules()):
+    for part in list(network.encoder.modules()):
         for name, inner in list(part.named_children()):
             weights = list(inner.parameters())
             if weights and all(weight.grad is None for weight in weights):

@@ -44,7 +44,7 @@ def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
 def fit_pool_temperature(
     members: Sequence[nn.Module], maps: Any, seed: int = 0, device: torch.device = CPU
 ) -> float:
-    """Finds the temperature of the average of several classifiers' probabilities, for `probabilities.sharpen`.
+    """Finds the temperature of the average of several classifiers' probabilities, for `models.fused.sharpen`.
 
     Args:
         members: each calibrated by itself, from uint8 images [B, 3, H, W] to logits [B, C, H, W].
@@ -77,7 +77,7 @@ def sample_logits(
         DatasetError: there is no such cell.
     """
     cells = maps.shape[0] * maps.shape[1]
-    kept = min(cells, max(1, _MOST_CELLS // len(maps)))
+    kept = max(1, _MOST_CELLS // len(maps))
     key = rng.stream_key(seed, "models", "temperature")
     found, classifier = [], classifier.to(device)
     with torch.inference_mode(), exact_convolutions():

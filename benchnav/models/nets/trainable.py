@@ -4,9 +4,8 @@ Letters in shapes: B maps, H×W cells.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import lightning
 import torch
@@ -14,43 +13,70 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 from torchmetrics import MeanMetric, Metric, MetricCollection
 
-from benchnav.models.config import ClassifierConfig, MDNConfig
+from benchnav.core.settings import of, read
+from benchnav.models.config import NetworkConfig
 
 _WARM_UP_SHARE = 0.15
 
 
+class MapScale(NamedTuple):
+    """What values of maps are scaled by.
+
+    Args:
+        colour_mean: of the training maps, 0–255, shape [3].
+        colour_std: of the training maps, shape [3].
+        slope_deg: by which slopes are divided; the root mean square of the training maps', at least 1.
+    """
+
+    colour_mean: Tensor
+    colour_std: Tensor
+    slope_deg: Tensor
+
+
+NO_SCALE = MapScale(torch.zeros(3), torch.ones(3), torch.ones(()))
+
+
 class TrainableNetwork(lightning.LightningModule):
     """A network that learns one field of the maps from their colours and perhaps other fields.
+
+    A subclass is built from its settings, the number of classes, a `MapScale` and the root seed of its weights.
 
     Args:
         config: what it is, and how it is trained.
     """
 
     part: ClassVar[str]  # name of the part of a model that it is
+    kind: ClassVar[type[NetworkConfig]]  # of its settings
     fields: ClassVar[tuple[str, ...]]  # that are read beside `rgb`; the last is what it learns
 
-    def __init__(self, config: ClassifierConfig | MDNConfig) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
         """Prepares what is measured."""
         super().__init__()
         self.config: Any = config
         # A loss that is no number is to be seen, not left out.
-        metrics: dict[str, Metric | MetricCollection] = {
+        metrics: dict[str, Any] = {
             "loss": MeanMetric(nan_strategy=math.nan),
             **self.configure_metrics(),
         }
         self.metrics = MetricCollection(metrics, prefix="valid_", compute_groups=False)
 
     @classmethod
-    def untrained(cls, config: Any, class_count: int, data: Any = None, seed: int = 0) -> Self:
-        """Builds it with fresh weights.
+    def from_tensors(cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]) -> Self:
+        """Rebuilds a trained network, downloading nothing.
 
         Args:
-            config: what it is.
+            config: fields of its settings.
             class_count: of the maps.
-            data: training data, whose colours and slopes it is scaled by; None for any scale.
-            seed: root seed of the weights.
+            tensors: a state dict.
+
+        Raises:
+            ConfigError: the settings are not those of such a network.
+            RuntimeError: the tensors do not fit them.
         """
-        raise NotImplementedError
+        built = read(cls.kind, {**config, "pretrained": False}, of(cls.kind.__name__))
+        network: Any = cls(built, class_count)  # type: ignore[call-arg]
+        network.load_state_dict(tensors)
+        return network.eval()
 
     def configure_metrics(self) -> dict[str, Metric]:
         """What is measured on the validation maps beside the loss, by name."""
@@ -93,11 +119,15 @@ class TrainableNetwork(lightning.LightningModule):
         named = {"valid_loss": self.metrics["loss"], **dict(self.metrics.items())}  # tables begin with it
         self.log_dict(named, on_epoch=True, batch_size=len(batch["rgb"]))
 
-    def measure(self, batches: Iterable[dict[str, Tensor]]) -> dict[str, float]:
-        """Measures batches as training does, by name; the network is in evaluation, on their device."""
+    def measure(self, maps: Any) -> dict[str, float]:
+        """Measures maps as training does, by name, such as `valid_loss`; the network is in evaluation.
+
+        Args:
+            maps: a `models.training.data.MapDataset` with `rgb` and `fields`.
+        """
         self.metrics.to(self.device).reset()
         with torch.inference_mode():
-            for batch in batches:
+            for _, batch in maps.chunks(self.device):
                 self._update(batch)
         return {name: float(value) for name, value in self.metrics.compute().items()}
 

@@ -1,19 +1,10 @@
 """The command `benchnav-train evaluate`: whether a model's probabilities can be trusted."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from benchnav.core.command import Device
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from benchnav.datagen.files.reader import TerrainDataset
-    from benchnav.models.base import TraversabilityModel
-    from benchnav.models.quality.measure import Quality
-    from benchnav.models.slope_gp.table import SlopeTable
 
 REPORT, CSV, PAGE, FIGURES = "quality.json", "quality.csv", "quality.md", "figures"
 DPI = 300
@@ -62,14 +53,22 @@ def evaluate(
         dataset.map_count(split)  # refuses an unknown one before the slow imports
 
     from benchnav.core.device import find_device
+    from benchnav.core.figures import save_twice
     from benchnav.models.predictor import load_model, trained_on
     from benchnav.models.quality.measure import choose_splits, nearest_colour_accuracy
     from benchnav.models.quality.measure import evaluate as evaluate_model
-    from benchnav.models.quality.report import quality_csv, quality_json, quality_markdown, quality_table
+    from benchnav.models.quality.report import (
+        quality_csv,
+        quality_figures,
+        quality_json,
+        quality_markdown,
+        quality_notes,
+        quality_table,
+    )
 
     place, model = find_device(device), load_model(checkpoint)
     chosen = choose_splits(model, dataset, splits or ())
-    qualities: dict[str, Quality] = {}
+    qualities = {}
 
     def steps() -> Iterator[tuple[int, int]]:
         for split, quality in evaluate_model(model, dataset, chosen, seed, place):
@@ -82,11 +81,7 @@ def evaluate(
     by_colour: dict[str, float] = {}
     if all(quality.classes for quality in qualities.values()):
         by_colour = {split: nearest_colour_accuracy(dataset, split) for split in chosen}
-    notes = [
-        *_beside_colour(by_colour, qualities),
-        *_seen(dataset, chosen, trained_on(checkpoint)),
-        *_without_truth(model, dataset, chosen),
-    ]
+    notes = quality_notes(model, dataset, qualities, by_colour, trained_on(checkpoint))
     for note in notes:
         print(note)
     about = {
@@ -111,37 +106,35 @@ def evaluate(
     write_text(folder / CSV, quality_csv(qualities))
     for old in (folder / FIGURES).glob("*.p[nd][gf]"):
         old.unlink()
-    absent = _absent(model, qualities)
     name = Path(checkpoint).name if Path(checkpoint).is_dir() else checkpoint
-    about_maps = f"model {name} on dataset {dataset.id}"
-    figures = _save_figures(about_maps, model, dataset, qualities, maps, folder / FIGURES)
-    write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, figures))
-    for note in absent:
-        print(note)
-    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(figures)} figures in {out}")
+    drawn, absent = quality_figures(f"model {name} on dataset {dataset.id}", model, dataset, qualities, maps)
+    paths = [f"{FIGURES}/{figure}.png" for figure in drawn]
+
+    def saved() -> Iterator[tuple[int, int]]:
+        for count, (path, draw) in enumerate(zip(paths, drawn.values(), strict=True), 1):
+            save_twice(draw(), folder / path, dpi=DPI)
+            yield count, len(paths)
+
+    show_progress(saved(), "figures")
+    write_text(folder / PAGE, quality_markdown(title, qualities, notes + absent, paths))
+    for line in absent:
+        print(line)
+    print(f"wrote {REPORT}, {CSV}, {PAGE} and {len(paths)} figures in {out}")
     print(f"what the columns and figures mean: {folder / PAGE}")
 
 
 def _check_targets(out: str, json: str, overwrite: bool) -> None:
     """Refuses what cannot be written to before any work is done."""
     from benchnav.core.errors import ConfigError
-    from benchnav.core.store import output_path
+    from benchnav.core.store import output_path, refuse_taken
 
     target, folder = output_path(json), output_path(out)
     if json and (not target.parent.is_dir() or target.is_dir()):
         raise ConfigError(
             f"Expected `json` to be a file in a folder that exists, got {json}. Make {target.parent} first."
         )
-    there = {item.name for item in folder.iterdir()} if out and folder.is_dir() else set()
-    if there - {REPORT, CSV, PAGE, FIGURES} or (out and folder.exists() and not folder.is_dir()):
-        raise ConfigError(
-            f"Expected `out` to be a new folder or an earlier evaluation, got {out}, which is something else."
-        )
-    if there and not overwrite:
-        raise ConfigError(
-            f"Expected `out` to be a new folder, got {out} with an earlier evaluation. Choose another, or "
-            "pass --overwrite to replace it."
-        )
+    if out:
+        refuse_taken(folder, overwrite, _foreign)
     for path in [target] * bool(json) + [folder / REPORT] * bool(out):
         nearest = next(parent for parent in path.absolute().parents if parent.exists())
         try:
@@ -151,145 +144,7 @@ def _check_targets(out: str, json: str, overwrite: bool) -> None:
             raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def _beside_colour(by_colour: "Mapping[str, float]", qualities: "Mapping[str, Quality]") -> list[str]:
-    """Says how often the nearest colour is right, and where the model is right less often."""
-    if not by_colour:
-        return []
-    listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
-    lines = [f"accuracy of the class of the nearest colour, without a model: {listed}"]
-    worse = [split for split, share in by_colour.items() if qualities[split].classes[0].accuracy < share]
-    if worse:
-        lines.append(f"warning: the model is right less often than the nearest colour on {', '.join(worse)}")
-    return lines
-
-
-def _seen(dataset: "TerrainDataset", splits: "Sequence[str]", known: "Mapping[str, str]") -> list[str]:
-    """Says which splits hold the very maps that the model was trained on, by their digests."""
-    # Checkpoints of earlier versions hold the digest of the arrays alone.
-    digests = {split: (dataset.split_digest(split), dataset.splits[split]["digest"]) for split in splits}
-    found = [
-        f"{split} (its {known[digest]})"
-        for split, both in digests.items()
-        for digest in both
-        if digest in known
-    ]
-    if not found:
-        return []
-    return [
-        f"warning: the model was trained, or chosen and calibrated, on the maps of {', '.join(found)}: their "
-        "numbers say nothing of maps that it has not seen"
-    ]
-
-
-def _without_truth(
-    model: "TraversabilityModel", dataset: "TerrainDataset", splits: "Sequence[str]"
-) -> list[str]:
-    """Says what cannot be measured where the truth is unknown, and what is measured in its place."""
-    from benchnav.models.predictor import Ideal, Oracle
-
-    unknown = [split for split in splits if dataset.truth_of(split) == "unknown"]
-    if not unknown:
-        return []
-    sources = [part.get("source", {}) for split in unknown for part in dataset.splits[split]["parts"]]
-    measured = all(source.get("traversability") for source in sources)
-    observed = (
-        "measured λ" if measured else "λ that was, at least in part, drawn by the class table, not measured"
-    )
-    lines = [
-        f"RMSE E[λ] is – on {', '.join(unknown)}, since the true distribution of λ is unknown on imported ground; "
-        f"RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” there are against {observed}"
-    ]
-    if isinstance(model, Oracle | Ideal):
-        lines.append(
-            f"warning: what this model says of {', '.join(unknown)} is the class table of the recipe, not the truth "
-            "of this ground"
-        )
-    return lines
-
-
-def _absent(model: "TraversabilityModel", qualities: "Mapping[str, Quality]") -> list[str]:
-    """Says which figures do not apply, and why."""
-    from benchnav.datagen.recipe.scenario import find_series
-
-    lines = []
-    if not all(quality.classes for quality in qualities.values()):
-        lines.append("no confusion matrix, reliability diagram or entropy: the model predicts no classes")
-    if _slope_table(model) is None:
-        lines.append("no latent functions: the model has no Gaussian processes over slope")
-    if not find_series(qualities):
-        lines.append("no series of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
-    return lines
-
-
-def _save_figures(
-    title: str,
-    model: "TraversabilityModel",
-    dataset: "TerrainDataset",
-    qualities: "Mapping[str, Quality]",
-    maps: int,
-    folder: Path,
-) -> list[str]:
-    """Draws what applies; returns paths from the page's folder."""
-    from benchnav.core.command import show_progress
-    from benchnav.core.figures import save_twice
-
-    written: list[str] = []
-
-    def steps() -> Iterator[tuple[int, int]]:
-        drawn = list(_figures(title, model, dataset, qualities, maps))
-        for name, draw in drawn:
-            save_twice(draw(), folder / f"{name}.png", dpi=DPI)
-            written.append(f"{folder.name}/{name}.png")
-            yield len(written), len(drawn)
-
-    show_progress(steps(), "figures")
-    return written
-
-
-def _figures(
-    title: str,
-    model: "TraversabilityModel",
-    dataset: "TerrainDataset",
-    qualities: "Mapping[str, Quality]",
-    maps: int,
-) -> "Iterator[tuple[str, Callable[[], Figure]]]":
-    """Names the figures that apply, each with what draws it."""
-    from functools import partial
-
-    from benchnav.datagen.recipe.scenario import find_series
-    from benchnav.models.quality import figures, map_sheet
-    from benchnav.models.quality.report import sheet_name
-
-    by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
-    by_cell = {split: quality.traversability for split, quality in qualities.items()}
-    classes, table = dataset.recipe.classes, _slope_table(model)
-    if by_class:
-        yield "confusion", partial(figures.confusion_figure, by_class, [item.name for item in classes])
-        yield "reliability", partial(figures.reliability_figure, by_class)
-    yield "pit", partial(figures.pit_figure, by_cell)
-    if all_series := find_series(qualities):
-        yield "severity", partial(figures.severity_figure, all_series, qualities)
-    if table is not None and by_class:
-        cells = [
-            [sum(counts) for counts in zip(*rows, strict=True)]
-            for rows in zip(*(quality.slope_cells for quality in by_class.values()), strict=True)
-        ]
-        known = all(dataset.truth_of(split) == "generated" for split in qualities)
-        yield "latent", partial(figures.latent_figure, table, classes, cells, known)
-    if maps:
-        sheets = [
-            map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))
-            for split in qualities
-        ]
-        scales = map_sheet.shared_scales(sheets, classes)
-        for sheet in sheets:
-            draw = partial(map_sheet.map_sheet_figure, sheet, scales, classes, title)
-            yield sheet_name(sheet.split), draw
-
-
-def _slope_table(model: "TraversabilityModel") -> "SlopeTable | None":
-    """The GPs of a model that has them as `table`."""
-    from benchnav.models.slope_gp.table import SlopeTable
-
-    table = getattr(model, "table", None)
-    return table if isinstance(table, SlopeTable) else None
+def _foreign(folder: Path) -> str:
+    """Says why what is at a place is no evaluation; empty where it is one. For `refuse_taken`."""
+    own = folder.is_dir() and {item.name for item in folder.iterdir()} <= {REPORT, CSV, PAGE, FIGURES}
+    return "" if own else "is something else than an evaluation"

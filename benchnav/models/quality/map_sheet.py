@@ -26,7 +26,6 @@ from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
-from benchnav.models.probabilities import class_probabilities
 from benchnav.models.quality.scores import mutual_information, predictive_entropy
 
 TITLES = {
@@ -94,7 +93,7 @@ def read_sheet(
         true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if model.class_names:
-            classes = class_probabilities(mixture, len(model.class_names))
+            classes = mixture.class_probabilities(len(model.class_names))
             layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
         layers |= {
             "expected_true" if known else "observed": true,

@@ -8,15 +8,11 @@ cells of all maps.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import MetricCollection
-from torchmetrics.classification import (
-    MulticlassAccuracy,
-    MulticlassConfusionMatrix,
-    MulticlassJaccardIndex,
-)
+from torchmetrics.functional.classification import multiclass_confusion_matrix
 
 from benchnav.core import rng
 from benchnav.core.device import CPU, exact_convolutions
@@ -28,17 +24,16 @@ from benchnav.datagen.recipe.classes import look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, predict
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.classifier import MeanIoU
-from benchnav.models.probabilities import class_probabilities
+from benchnav.models.predictor import class_mismatch
 from benchnav.models.quality.scores import (
-    LEVEL,
     PIT_BINS,
-    BrierScore,
     ErrorRanking,
     LookAlikeQuality,
     LookAlikeTally,
     ReliabilityCurve,
+    brier_score,
     calibration_error,
+    class_scores,
     coverage,
     crps,
     mutual_information,
@@ -161,13 +156,9 @@ def choose_splits(
             f"Expected a test split in {dataset.path}, got {sorted(dataset.splits)}. Name one in `splits`."
         )
     for split in chosen:
-        dataset.map_count(split)
-    names = tuple(item.name for item in dataset.recipe.classes)
-    if model.class_names not in ((), names):
-        raise CheckpointError(
-            f"Expected a model of the classes {', '.join(names)}, got one of {', '.join(model.class_names)}. "
-            "Train it on a dataset with this class table."
-        )
+        dataset.map_count(split)  # refuses an unknown one
+    if why := class_mismatch(model, dataset.recipe):
+        raise CheckpointError(f"{why}. Train it on a dataset with this class table.")
     return chosen
 
 
@@ -218,37 +209,34 @@ def measure(
         alike: of each class those that look like it, itself among them; empty where none do.
         truth: whether the maps' true distribution of λ is known.
     """
-    maps, cells, sums = 0, 0, torch.zeros(7, dtype=torch.float64)
+    maps, sums = 0, torch.zeros(8, dtype=torch.float64)
     histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
-    classes: list[_ClassTally] = []
+    count = len(model.class_names)
+    tally = None
     for terrain in chunks:
         mixture, members = _predict(model, terrain)
         scores, transformed = _score_cells(mixture, terrain, generator, isinstance(model, PrivilegedModel))
-        sums += scores.cpu()
+        sums += scores
         histogram += pit_counts(transformed)
-        maps, cells = maps + len(terrain), cells + transformed.numel()
-        if model.class_names:
-            classes = classes or [
-                _ClassTally(len(model.class_names), terrain.rgb.device, len(members) > 1, alike)
-            ]
-            probabilities = class_probabilities(mixture, len(model.class_names))
-            classes[0].add(probabilities, members, terrain.class_id, terrain.slope_deg)
-    if not cells:
+        maps += len(terrain)
+        if count:
+            tally = tally or _ClassTally(count, terrain.rgb.device, alike)
+            tally.add(mixture.class_probabilities(count), members, terrain.class_id, terrain.slope_deg)
+    if not sums[0]:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    squared_expected = float(sums[5] / sums[6]) if truth else math.nan
-    squared_observed, nll, score, covered, in_tail = (sums[:5] / cells).tolist()
+    squared_observed, nll, score, covered, in_tail = (sums[1:6] / sums[0]).tolist()
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
             rmse_observed=squared_observed**0.5,
-            rmse_expected=squared_expected**0.5,
+            rmse_expected=float(sums[6] / sums[7]) ** 0.5 if truth else math.nan,
             nll=nll,
             crps=score,
             coverage=covered,
             tail_rate=in_tail,
             pit=tuple(histogram.tolist()),
         ),
-        classes=tuple(tally.quality() for tally in classes if tally.entropy.cells),
+        classes=(tally.quality(),) if tally and tally.cells else (),
     )
 
 
@@ -271,25 +259,16 @@ class _ClassTally:
     Args:
         count: number of classes C.
         device: where the maps are.
-        several: whether the model has several members.
         alike: of each class those that look like it, itself among them; empty where none do.
     """
 
-    def __init__(
-        self, count: int, device: torch.device, several: bool, alike: Sequence[tuple[int, ...]]
-    ) -> None:
-        self.by_class = MetricCollection(
-            {
-                "accuracy": MulticlassAccuracy(count, average="micro"),
-                "miou": MeanIoU(count),
-                "miou_predicted": MulticlassJaccardIndex(count, average="macro"),
-                "confusion": MulticlassConfusionMatrix(count),
-            }
-        ).to(device)
-        self.brier, self.reliability = BrierScore().to(device), ReliabilityCurve().to(device)
-        self.entropy = _Uncertainty(device)
-        self.information = _Uncertainty(device) if several else None
+    def __init__(self, count: int, device: torch.device, alike: Sequence[tuple[int, ...]]) -> None:
+        self.count, self.cells, self.brier = count, 0, 0.0
+        self.confusion = torch.zeros(count, count, dtype=torch.int64, device=device)
         self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
+        self.reliability = ReliabilityCurve(device)
+        self.entropy = ErrorRanking(device)
+        self.information = ErrorRanking(device)
         self.look_alikes = LookAlikeTally(alike, device) if any(len(own) > 1 for own in alike) else None
 
     def add(self, probabilities: Tensor, members: Tensor, class_id: Tensor, slope_deg: Tensor) -> None:
@@ -299,64 +278,46 @@ class _ClassTally:
             return
         if not bool(labelled.all()):
             probabilities = _in_a_row(probabilities[None], labelled)[0]
-            members = _in_a_row(members, labelled) if self.information is not None else members
+            members = _in_a_row(members, labelled) if len(members) > 1 else members
             class_id, slope_deg = (layer[labelled][None, None] for layer in (class_id, slope_deg))
         found = probabilities.argmax(1)
         wrong = found != class_id
-        self.by_class.update(found, class_id)
-        self.brier.update(probabilities, class_id)
+        self.cells += class_id.numel()
+        self.confusion += multiclass_confusion_matrix(found, class_id, self.count)
+        self.brier += float(brier_score(probabilities, class_id).double().sum())
         self.reliability.update(probabilities, class_id)
-        self.entropy.add(predictive_entropy(probabilities), wrong)
-        if self.information is not None:
-            self.information.add(mutual_information(members), wrong)
+        self.entropy.update(predictive_entropy(probabilities), wrong)
+        if len(members) > 1:
+            self.information.update(mutual_information(members), wrong)
         degree = slope_deg.floor().long().clamp(0, 89)
         counted = torch.bincount((90 * class_id + degree).flatten(), minlength=self.slope_cells.numel())
         self.slope_cells += counted.view_as(self.slope_cells)
-        if self.look_alikes is not None:
+        if self.look_alikes:
             self.look_alikes.add(probabilities, class_id)
 
     def quality(self) -> ClassQuality:
-        by_class, curve = self.by_class.compute(), self.reliability.compute().cpu()
+        accuracy, miou, miou_predicted = class_scores(self.confusion)
+        entropy, entropy_auroc = self.entropy.compute()
+        information, information_auroc = self.information.compute()
+        curve = self.reliability.compute()
+        cells, confidence, right = curve.tolist()
         return ClassQuality(
-            accuracy=float(by_class["accuracy"]),
-            miou=float(by_class["miou"]),
-            miou_predicted=float(by_class["miou_predicted"]),
+            accuracy=accuracy,
+            miou=miou,
+            miou_predicted=miou_predicted,
             ece=calibration_error(curve),
-            brier=float(self.brier.compute()),
-            entropy=self.entropy.mean,
-            mutual_information=math.nan if self.information is None else self.information.mean,
-            entropy_auroc=self.entropy.auroc,
-            mutual_information_auroc=math.nan if self.information is None else self.information.auroc,
-            confusion=tuple(tuple(row) for row in by_class["confusion"].tolist()),
+            brier=self.brier / self.cells,
+            entropy=entropy,
+            mutual_information=information,
+            entropy_auroc=entropy_auroc,
+            mutual_information_auroc=information_auroc,
+            confusion=tuple(map(tuple, self.confusion.tolist())),
             reliability=Reliability(
-                cells=tuple(int(cells) for cells in curve[0]),
-                confidence=tuple(curve[1].tolist()),
-                accuracy=tuple(curve[2].tolist()),
+                cells=tuple(map(int, cells)), confidence=tuple(confidence), accuracy=tuple(right)
             ),
-            slope_cells=tuple(tuple(row) for row in self.slope_cells.tolist()),
-            look_alikes=None if self.look_alikes is None else self.look_alikes.quality(),
+            slope_cells=tuple(map(tuple, self.slope_cells.tolist())),
+            look_alikes=self.look_alikes.quality() if self.look_alikes else None,
         )
-
-
-class _Uncertainty:
-    """Counts of a measure of uncertainty over cells."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._ranking, self._total, self.cells = ErrorRanking().to(device), 0.0, 0
-
-    def add(self, measure: Tensor, wrong: Tensor) -> None:
-        """Adds cells: the measure, and whether each is wrongly classified, of one shape."""
-        self._ranking.update(measure, wrong)
-        self._total += float(measure.double().sum())
-        self.cells += measure.numel()
-
-    @property
-    def mean(self) -> float:
-        return self._total / self.cells
-
-    @property
-    def auroc(self) -> float:
-        return float(self._ranking.compute())
 
 
 def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
@@ -367,32 +328,32 @@ def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
 def _score_cells(
     mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator, privileged: bool
 ) -> tuple[Tensor, Tensor]:
-    """What is summed over cells, float64, shape [7]; and every PIT.
+    """What is summed over cells, float64, shape [8] on the CPU; and every PIT.
 
-    The sums: squared errors, NLL, CRPS, covered cells, cells in the tail, squared errors of E[λ], and the cells of
-    which these are. Cells whose λ was not observed are left out; of a privileged model, which says nothing where no
+    The sums: cells, squared errors, NLL, CRPS, covered cells, cells in the tail, squared errors of E[λ], and the cells
+    of which these are. Cells whose λ was not observed are left out; of a privileged model, which says nothing where no
     class is known, those without a class as well.
     """
     labelled = terrain.class_id != UNLABELLED
     known = ~terrain.traversability.isnan()
     known = known & labelled if privileged else known
     if not bool(known.any()):
-        return torch.zeros(7, dtype=torch.float64), torch.zeros(0)
+        return torch.zeros(8, dtype=torch.float64), torch.zeros(0)
     mixture, observed = mixture.at(known), terrain.traversability[known].unsqueeze(0)
-    truth = terrain.truth.at(known).mean()
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
-    errors = (expected - truth)[0, labelled[known]].double().square()
-    sums = [
+    errors = (expected - terrain.truth.at(known).mean())[0, labelled[known]].double().square()
+    sums: list[Any] = [
+        cells,
         (expected - observed).double().square().sum(),
         -mixture.log_prob(observed).double().sum(),
         crps(mixture, observed).double().sum(),
-        torch.as_tensor(coverage(transformed) * cells, device=observed.device),
-        torch.as_tensor(tail_rate(transformed, LEVEL) * cells, device=observed.device),
+        coverage(transformed) * cells,
+        tail_rate(transformed) * cells,
         errors.sum(),
-        torch.as_tensor(errors.numel(), device=observed.device),
+        errors.numel(),
     ]
-    return torch.stack([total.double() for total in sums]), transformed
+    return torch.tensor([float(value) for value in sums], dtype=torch.float64), transformed
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
@@ -405,12 +366,9 @@ def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:
     Returns:
         Class indices, int64, shape [B, H, W]; of classes equally near the first.
     """
-    pixels = rgb.movedim(1, -1).float()
-    return (
-        torch.cdist(pixels.flatten(1, 2), colours.float().expand(len(rgb), -1, -1))
-        .argmin(-1)
-        .view(len(rgb), *rgb.shape[-2:])
-    )
+    pixels = rgb.movedim(1, -1).float().flatten(1, 2)
+    distance = torch.cdist(pixels, colours.float().expand(len(rgb), -1, -1))
+    return distance.argmin(-1).view_as(rgb[:, 0])
 
 
 def nearest_colour_accuracy(dataset: TerrainDataset, split: str) -> float:

@@ -2,14 +2,25 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
 
 from benchnav.core.tables import NOTHING, Table, to_markdown
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.scenario import find_series
+from benchnav.models.base import TraversabilityModel
+from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality.measure import Quality
+from benchnav.models.slope_gp.table import SlopeTable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Of the numbers of ClassQuality and TraversabilityQuality: the heading in two lines, and what it means to who meets
 # it first.
@@ -169,13 +180,10 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
         if (whole or name not in _FILES_ONLY)
         and (name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values()))
     ]
-    headings = [COLUMNS[name][0] for name in names]
-    explained = [
-        (" ".join(heading.split()), COLUMNS[name][1]) for heading, name in zip(headings, names, strict=True)
-    ]
+    explained = [(" ".join(heading.split()), text) for heading, text in (COLUMNS[name] for name in names)]
     return Table(
         title=title,
-        headings=("split\n", "maps\n", *headings),
+        headings=("split\n", "maps\n", *(COLUMNS[name][0] for name in names)),
         numbers=True,
         rows=tuple(
             (split, str(qualities[split].maps), *(_decimal(row.get(name, math.nan)) for name in names))
@@ -197,7 +205,9 @@ def quality_json(about: Mapping[str, Any], qualities: Mapping[str, Quality]) -> 
         scenario: [{"severity": severity, "split": split} for severity, split in pairs]
         for scenario, pairs in find_series(qualities).items()
     }
-    return json.dumps(_finite({**about, "splits": splits, "series": all_series}), indent=1) + "\n"
+    text = json.dumps({**about, "splits": splits, "series": all_series})
+    # JSON has no word for what is no number.
+    return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=1) + "\n"
 
 
 def quality_csv(qualities: Mapping[str, Quality]) -> str:
@@ -205,22 +215,26 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 
     `std` stands at severity 0 with no scenario, as it begins every series.
     """
-    import pandas as pd
-
-    table = pd.DataFrame({split: numbers(quality) for split, quality in qualities.items()}).T
-    table = table.replace((math.inf, -math.inf), math.nan)
-    alike = any(item.look_alikes for quality in qualities.values() for item in quality.classes)
-    table = table.reindex(columns=[name for name in COLUMNS if alike or name not in LOOK_ALIKES])
     places = {
         split: (scenario if severity else "", severity)
         for scenario, series in find_series(qualities).items()
         for severity, split in series
     }
-    scenarios, severities = zip(*(places.get(split, ("", math.nan)) for split in qualities), strict=True)
-    table.insert(0, "scenario", scenarios)
-    table.insert(1, "severity", severities)
-    table.insert(2, "maps", [quality.maps for quality in qualities.values()])
-    return table.to_csv(index_label="split", float_format="%.6g")
+    rows = []
+    for split, quality in qualities.items():
+        scenario, severity = places.get(split, ("", math.nan))
+        place = {"split": split, "scenario": scenario, "severity": severity, "maps": quality.maps}
+        rows.append({**place, **numbers(quality)})
+    alike = any(LOOK_ALIKES[0] in row for row in rows)
+    columns = [
+        "split",
+        "scenario",
+        "severity",
+        "maps",
+        *(name for name in COLUMNS if alike or name not in LOOK_ALIKES),
+    ]
+    table = pd.DataFrame(rows, columns=columns).replace((math.inf, -math.inf), math.nan)
+    return table.to_csv(index=False, float_format="%.6g")
 
 
 def quality_markdown(
@@ -242,6 +256,108 @@ def quality_markdown(
     return "\n".join([*lines, ""])
 
 
+def quality_notes(
+    model: TraversabilityModel,
+    dataset: TerrainDataset,
+    qualities: Mapping[str, Quality],
+    by_colour: Mapping[str, float],
+    trained_on: Mapping[str, str],
+) -> list[str]:
+    """Says in lines what else a reader has to know of the numbers.
+
+    Args:
+        model: what was measured.
+        dataset: on what.
+        qualities: by split.
+        by_colour: how often the nearest colour is right, by split; empty for a model that predicts no classes.
+        trained_on: names of the splits that the model was trained on, by digest.
+    """
+    lines = []
+    if by_colour:
+        listed = ", ".join(f"{split} {share:.4f}" for split, share in by_colour.items())
+        lines.append(f"accuracy of the class of the nearest colour, without a model: {listed}")
+    if worse := [split for split, share in by_colour.items() if qualities[split].classes[0].accuracy < share]:
+        lines.append(f"warning: the model is right less often than the nearest colour on {', '.join(worse)}")
+    seen = [
+        f"{split} (its {trained_on[digest]})"
+        for split in qualities
+        # Checkpoints of earlier versions hold the digest of the arrays alone.
+        for digest in (dataset.split_digest(split), dataset.splits[split]["digest"])
+        if digest in trained_on
+    ]
+    if seen:
+        lines.append(
+            f"warning: the model was trained, or chosen and calibrated, on the maps of {', '.join(seen)}: their "
+            "numbers say nothing of maps that it has not seen"
+        )
+    if unknown := [split for split in qualities if dataset.truth_of(split) == "unknown"]:
+        parts = [part for split in unknown for part in dataset.splits[split]["parts"]]
+        observed = "λ that was, at least in part, drawn by the class table, not measured"
+        if all(part.get("source", {}).get("traversability") for part in parts):
+            observed = "measured λ"
+        lines.append(
+            f"RMSE E[λ] is – on {', '.join(unknown)}, since the true distribution of λ is unknown on imported ground; "
+            f"RMSE λ, NLL, CRPS, “in 90 %” and “< VaR” there are against {observed}"
+        )
+        if isinstance(model, Oracle | Ideal):
+            lines.append(
+                f"warning: what this model says of {', '.join(unknown)} is the class table of the recipe, not the "
+                "truth of this ground"
+            )
+    return lines
+
+
+def quality_figures(
+    title: str,
+    model: TraversabilityModel,
+    dataset: TerrainDataset,
+    qualities: Mapping[str, Quality],
+    maps: int,
+) -> "tuple[dict[str, Callable[[], Figure]], list[str]]":
+    """Gives what draws the figures that apply, by name; and a line for each of those that do not, with why.
+
+    Args:
+        title: what the map sheets say of model and dataset.
+        model: what was measured.
+        dataset: on what.
+        qualities: by split.
+        maps: how many maps of each split the map sheets show.
+    """
+    from benchnav.models.quality import figures, map_sheet
+
+    drawn: dict[str, Callable[[], Figure]] = {}
+    absent = []
+    by_class = {split: item for split, quality in qualities.items() for item in quality.classes}
+    classes, table = dataset.recipe.classes, getattr(model, "table", None)
+    if by_class:
+        drawn["confusion"] = partial(figures.confusion_figure, by_class, [item.name for item in classes])
+        drawn["reliability"] = partial(figures.reliability_figure, by_class)
+    if len(by_class) < len(qualities):
+        absent.append("no confusion matrix, reliability diagram or entropy: the model predicts no classes")
+    by_cell = {split: quality.traversability for split, quality in qualities.items()}
+    drawn["pit"] = partial(figures.pit_figure, by_cell)
+    if all_series := find_series(qualities):
+        drawn["severity"] = partial(figures.severity_figure, all_series, qualities)
+    if not isinstance(table, SlopeTable):
+        absent.append("no latent functions: the model has no Gaussian processes over slope")
+    elif by_class:
+        cells = np.sum([quality.slope_cells for quality in by_class.values()], 0)
+        known = all(dataset.truth_of(split) == "generated" for split in qualities)
+        drawn["latent"] = partial(figures.latent_figure, table, classes, cells.tolist(), known)
+    if not all_series:
+        absent.append("no series of shifts: no splits such as test/hg-050 and test/hg-100 were measured")
+    if maps:
+        sheets = [
+            map_sheet.read_sheet(model, dataset, split, range(min(maps, dataset.map_count(split))))
+            for split in qualities
+        ]
+        scales = map_sheet.shared_scales(sheets, classes)
+        for sheet in sheets:
+            draw = partial(map_sheet.map_sheet_figure, sheet, scales, classes, title)
+            drawn[sheet_name(sheet.split)] = draw
+    return drawn, absent
+
+
 def numbers(quality: Quality) -> dict[str, float]:
     """The single numbers of a split's quality by name, in the order of `COLUMNS`."""
     values = _everything(quality)
@@ -259,15 +375,6 @@ def _everything(quality: Quality) -> dict[str, Any]:
 
 def _decimal(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.4f}"
-
-
-def _finite(value: Any) -> Any:
-    """Puts None for what is no number, which JSON has no word for."""
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def caption(figure: str, splits: Iterable[str]) -> tuple[str, str]:

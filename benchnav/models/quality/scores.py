@@ -28,11 +28,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import Metric, MetricCollection
-from torchmetrics.classification import MulticlassAccuracy
+from torchmetrics.functional.classification import multiclass_confusion_matrix
 
+from benchnav.core.device import CPU
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.models.nets.classifier import MeanIoU
 
 LEVEL = 0.9
 CONFIDENCE_BINS = 15
@@ -89,26 +88,24 @@ def pit(mixture: TraversabilityMixture, observed: Tensor, generator: torch.Gener
     return lower + drawn * (upper - lower)
 
 
-def coverage(transformed: Tensor, share: float = 0.9) -> float:
-    """Share of observations in the central interval that should hold `share` of them.
+def coverage(transformed: Tensor) -> float:
+    """Share of observations in the central interval that should hold 90 % of them.
 
     Args:
         transformed: from `pit`, any shape.
-        share: of the central interval.
     """
-    return float(((transformed - 0.5).abs() <= share / 2).double().mean())
+    return float(((transformed - 0.5).abs() <= LEVEL / 2).double().mean())
 
 
-def tail_rate(transformed: Tensor, level: float = LEVEL) -> float:
-    """Share of observations under the VaR at `level`; ideally 1 − level.
+def tail_rate(transformed: Tensor) -> float:
+    """Share of observations under the VaR at level 0.9; ideally 0.1.
 
     Where the VaR is 0 or 1 it lies on an atom, and the draw within the atom decides.
 
     Args:
         transformed: from `pit`, any shape.
-        level: α in [0, 1).
     """
-    return float((transformed < 1 - level).double().mean())
+    return float((transformed < 1 - LEVEL).double().mean())
 
 
 def pit_counts(transformed: Tensor) -> Tensor:
@@ -124,43 +121,50 @@ def pit_counts(transformed: Tensor) -> Tensor:
     return torch.bincount(place.flatten(), minlength=PIT_BINS).cpu()
 
 
-class BrierScore(Metric):
-    """Mean over cells of Σ_c (p_c − y_c)², y being 1 at the class that is there (Brier, 1950)."""
+def brier_score(probabilities: Tensor, class_id: Tensor) -> Tensor:
+    """Σ_c (p_c − y_c)² of each cell, y being 1 at the class that is there (Brier, 1950).
 
-    full_state_update = False
-    total: Tensor
-    cells: Tensor
+    Args:
+        probabilities: shape [B, C, H, W].
+        class_id: true classes, int64, shape [B, H, W].
 
-    def __init__(self) -> None:
-        """Starts with no cells."""
-        super().__init__()
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("cells", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
-
-    def update(self, probabilities: Tensor, class_id: Tensor) -> None:
-        """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
-        right = probabilities.gather(1, class_id.unsqueeze(1)).squeeze(1)
-        self.total += (probabilities.square().sum(1) - 2 * right + 1).double().sum()
-        self.cells += class_id.numel()
-
-    def compute(self) -> Tensor:
-        """The score of all cells so far."""
-        return self.total / self.cells
+    Returns:
+        In [0, 2], shape [B, H, W].
+    """
+    right = probabilities.gather(1, class_id.unsqueeze(1)).squeeze(1)
+    return probabilities.square().sum(1) - 2 * right + 1
 
 
-class ReliabilityCurve(Metric):
+def class_scores(confusion: Tensor) -> tuple[float, float, float]:
+    """Scores of the most likely classes.
+
+    Args:
+        confusion: cells by true class (row) and most likely class (column), int64, shape [C, C].
+
+    Returns:
+        Accuracy; intersection over union in the mean over the classes that occur in truth; and over those that are
+        true or predicted somewhere.
+    """
+    hits, true = confusion.diagonal().float(), confusion.float().sum(1)
+    either = true + confusion.float().sum(0) - hits
+    overlap = torch.where(either > 0, hits / either, 0.0)
+    accuracy = confusion.diagonal().sum() / confusion.sum()
+    return (
+        float(accuracy),
+        float(overlap[true > 0].mean()),
+        float((overlap / (either > 0).sum()).sum()),
+    )
+
+
+class ReliabilityCurve:
     """How often the most likely class is right, by how likely it was said to be, in 15 equal bins.
 
     Unlike torchmetrics' calibration error it keeps sums a bin rather than every cell.
     """
 
-    full_state_update = False
-    sums: Tensor
-
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device = CPU) -> None:
         """Starts with no cells."""
-        super().__init__()
-        self.add_state("sums", torch.zeros(3, CONFIDENCE_BINS, dtype=torch.float64), dist_reduce_fx="sum")
+        self.sums = torch.zeros(3, CONFIDENCE_BINS, dtype=torch.float64, device=device)
 
     def update(self, probabilities: Tensor, class_id: Tensor) -> None:
         """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
@@ -170,8 +174,8 @@ class ReliabilityCurve(Metric):
         self.sums.index_add_(1, place, terms)
 
     def compute(self) -> Tensor:
-        """Cells, mean confidence and accuracy of each bin, float64, shape [3, 15]; 0 in empty bins."""
-        cells, confidence, right = self.sums
+        """Cells, mean confidence and accuracy of each bin, float64, shape [3, 15] on the CPU; 0 in empty bins."""
+        cells, confidence, right = self.sums.cpu()
         filled = cells.clamp(min=1)
         return torch.stack([cells, confidence / filled, right / filled])
 
@@ -221,21 +225,18 @@ def mutual_information(member_probabilities: Tensor) -> Tensor:
     return (predictive_entropy(members.mean(0)) - shared).clamp(min=0).to(member_probabilities.dtype)
 
 
-class ErrorRanking(Metric):
-    """AUROC of a score as a sign of error: how often a wrong cell has a higher one than a right cell.
+class ErrorRanking:
+    """A measure of uncertainty over cells: its mean, and its AUROC as a sign of error.
 
-    Scores are counted by size in steps of 0.1 %, fine at every scale, so memory is bounded however many
-    cells there are; a tie counts half. torchmetrics' AUROC would need 262 144 thresholds for the same, all of which it
-    goes through for each batch.
+    That is how often a wrong cell has a higher one than a right cell. Measures are counted by size in steps of 0.1 %,
+    fine at every scale, so memory is bounded however many cells there are; a tie counts half. torchmetrics' AUROC would
+    need 262 144 thresholds for the same, all of which it goes through for each batch.
     """
 
-    full_state_update = False
-    counts: Tensor
-
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device = CPU) -> None:
         """Starts with no cells."""
-        super().__init__()
-        self.add_state("counts", torch.zeros(2, _PLACES, dtype=torch.int64), dist_reduce_fx="sum")
+        self.counts = torch.zeros(2, _PLACES, dtype=torch.int64, device=device)
+        self.total = 0.0
 
     def update(self, score: Tensor, wrong: Tensor) -> None:
         """Adds cells: scores ≥ 0, and whether each is wrongly classified, of one shape."""
@@ -243,12 +244,18 @@ class ErrorRanking(Metric):
         place = score.float().clamp(min=0).abs().view(torch.int32).long() >> _DROPPED_BITS
         counted = torch.bincount((place + wrong * _PLACES).flatten(), minlength=2 * _PLACES)
         self.counts += counted.view(2, _PLACES)
+        self.total += float(score.double().sum())
 
-    def compute(self) -> Tensor:
-        """The AUROC in [0, 1], 0.5 for a score that tells nothing; not a number where all or none are wrong."""
+    def compute(self) -> tuple[float, float]:
+        """The mean, and the AUROC; neither is a number where there are no cells.
+
+        The AUROC is in [0, 1], 0.5 for a score that tells nothing; not a number where all or none are wrong.
+        """
         right, wrong = self.counts.double()
         lower = right.cumsum(0) - right / 2
-        return (wrong * lower).sum() / (right.sum() * wrong.sum())
+        auroc = (wrong * lower).sum() / (right.sum() * wrong.sum())
+        cells = int(self.counts.sum())
+        return self.total / cells if cells else math.nan, float(auroc)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,48 +288,35 @@ class LookAlikeTally:
         """Starts with no cells."""
         self.groups = sorted({own for own in alike if len(own) > 1})
         names = sorted({min(own) for own in alike})
-        count = max(2, len(names))  # of fewer there are no scores
         self.merged = torch.tensor([names.index(min(own)) for own in alike], device=device)
-        self.scores = MetricCollection(
-            {
-                "accuracy": MulticlassAccuracy(count, average="micro"),
-                "miou": MeanIoU(count),
-            }
-        ).to(device)
-        self.curve = ReliabilityCurve().to(device)
+        self.size = max(2, len(names))  # of fewer there are no scores
+        self.confusion = torch.zeros(self.size, self.size, dtype=torch.int64, device=device)
+        self.curve = ReliabilityCurve(device)
         self.distance, self.cells = 0.0, 0
 
     def add(self, probabilities: Tensor, class_id: Tensor) -> None:
         """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
-        size = int(self.merged.max()) + 1
-        shape = (len(probabilities), size, *probabilities.shape[2:])
-        merged = torch.zeros(shape, device=probabilities.device, dtype=probabilities.dtype)
+        merged = torch.zeros_like(probabilities[:, :1]).repeat(1, self.size, 1, 1)
         merged.index_add_(1, self.merged, probabilities)
-        self.scores.update(merged.argmax(1), self.merged[class_id])
+        self.confusion += multiclass_confusion_matrix(merged.argmax(1), self.merged[class_id], self.size)
         for group in self.groups:
-            self._add_shares(probabilities[:, list(group)], class_id, group)
-
-    def _add_shares(self, probabilities: Tensor, class_id: Tensor, group: tuple[int, ...]) -> None:
-        """Adds the shares within one set of look-alikes, [B, G, H, W], of the cells that are of them."""
-        here = torch.isin(class_id, torch.tensor(group, device=class_id.device))
-        if not bool(here.any()):
-            return
-        own = probabilities.movedim(1, -1)[here].double()  # [N, G]
-        total = own.sum(1, keepdim=True)
-        shares = torch.where(total > 0, own / total, 1 / len(group))
-        place = (class_id[here].unsqueeze(1) == torch.tensor(group, device=class_id.device)).int().argmax(1)
-        right = shares.gather(1, place.unsqueeze(1))
-        self.distance += float((right - 1 / len(group)).abs().sum())
-        self.cells += len(shares)
-        self.curve.update(shares.T[None, :, None], place[None, None])
+            match = class_id.unsqueeze(-1) == torch.tensor(group, device=class_id.device)  # [B, H, W, G]
+            here = match.any(-1)
+            own = probabilities[:, list(group)].movedim(1, -1)[here].double()  # [N, G]
+            total = own.sum(1, keepdim=True)
+            shares = torch.where(total > 0, own / total, 1 / len(group))
+            place = match[here].int().argmax(1)
+            right = shares.gather(1, place.unsqueeze(1))
+            self.distance += float((right - 1 / len(group)).abs().sum())
+            self.cells += len(shares)
+            self.curve.update(shares.T[None, :, None], place[None, None])
 
     def quality(self) -> LookAlikeQuality:
         """What was counted; the shares are not a number where no look-alike occurred."""
-        scores = self.scores.compute()
-        missing = float("nan")
+        accuracy, miou, _ = class_scores(self.confusion)
         return LookAlikeQuality(
-            look_alike_accuracy=float(scores["accuracy"]),
-            look_alike_miou=float(scores["miou"]),
-            look_alike_share_error=self.distance / self.cells if self.cells else missing,
-            look_alike_share_ece=calibration_error(self.curve.compute().cpu()) if self.cells else missing,
+            look_alike_accuracy=accuracy,
+            look_alike_miou=miou,
+            look_alike_share_error=self.distance / self.cells if self.cells else math.nan,
+            look_alike_share_ece=calibration_error(self.curve.compute()),
         )

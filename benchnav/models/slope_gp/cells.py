@@ -18,6 +18,7 @@ from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.mixture import map_tensors
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
@@ -51,11 +52,7 @@ class Cells:
 
     def select(self, which: Tensor) -> "Cells":
         """Keeps some cells, by index or by truth, shape [M]."""
-        return Cells(
-            class_id=self.class_id[which],
-            slope_deg=self.slope_deg[which],
-            traversability=self.traversability[which],
-        )
+        return map_tensors(self, lambda values: values[which])
 
 
 def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, class_count: int) -> Cells:
@@ -73,9 +70,10 @@ def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, 
     ids, slopes, values = (column.flatten() for column in (class_id, slope_deg, traversability))
     seen = ~(slopes.isnan() | values.isnan()) & (ids != UNLABELLED)
     cells = Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
-    _check_range("class_id", cells.class_id, class_count - 1)
-    _check_range("slope_deg", cells.slope_deg, 90)
-    _check_range("traversability", cells.traversability, 1)
+    for name, most in (("class_id", class_count - 1), ("slope_deg", 90), ("traversability", 1)):
+        column = getattr(cells, name)
+        if not bool(((column >= 0) & (column <= most)).all()):
+            raise ConfigError(f"Expected `{name}` within [0, {most}], got values outside it.")
     return cells
 
 
@@ -166,13 +164,9 @@ class SlopeSums:
 
     def __add__(self, other: "SlopeSums") -> "SlopeSums":
         """The sums over both parts of the data."""
-        return SlopeSums(
-            cells=self.cells + other.cells,
-            slope=self.slope + other.slope,
-            total=self.total + other.total,
-            squares=self.squares + other.squares,
-            steepest_deg=torch.maximum(self.steepest_deg, other.steepest_deg),
-        )
+        added = {name: sums + getattr(other, name) for name, sums in vars(self).items()}
+        steepest = torch.maximum(self.steepest_deg, other.steepest_deg)
+        return SlopeSums(**{**added, "steepest_deg": steepest})
 
     @property
     def count(self) -> Tensor:
@@ -191,16 +185,17 @@ class SlopeSums:
             [C, B]; and `count`, the cells of each class in all, shape [C].
         """
         cells = self.cells.sum(2).double()
-        size = int((cells.sum(0) > 0).nonzero().max()) + 1 if bool(cells.any()) else 1
-        zeros, ones = self.cells[..., 0].double(), self.cells[..., -1].double()
+        size = max([0, *cells.sum(0).nonzero().flatten().tolist()]) + 1
+        at_0, at_1 = self.cells[..., 0].double(), self.cells[..., -1].double()
+        zeros, ones = at_0 * censored, at_1 * censored
         middle = (torch.arange(_BINS, dtype=torch.float64) + 0.5) * BIN_DEG
         sums = {
             "slope_deg": torch.where(cells > 0, self.slope / cells.clamp(min=1), middle),
-            "zeros": zeros if censored else 0 * zeros,
-            "ones": ones if censored else 0 * ones,
-            "inside": cells - zeros - ones if censored else cells,
-            "total": self.total if censored else self.total + ones,
-            "squares": self.squares if censored else self.squares + ones,
+            "zeros": zeros,
+            "ones": ones,
+            "inside": cells - zeros - ones,
+            "total": self.total + (at_1 - ones),
+            "squares": self.squares + (at_1 - ones),
         }
         return {**{name: values[:, :size].clone() for name, values in sums.items()}, "count": self.count}
 
@@ -278,8 +273,3 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = T
             noise_error = max(noise_error, float((ratio - 1).abs().max()))
     errors = {"latent_rmse": (squares / max(1, cells)) ** 0.5, "noise_error": noise_error} if truth else {}
     return {**errors, "nll": surprise / max(1, seen)}
-
-
-def _check_range(name: str, column: Tensor, most: float) -> None:
-    if not bool(((column >= 0) & (column <= most)).all()):
-        raise ConfigError(f"Expected `{name}` within [0, {most}], got values outside it.")

@@ -101,7 +101,6 @@ class LatentGPs(lightning.LightningModule):
 
     Args:
         config: what they are.
-        class_count: C.
         steepest_deg: steepest slope of each class's training data, shape [C]; inducing points lie up to
             there.
         soft: second modes of the classes beside the GPs; None where no class has one.
@@ -110,20 +109,19 @@ class LatentGPs(lightning.LightningModule):
     def __init__(
         self,
         config: LatentGPConfig,
-        class_count: int,
         steepest_deg: Tensor,
         soft: SoftModes | None = None,
     ) -> None:
         """Builds the GPs at their prior, in float64."""
         super().__init__()
         self.automatic_optimization = False
-        self.config, self.class_count, self.soft = config, class_count, soft
+        self.config, self.soft = config, soft
         self.steepest_deg = [round(slope, 4) for slope in steepest_deg.tolist()]
         reach = torch.tensor(self.steepest_deg, dtype=torch.float64)
         places = torch.linspace(0, 1, config.inducing_points, dtype=torch.float64)
         self.gp = SlopeGP(reach.clamp(min=_LEAST_SPAN_DEG).unsqueeze(-1) * places / _SLOPE_UNIT_DEG, config)
         self.likelihood = gpytorch.likelihoods.GaussianLikelihood(
-            batch_shape=torch.Size([class_count]),
+            batch_shape=steepest_deg.shape,
             noise_constraint=Interval(*(std**2 for std in config.noise_std_range)),
         )
         self.likelihood.noise = config.noise_std**2
@@ -149,8 +147,7 @@ class LatentGPs(lightning.LightningModule):
         optimizers = self.optimizers()
         assert isinstance(optimizers, list)
         natural, others = optimizers
-        natural.zero_grad()
-        others.zero_grad()
+        self.zero_grad()
         self.manual_backward(-bound.sum())
         natural.step()
         others.optimizer.step()  # past Lightning, which would count a second step
@@ -173,7 +170,7 @@ class LatentGPs(lightning.LightningModule):
     def tabulate(self) -> SlopeTable:
         """Evaluates mean, spread and noise at the nodes of the table, float32."""
         self.eval()
-        slopes = table_slopes().to(self.device).expand(self.class_count, -1)
+        slopes = table_slopes().to(self.device).expand(len(self.steepest_deg), -1)
         with torch.no_grad():
             latent = self(slopes)
             noise = self.likelihood.noise

@@ -16,11 +16,12 @@ bins of λ, C classes.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from benchnav.core.mixture import map_tensors
 from benchnav.models.slope_gp.cells import INSIDE_BINS, SlopeSums, levels
 from benchnav.models.slope_gp.table import SoftModes
 
@@ -39,7 +40,7 @@ _SETTLED = 1e-8  # nats a cell and step
 
 @dataclass(frozen=True)
 class _Modes:
-    """Parameters of S fits: f of shape [S, B], all others of shape [S]; weight 0 for a single mode."""
+    """Parameters of S fits: f of shape [S, B], all others of shape [S, 1]; weight 0 for a single mode."""
 
     main: Tensor
     main_std: Tensor
@@ -49,8 +50,7 @@ class _Modes:
 
     def select(self, which: int) -> "_Modes":
         """Keeps one fit."""
-        one = slice(which, which + 1)
-        return _Modes(self.main[one], self.main_std[one], self.weight[one], self.mean[one], self.std[one])
+        return map_tensors(self, lambda values: values[which : which + 1])
 
 
 def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, Tensor]:
@@ -70,7 +70,7 @@ def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, Tensor]:
         found = _find_in_class(counts)
         if found is not None:
             modes, share[c] = found
-            weight[c], mean[c], std[c] = modes.weight[0], modes.mean[0], modes.std[0]
+            weight[c], mean[c], std[c] = modes.weight, modes.mean, modes.std
     soft = SoftModes(weight=weight, mean=mean, std=std) if bool(weight.any()) else None
     return soft, share
 
@@ -103,10 +103,20 @@ def _find_in_class(counts: Tensor) -> tuple[_Modes, Tensor] | None:
         return None
     size = int(counts.sum(1).nonzero().max()) + 1
     cells = counts[:size].double()
-    single, single_fit = _maximise(cells, _first_guess(cells), _MOST_STEPS)
-    starts = _maximise(cells, _with_second(single), _FIRST_STEPS)
-    best = starts[0].select(int(starts[1].argmax()))
-    double, double_fit = _maximise(cells, best, _MOST_STEPS)
+    # One mode, level at the mean of all cells, then with a small second one at several places.
+    level, every = levels(), cells.sum(0)
+    mean = (every * level).sum() / every.sum()
+    spread = ((every * (level - mean) ** 2).sum() / every.sum()).sqrt().clamp(min=_FIRST_STD)
+    none = torch.zeros(1, 1, dtype=torch.float64)
+    flat = _Modes(mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD)
+    single, single_fit = _maximise(cells, flat, _MOST_STEPS)
+    places = torch.tensor(_STARTS, dtype=torch.float64).unsqueeze(1)
+    same = torch.ones_like(places)
+    seconds = (_FIRST_WEIGHT * same, places, _FIRST_STD * same)
+    starts, fits = _maximise(
+        cells, _Modes(single.main * same, single.main_std * same, *seconds), _FIRST_STEPS
+    )
+    double, double_fit = _maximise(cells, starts.select(int(fits.argmax())), _MOST_STEPS)
     gain, weight = float(double_fit - single_fit), float(double.weight)
     if weight <= LEAST_WEIGHT or gain <= LEAST_GAIN * total:
         return None
@@ -117,30 +127,9 @@ def _find_in_class(counts: Tensor) -> tuple[_Modes, Tensor] | None:
     return double, share
 
 
-def _first_guess(cells: Tensor) -> _Modes:
-    """One mode, level at the mean of all cells."""
-    level, every = levels(), cells.sum(0)
-    mean = (every * level).sum() / every.sum()
-    spread = ((every * (level - mean) ** 2).sum() / every.sum()).sqrt().clamp(min=_FIRST_STD)
-    none = torch.zeros(1, dtype=torch.float64)
-    return _Modes(mean.expand(1, len(cells)), spread.view(1), none, none, none + _FIRST_STD)
-
-
-def _with_second(single: _Modes) -> _Modes:
-    """Starts with a small second mode at several places."""
-    mean = torch.tensor(_STARTS, dtype=torch.float64)
-    return _Modes(
-        single.main.expand(len(mean), -1),
-        single.main_std.expand(len(mean)),
-        torch.full_like(mean, _FIRST_WEIGHT),
-        mean,
-        torch.full_like(mean, _FIRST_STD),
-    )
-
-
 def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Tensor]:
     """Climbs from S starts at once; gives the last parameters and their log likelihoods [S]."""
-    before = torch.full_like(modes.weight, -math.inf)
+    before = torch.tensor(-math.inf, dtype=torch.float64)
     for _ in range(most_steps):
         log_prob, share = _soft_share(modes)
         fit = (cells * log_prob).sum((1, 2))
@@ -152,14 +141,14 @@ def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Te
 
 def _soft_share(modes: _Modes) -> tuple[Tensor, Tensor]:
     """Log probability of a bin of λ, and the second mode's share in it, each of shape [S, B, V]."""
-    main = _log_prob(modes.main, modes.main_std.unsqueeze(1)) + torch.log1p(-modes.weight).view(-1, 1, 1)
-    soft = _log_prob(modes.mean.unsqueeze(1), modes.std.unsqueeze(1)) + modes.weight.log().view(-1, 1, 1)
+    main = _log_prob(modes.main, modes.main_std) + torch.log1p(-modes.weight).unsqueeze(-1)
+    soft = _log_prob(modes.mean, modes.std) + modes.weight.log().unsqueeze(-1)
     odds = (soft - main).clamp(-_MOST_ODDS, _MOST_ODDS)
     return main + torch.nn.functional.softplus(odds), odds.sigmoid()
 
 
 def _log_prob(mean: Tensor, std: Tensor) -> Tensor:
-    """Of the bins of λ under clipped normal distributions: shape [S, B, V] from means and deviations [S, B]."""
+    """Of the bins of λ under clipped normal distributions: shape [S, B, V] from means [S, B] and deviations [S, 1]."""
     z = (levels()[1:-1] - mean.unsqueeze(-1)) / std.unsqueeze(-1)
     inside = -0.5 * z**2 - (std * math.sqrt(2 * math.pi) * INSIDE_BINS).log().unsqueeze(-1)
     at_0, at_1 = torch.special.log_ndtr(-mean / std), torch.special.log_ndtr((mean - 1) / std)
@@ -169,19 +158,21 @@ def _log_prob(mean: Tensor, std: Tensor) -> Tensor:
 def _improve(cells: Tensor, modes: _Modes, share: Tensor) -> _Modes:
     """The parameters of greatest expected likelihood, given the shares of the second mode [S, B, V]."""
     soft = cells * share
-    count, total, squares = _moments(cells - soft, modes.main, modes.main_std.unsqueeze(1))
+    count, total, squares = _moments(cells - soft, modes.main, modes.main_std)
     main = _smooth(count, total, modes.main_std)
     gap = squares - 2 * main * total + main**2 * count
-    main_std = (gap.sum(1) / count.sum(1)).clamp(min=_LEAST_STD**2).sqrt()
+    main_std = _deviation(gap.sum(1, keepdim=True) / count.sum(1, keepdim=True))
     if not bool(modes.weight.any()):
-        return _Modes(main, main_std, modes.weight, modes.mean, modes.std)
-    every = soft.sum(1, keepdim=True)
-    count, total, squares = _moments(every, modes.mean.unsqueeze(1), modes.std.unsqueeze(1))
+        return replace(modes, main=main, main_std=main_std)
+    count, total, squares = _moments(soft.sum(1, keepdim=True), modes.mean, modes.std)
     some = count.clamp(min=1e-9)
-    mean = (total / some).squeeze(1)
-    std = (squares / some - mean.unsqueeze(1) ** 2).clamp(min=_LEAST_STD**2).sqrt().squeeze(1)
-    weight = (count.squeeze(1) / cells.sum()).clamp(max=_MOST_WEIGHT)
-    return _Modes(main, main_std, weight, mean, std)
+    mean = total / some
+    weight = (count / cells.sum()).clamp(max=_MOST_WEIGHT)
+    return _Modes(main, main_std, weight, mean, _deviation(squares / some - mean**2))
+
+
+def _deviation(variance: Tensor) -> Tensor:
+    return variance.clamp(min=_LEAST_STD**2).sqrt()
 
 
 def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -208,12 +199,9 @@ def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, 
 
 def _smooth(count: Tensor, total: Tensor, std: Tensor) -> Tensor:
     """f of least squares, its bends held small, from counts and sums of λ by bins of slope, [S, B]."""
-    bins = count.shape[1]
-    bends = torch.eye(bins, dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD if bins > 2 else None
-    variance = (std**2).unsqueeze(1)
+    bends = torch.eye(count.shape[1], dtype=torch.float64).diff(n=2, dim=0) / _BEND_STD
+    variance = std**2
     # A little of the level of all cells settles what the data leave open.
     level = (total.sum(1) / count.sum(1)).unsqueeze(1)
-    precision = torch.diag_embed(count / variance + 1e-3)
-    if bends is not None:
-        precision = precision + bends.T @ bends
+    precision = torch.diag_embed(count / variance + 1e-3) + bends.T @ bends
     return torch.linalg.solve(precision, (total / variance + 1e-3 * level).unsqueeze(-1)).squeeze(-1)

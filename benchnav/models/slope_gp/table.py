@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture, map_tensors
 
 STEP_DEG = 0.1
 STEEPEST_DEG = 90.0
+
+_TABLES = ("mean", "std", "noise_std")
 
 
 def table_slopes() -> Tensor:
@@ -39,20 +41,14 @@ class SoftModes:
 
     def __post_init__(self) -> None:
         """Checks shapes and values."""
-        if not self.weight.shape == self.mean.shape == self.std.shape:
-            raise ConfigError(
-                "Expected `weight`, `mean` and `std` of soft modes of one shape [C], got "
-                f"{list(self.weight.shape)}, {list(self.mean.shape)} and {list(self.std.shape)}."
-            )
+        is_whole = self.weight.shape == self.mean.shape == self.std.shape
         shares = (self.weight >= 0) & (self.weight < 1)
-        if not bool((shares & self.mean.isfinite() & self.std.isfinite() & (self.std > 0)).all()):
+        if not is_whole or not bool(
+            (shares & self.mean.isfinite() & self.std.isfinite() & (self.std > 0)).all()
+        ):
             raise ConfigError(
-                "Expected soft modes of `weight` in [0, 1), finite `mean` and `std` > 0, got others."
+                "Expected soft modes of one shape [C], of `weight` in [0, 1), finite `mean` and `std` > 0, got others."
             )
-
-    def to(self, device: torch.device | str) -> "SoftModes":
-        """Copies them to `device`."""
-        return SoftModes(weight=self.weight.to(device), mean=self.mean.to(device), std=self.std.to(device))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,13 +89,8 @@ class SlopeTable:
         Returns:
             Means and standard deviations, dtype and device of the slopes, each [*B, C, H, W].
         """
-        node, share = self._place(slope_deg)
-        values = []
-        for table in (self.mean, self.std):
-            rows = table.to(slope_deg)
-            low, high = rows[:, node], rows[:, node + 1]
-            values.append(torch.lerp(low, high, share.to(low.dtype)).movedim(0, -3))
-        return values[0], values[1]
+        mean, std = self._read(slice(None), slope_deg)
+        return mean.movedim(0, -3), std.movedim(0, -3)
 
     def own(self, class_id: Tensor, slope_deg: Tensor) -> TraversabilityMixture:
         """Reads each cell with its own class.
@@ -111,42 +102,23 @@ class SlopeTable:
         Returns:
             Parameters of shape [*B, K, H, W]: K = 1, or 2 where classes have second modes.
         """
-        node, share = self._place(slope_deg)
-        read = []
-        for table in (self.mean, self.std):
-            rows = table.to(slope_deg)
-            low, high = rows[class_id, node], rows[class_id, node + 1]
-            read.append(torch.lerp(low, high, share.to(low.dtype)))
-        mean, std = read
-        if self.soft is None:
-            whole = torch.ones_like(mean).unsqueeze(-3)
-            return TraversabilityMixture(whole, mean.unsqueeze(-3), std.unsqueeze(-3), (0,))
-        soft = self.soft
-        weight, soft_mean, soft_std = (v.to(slope_deg)[class_id] for v in (soft.weight, soft.mean, soft.std))
-        pairs = ((1 - weight, weight), (mean, soft_mean), (std, soft_std))
-        weights, means, stds = (torch.stack(pair, -3) for pair in pairs)
-        return TraversabilityMixture(weights, means, stds, (0, 0))
+        mean, std = self._read(class_id, slope_deg)
+        components: list[tuple[Tensor, ...]] = [(torch.ones_like(mean), mean, std)]
+        if soft := self.soft:
+            weight, *others = (v.to(slope_deg)[class_id] for v in (soft.weight, soft.mean, soft.std))
+            components = [(1 - weight, mean, std), (weight, *others)]
+        weights, means, stds = (torch.stack(values, -3) for values in zip(*components, strict=True))
+        return TraversabilityMixture(weights, means, stds, (0,) * len(components))
 
     def to(self, device: torch.device | str) -> "SlopeTable":
         """Copies the tables to `device`."""
-        return SlopeTable(
-            mean=self.mean.to(device),
-            std=self.std.to(device),
-            noise_std=self.noise_std.to(device),
-            soft=None if self.soft is None else self.soft.to(device),
-        )
+        return map_tensors(self, lambda values: values.to(device))
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the tables by name, for a checkpoint."""
-        tables = {"mean": self.mean, "std": self.std, "noise_std": self.noise_std}
-        if self.soft is None:
-            return tables
-        return {
-            **tables,
-            "soft_weight": self.soft.weight,
-            "soft_mean": self.soft.mean,
-            "soft_std": self.soft.std,
-        }
+        tables = {name: getattr(self, name) for name in _TABLES}
+        soft = vars(self.soft) if self.soft else {}
+        return {**tables, **{f"soft_{name}": values for name, values in soft.items()}}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> "SlopeTable":
@@ -158,13 +130,17 @@ class SlopeTable:
         """
         soft = None
         if "soft_weight" in tensors:
-            soft = SoftModes(
-                weight=tensors["soft_weight"], mean=tensors["soft_mean"], std=tensors["soft_std"]
-            )
-        return cls(mean=tensors["mean"], std=tensors["std"], noise_std=tensors["noise_std"], soft=soft)
+            soft = SoftModes(**{name: tensors[f"soft_{name}"] for name in ("weight", "mean", "std")})
+        return cls(**{name: tensors[name] for name in _TABLES}, soft=soft)
 
-    def _place(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
-        """The node under each slope, and how far on to the next it is."""
+    def _read(self, classes: Tensor | slice, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
+        """Means and standard deviations of classes, between the node under each slope and the next."""
         place = (slope_deg / STEP_DEG).clamp(0, self.mean.shape[1] - 1)
         left = place.floor().clamp(max=self.mean.shape[1] - 2)
-        return left.long(), place - left
+        node = left.long()
+        tables = (table.to(slope_deg) for table in (self.mean, self.std))
+        mean, std = (
+            torch.lerp(rows[classes, node], rows[classes, node + 1], (place - left).to(rows.dtype))
+            for rows in tables
+        )
+        return mean, std

@@ -5,22 +5,24 @@ come from named random streams, so a training that is resumed sees what it would
 processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W cells.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import lightning
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Sampler
 from torchvision.transforms.v2 import functional as photometry
 
 from benchnav.core import rng
 from benchnav.core.device import CPU
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset
+from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
+from benchnav.models.nets.trainable import MapScale
 
 TRAIN, VALID = "train", "valid"
 
@@ -31,25 +33,15 @@ MapKey = tuple[Tensor, Tensor, Tensor]
 Batch = dict[str, Tensor]
 
 
-class MapDataset(Dataset[Batch]):
-    """Maps by field; indexed by a whole batch at a time.
+class MapDataset(TerrainMaps):
+    """Maps by field, `rgb` (uint8, [b, 3, H, W]) among them; indexed by a whole batch at a time."""
 
-    Args:
-        read: gives every field of some maps by their indices, each of shape [b, *, H, W]; `rgb` (uint8, [b, 3, H,
-            W]) is among them.
-        count: how many maps there are.
-        shape: H and W.
-    """
+    @property
+    def shape(self) -> tuple[int, int]:
+        """H and W."""
+        return self.dataset.grid.shape
 
-    def __init__(self, read: Callable[[Sequence[int]], Batch], count: int, shape: tuple[int, int]) -> None:
-        """Reads nothing yet."""
-        self.read, self.count, self.shape = read, count, shape
-
-    def __len__(self) -> int:
-        """Number of maps."""
-        return self.count
-
-    def __getitem__(self, key: MapKey) -> Batch:
+    def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W].
 
         Args:
@@ -57,14 +49,19 @@ class MapDataset(Dataset[Batch]):
                 factors of `apply_jitter`, shape [b, 3].
         """
         index, symmetry, factors = key
-        batch = {name: _turn(values, symmetry) for name, values in self.read(index.tolist()).items()}
+        batch = {
+            name: torch.stack(
+                [apply_symmetry(layer, which) for layer, which in zip(values, symmetry.tolist(), strict=True)]
+            )
+            for name, values in self.read(index.tolist()).items()
+        }
         return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
 
-    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
+    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[list[int], Batch]]:
         """All maps as they are, in order, some at a time, with their indices; on a device."""
-        step = max(1, CHUNK_CELLS // (self.shape[0] * self.shape[1]))
-        for first in range(0, self.count, step):
-            indices = range(first, min(first + step, self.count))
+        height, width = self.shape
+        for chunk in torch.arange(len(self)).split(max(1, CHUNK_CELLS // (height * width))):
+            indices = chunk.tolist()
             yield indices, {name: values.to(device) for name, values in self.read(indices).items()}
 
 
@@ -96,14 +93,7 @@ def apply_symmetry(maps: Tensor, which: int) -> Tensor:
     return turned.flip(-1) if which % 2 else turned
 
 
-def _turn(maps: Tensor, symmetry: Tensor) -> Tensor:
-    turned = torch.empty_like(maps)
-    for which in symmetry.unique().tolist():
-        chosen = symmetry == which
-        turned[chosen] = apply_symmetry(maps[chosen], which)
-    return turned
-
-
+@dataclass(eq=False)
 class MapSampler(Sampler[MapKey]):
     """Cuts the maps into batches of nearly equal size, in an order keyed by (seed, epoch).
 
@@ -115,23 +105,17 @@ class MapSampler(Sampler[MapKey]):
         jitter: largest relative change of brightness, contrast and saturation.
         shuffle: whether to change the order each epoch.
         share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
+        epoch: that the next iteration gives.
     """
 
-    def __init__(
-        self,
-        maps: int,
-        batch_size: int,
-        seed: int = 0,
-        *,
-        symmetries: tuple[int, ...] = (0,),
-        jitter: float = 0.0,
-        shuffle: bool = False,
-        share: tuple[int, int] = (0, 1),
-    ) -> None:
-        """Starts at epoch 0."""
-        self.maps, self.batch_size, self.seed = maps, batch_size, seed
-        self.symmetries, self.jitter, self.shuffle, self.share = symmetries, jitter, shuffle, share
-        self.epoch = 0
+    maps: int
+    batch_size: int
+    seed: int = 0
+    symmetries: tuple[int, ...] = (0,)
+    jitter: float = 0.0
+    shuffle: bool = False
+    share: tuple[int, int] = (0, 1)
+    epoch: int = 0
 
     def set_epoch(self, epoch: int) -> None:
         """Chooses the epoch that the next iteration gives; the trainer calls this."""
@@ -143,16 +127,13 @@ class MapSampler(Sampler[MapKey]):
 
     def __iter__(self) -> Iterator[MapKey]:
         """Yields the batches of the epoch."""
-        order, symmetry = np.arange(self.maps), np.zeros(self.maps, dtype=np.int64)
-        factors = np.ones((self.maps, 3))
+        order, epoch = np.arange(self.maps), np.array([self.epoch])
         if self.shuffle:
-            epoch = np.array([self.epoch])
             order = rng.permutation(self._key("order"), epoch, self.maps)[0]
-            drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
-            symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        if self.jitter:
-            drawn = rng.uniform(self._key("jitter"), np.array([self.epoch]), (self.maps, 3))[0]
-            factors = 1 + self.jitter * (2 * drawn - 1)
+        drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
+        symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
+        drawn = rng.uniform(self._key("jitter"), epoch, (self.maps, 3))[0]
+        factors = 1 + self.jitter * (2 * drawn - 1)
         first, step = self.share
         pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
         for batch in zip(*pieces, strict=True):
@@ -181,7 +162,7 @@ class MapData(lightning.LightningDataModule):
         workers: processes that read ahead; 0 reads in this one.
 
     Raises:
-        DatasetError: a split is missing, or there are fewer than two maps to train on.
+        DatasetError: a split is missing.
     """
 
     def __init__(
@@ -196,23 +177,25 @@ class MapData(lightning.LightningDataModule):
     ) -> None:
         """Opens the splits."""
         super().__init__()
-        if batch_size < 2:
-            raise ConfigError(f"Expected `batch_size` ≥ 2, got {batch_size}.")
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
         self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
-        check_maps(dataset)
-        self.digest = training_digest(dataset)
 
-    def colour_statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the training maps' colours, 0–255, each of shape [3]."""
-        counts = torch.zeros(3, 256, dtype=torch.int64)
+    def scale(self) -> MapScale:
+        """What the training maps' colours and slopes are scaled by; 1 of slopes that are not read."""
+        counts, squares = torch.zeros(3, 256, dtype=torch.int64), torch.zeros((), dtype=torch.float64)
         for _, maps in self.train.chunks():
             channels = maps["rgb"].unbind(1)
             counts += torch.stack([channel.flatten().bincount(minlength=256) for channel in channels])
+            if "slope_deg" in maps:
+                squares += maps["slope_deg"].double().square().sum()
         share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
         mean = (share * level).sum(1)
         variance = (share * level**2).sum(1) - mean**2
-        return mean.float(), variance.clamp(min=1).sqrt().float()
+        # Ground of one colour, or flat, would have no scale.
+        std, slope_deg = (
+            value.clamp(min=1).sqrt().float() for value in (variance, squares / counts[0].sum())
+        )
+        return MapScale(mean.float(), std, slope_deg)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
@@ -234,34 +217,40 @@ class MapData(lightning.LightningDataModule):
         )  # fmt: skip
 
 
-def check_maps(dataset: TerrainDataset) -> None:
-    """Refuses a dataset with fewer than two maps to train on, or none to measure on.
+def open_dataset(data: str) -> TerrainDataset:
+    """Opens a dataset to train on, by path or id.
 
     Raises:
-        DatasetError: there are too few.
+        DatasetError: it has no splits to train and to measure on.
     """
-    for split, least in ((TRAIN, 2), (VALID, 1)):
-        if dataset.map_count(split) < least:
-            raise DatasetError(
-                f"Expected at least {least} maps in split {split} of {dataset.path}, got {dataset.map_count(split)}."
-            )
+    dataset = TerrainDataset(find_dataset(data))
+    if not {TRAIN, VALID} <= set(dataset.splits):
+        raise DatasetError(
+            f"Expected splits train and valid in {dataset.path} to train on, got {sorted(dataset.splits)}. "
+            "Make a dataset with them, for example `benchnav-datagen create paper-v1`."
+        )
+    return dataset
 
 
-def check_known(dataset: TerrainDataset, field: str) -> None:
-    """Refuses maps that a network cannot learn from since no cell has what it learns.
+def check_maps(dataset: TerrainDataset, field: str) -> None:
+    """Refuses a dataset that a network cannot learn from.
 
     Args:
         dataset: the maps.
-        field: `class_id` or `traversability`.
+        field: `class_id` or `traversability`, which is to be learned.
 
     Raises:
-        DatasetError: in `train` or `valid` none has.
+        DatasetError: there are fewer than two maps to train on, or none to measure on; or in one of these splits no
+            cell has what is learned.
     """
     what = {"class_id": "cells with a class", "traversability": "observed traversability"}[field]
-    for split in (TRAIN, VALID):
+    for split, least in ((TRAIN, 2), (VALID, 1)):
+        place, count = f"split {split} of {dataset.path}", dataset.map_count(split)
+        if count < least:
+            raise DatasetError(f"Expected at least {least} maps in {place}, got {count}.")
         chunks = (maps[field] for _, maps in dataset.chunks(split, (field,)))
         if not any(bool((np.isfinite(values) & (values != UNLABELLED)).any()) for values in chunks):
-            raise DatasetError(f"Expected {what} in split {split} of {dataset.path} to learn from, got none.")
+            raise DatasetError(f"Expected {what} in {place} to learn from, got none.")
 
 
 def training_digest(dataset: TerrainDataset) -> str:
@@ -273,5 +262,4 @@ def read_maps(
     dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",), in_memory: bool = False
 ) -> MapDataset:
     """The colours and other fields of a split, read as they are asked for, or at once."""
-    maps = TerrainMaps(dataset.path, split, ("rgb", *fields), in_memory)
-    return MapDataset(maps.read, len(maps), dataset.grid.shape)
+    return MapDataset(dataset.path, split, ("rgb", *fields), in_memory)

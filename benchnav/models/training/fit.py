@@ -11,6 +11,7 @@ import json
 import os
 import pickle
 import signal
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -19,64 +20,59 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import pandas as pd
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
+from lightning.fabric.plugins.io import TorchCheckpointIO
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar, RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
+from benchnav.core.command import tell
 from benchnav.core.device import find_device
 from benchnav.core.errors import CheckpointError, ConfigError, quiet
 from benchnav.core.settings import one_line
-from benchnav.core.store import sole_writer, write_text
-from benchnav.models.training.callbacks import History, WholeFiles, measured, progress
+from benchnav.core.store import replacing, sole_writer, write_text
+from benchnav.models.config import TrainOptions
 
 STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
+
+_PARTIAL = f".{STATE}.*.partial"  # what a kill in the middle of writing has left
 
 # Settings of Lightning's trainer that are made here, and those that the outcome does not depend on.
 _OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "accelerator", "fast_dev_run"}
 _OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "enable_autolog_hparams"}
 _OWN |= {"barebones", "num_sanity_val_steps", "use_distributed_sampler", "inference_mode"}
 _OWN |= {"model_registry", "profiler"}
+_DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
 _OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitOptions:
+class FitOptions(TrainOptions):
     """How to train, whatever is trained.
 
     Args:
         folder: where logs and what is needed to go on are kept, in a folder for each part of a model;
             nothing is written when None.
-        resume: go on with the training that was interrupted there, if there is one.
-        trainer: settings of Lightning's trainer by name.
-        in_memory: hold all maps in memory, in place of reading them as they are asked for.
-        workers: processes that read maps ahead; the outcome is the same for any number.
-        device: where networks are trained, calibrated and measured: "cpu", "cuda", or "auto" for CUDA where there is
-            a GPU.
 
     Raises:
         ConfigError: `workers` is below 0; there is no such device; the trainer has no such setting, or it is set here.
     """
 
     folder: Path | None = None
-    resume: bool = False
-    trainer: Mapping[str, Any] = field(default_factory=dict)
-    in_memory: bool = False
-    workers: int = 0
-    device: str = "auto"
 
     def __post_init__(self) -> None:
         """Checks the settings by name."""
         if self.workers < 0:
             raise ConfigError(f"Expected `workers` ≥ 0, got {self.workers}.")
-        if "accelerator" in self.trainer:
+        asked = self.trainer or {}
+        if "accelerator" in asked:
             raise ConfigError("Expected no `trainer.accelerator`, which is now `device`: auto, cpu or cuda.")
-        known = sorted(set(inspect.signature(lightning.Trainer.__init__).parameters) - _OWN)
-        unknown = sorted(set(self.trainer) - set(known))
-        if unknown:
+        known = sorted(_DEFAULTS.keys() - _OWN)
+        if unknown := sorted(asked.keys() - known):
             raise ConfigError(f"Expected settings of `trainer` among {', '.join(known)}, got {unknown[0]!r}.")
-        devices, processors = self.trainer.get("devices", 1), os.cpu_count() or 1
+        devices, processors = asked.get("devices", 1), os.cpu_count() or 1
         if self.place.type == "cpu" and isinstance(devices, int) and not 1 <= devices <= processors:
             raise ConfigError(
                 f"Expected `trainer.devices` in 1–{processors}, as many as there are processors, got {devices}."
@@ -90,18 +86,18 @@ class FitOptions:
     @property
     def trainer_settings(self) -> dict[str, Any]:
         """The settings of the trainer on which the outcome of a network's training depends, as plain data."""
-        defaults = inspect.signature(lightning.Trainer.__init__).parameters
         chosen = {
             name: value
             for name, value in self.chosen().items()
-            if name not in _OF_NO_ACCOUNT and value != defaults[name].default
+            if name not in _OF_NO_ACCOUNT and value != _DEFAULTS[name].default
         }
         return json.loads(json.dumps(chosen, default=str, sort_keys=True))
 
     def chosen(self, **trainer: Any) -> dict[str, Any]:
         """All settings of the trainer, of those given here and others, by name."""
-        chosen: dict[str, Any] = {"devices": 1, **trainer, **self.trainer, "accelerator": self.place.type}
-        return {"precision": default_precision(self.place.type), **chosen}
+        kind = self.place.type
+        first = {"precision": default_precision(kind), "devices": 1}
+        return {**first, **trainer, **(self.trainer or {}), "accelerator": kind}
 
 
 def fit(
@@ -111,7 +107,7 @@ def fit(
     settings: Mapping[str, Any],
     callbacks: list[Callback],
     data: Mapping[str, Any],
-    **trainer: Any,
+    **usual: Any,
 ) -> dict[str, float]:
     """Trains a module in place.
 
@@ -123,7 +119,7 @@ def fit(
             gone on with.
         callbacks: what else is to happen.
         data: loaders or data module, as arguments of the trainer's `fit`.
-        trainer: settings of Lightning's trainer, where the options say nothing; of `precision`, which may be left
+        usual: settings of Lightning's trainer, where the options say nothing; of `precision`, which may be left
             out, `default_precision`.
 
     Returns:
@@ -135,7 +131,9 @@ def fit(
     """
     folder = options.folder / part if options.folder else None
     held = sole_writer(folder, str(folder)) if folder and is_first_process() else nullcontext()
-    callbacks, state = [*callbacks, progress(part)], None
+    in_terminal = sys.stderr.isatty()
+    shown = RichProgressBar(console_kwargs={"stderr": True}) if in_terminal else EpochLines(part)
+    callbacks, state = [*callbacks, shown], None
     kept: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     with quietly(), held:
         if folder:
@@ -146,9 +144,22 @@ def fit(
             )
             callbacks += [History(folder / HISTORY), last]
             kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
-        lightning_trainer = make_trainer(callbacks, **kept, **options.chosen(**trainer))
-        _run(lightning_trainer, module, data, state)
-        return measured(lightning_trainer)
+        trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
+        handler = signal.getsignal(signal.SIGINT)
+        try:
+            trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
+        except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
+            signal.signal(signal.SIGINT, handler)
+            raise KeyboardInterrupt from None
+        except MisconfigurationException as error:
+            raise _unusable(error) from error
+        except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
+            if state is None or trainer.global_step:
+                raise
+            raise CheckpointError(
+                f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
+            ) from error
+        return measured(trainer)
 
 
 def say(line: str) -> None:
@@ -162,15 +173,22 @@ def is_first_process() -> bool:
     return not getattr(rank_zero_only, "rank", 0)
 
 
-def interrupted(folder: Path, parts: list[str]) -> list[str]:
-    """Names the parts whose training was interrupted in `folder`."""
-    return [part for part in parts if (folder / part / STATE).exists()]
+def interrupted(options: FitOptions, parts: list[str]) -> list[str]:
+    """Names the parts whose training was interrupted in the folder of some options."""
+    return [part for part in parts if options.folder and (options.folder / part / STATE).exists()]
 
 
-def forget(folder: Path, part: str) -> None:
+def forget(options: FitOptions, part: str) -> None:
     """Drops what was kept to go on with a part's training; its logs stay."""
-    for path in (folder / part / STATE, *_partial(folder / part)):
-        path.unlink(missing_ok=True)
+    if options.folder and is_first_process():
+        _drop(options.folder / part, STATE, _PARTIAL)
+
+
+def differing(wanted: Mapping[str, Any], there: Mapping[str, Any]) -> str:
+    """Names the settings in which two trainings differ, such as "another `seed`"; empty where there are none."""
+    wanted, there = (json.loads(json.dumps(settings, default=str)) for settings in (wanted, there))
+    others = sorted(name for name in {**wanted, **there} if wanted.get(name) != there.get(name))
+    return f"another {' and '.join(f'`{name}`' for name in others)}" if others else ""
 
 
 def default_precision(accelerator: str) -> str:
@@ -185,51 +203,25 @@ def default_precision(accelerator: str) -> str:
 def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | None:
     """Makes the folder; gives the state to go on from, if any."""
     folder.mkdir(parents=True, exist_ok=True)
-    state, described = folder / STATE, json.loads(json.dumps(settings, default=str))
+    state, described = folder / STATE, json.dumps(settings, default=str, indent=1) + "\n"
     if resume and state.exists():
         there = json.loads((folder / SETTINGS).read_text()) if (folder / SETTINGS).exists() else {}
-        names = {name for name in {*there, *described} if there.get(name) != described.get(name)}
-        if names:
+        if others := differing(settings, there):
             raise CheckpointError(
-                f"Expected the settings of the interrupted training in {folder} to resume it, got another "
-                f"{' and '.join(f'`{name}`' for name in sorted(names))}. Repeat its settings, or pass "
-                "--overwrite to begin anew."
+                f"Expected the settings of the interrupted training in {folder} to resume it, got {others}. "
+                "Repeat its settings, or pass --overwrite to begin anew."
             )
         return state
     if is_first_process():
-        for old in (state, folder / HISTORY, *folder.glob("events.out.tfevents.*"), *_partial(folder)):
-            old.unlink(missing_ok=True)
-        write_text(folder / SETTINGS, json.dumps(described, indent=1) + "\n")
+        _drop(folder, STATE, _PARTIAL, HISTORY, "events.out.tfevents.*")
+        write_text(folder / SETTINGS, described)
     return None
 
 
-def _partial(folder: Path) -> Iterator[Path]:
-    """What a kill in the middle of writing has left."""
-    return folder.glob(f".{STATE}.*.partial")
-
-
-def _run(
-    trainer: lightning.Trainer,
-    module: lightning.LightningModule,
-    data: Mapping[str, Any],
-    state: Path | None,
-) -> None:
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
-    except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
-        signal.signal(signal.SIGINT, handler)
-        raise KeyboardInterrupt from None
-    except MisconfigurationException as error:
-        raise ConfigError(
-            f"Expected settings of `trainer` that Lightning takes, got: {one_line(error)}"
-        ) from error
-    except (RuntimeError, EOFError, KeyError, pickle.UnpicklingError) as error:
-        if state is None or trainer.global_step:
-            raise
-        raise CheckpointError(
-            f"{state} is damaged: {type(error).__name__} {error}. Pass --overwrite to begin anew."
-        ) from error
+def _drop(folder: Path, *patterns: str) -> None:
+    for pattern in patterns:
+        for path in folder.glob(pattern):
+            path.unlink()
 
 
 def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Trainer:
@@ -248,7 +240,11 @@ def make_trainer(callbacks: list[Callback], **settings: Any) -> lightning.Traine
             **settings,
         )
     except (ValueError, TypeError, RuntimeError, MisconfigurationException) as error:
-        raise ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {error}") from error
+        raise _unusable(error) from error
+
+
+def _unusable(error: Exception) -> ConfigError:
+    return ConfigError(f"Expected settings of `trainer` that Lightning takes, got: {one_line(error)}")
 
 
 @contextmanager
@@ -257,3 +253,118 @@ def quietly() -> Iterator[None]:
     with quiet("lightning.pytorch", "lightning.fabric"), warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"lightning\..*")
         yield
+
+
+class KeepBest(Callback):
+    """Keeps the weights of the epoch with the lowest validation loss and restores them at the end.
+
+    They are part of what a training goes on from. Lightning's `ModelCheckpoint` would put them into a second file,
+    which a kill could leave of another epoch than the first, and knows the loss alone of all that was measured.
+    """
+
+    def __init__(self) -> None:
+        """Starts with none."""
+        self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
+        self.validated = False
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Copies the weights when they are the best so far."""
+        self.validated = True
+        metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
+        if metrics["valid_loss"] < self.best["loss"]:
+            weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
+            metrics["epoch"] = trainer.current_epoch + 1
+            self.best = {"loss": metrics["valid_loss"], "metrics": metrics, "weights": weights}
+
+    def on_fit_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Puts the best weights back."""
+        if not self.best["weights"]:
+            raise ConfigError(
+                "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
+                if self.validated
+                else "Expected settings of `trainer` under which the split valid is measured, got an end of training "
+                "before it ever was. Train for longer, or validate more often."
+            )
+        module.load_state_dict(self.best["weights"])
+        # The trainer's own metrics are what comes back from processes that it has started.
+        metrics = self.best["metrics"].items()
+        trainer.callback_metrics.update({name: torch.tensor(value) for name, value in metrics})
+
+    def state_dict(self) -> dict[str, Any]:
+        """Gives what `load_state_dict` takes."""
+        return self.best
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from an earlier state."""
+        self.best = state
+
+
+@dataclass(eq=False)
+class History(Callback):
+    """Writes what was measured to a table, a row an epoch.
+
+    Lightning's `CSVLogger` writes training and validation to rows of their own, and begins anew when it is resumed.
+
+    Args:
+        path: the table, CSV.
+        rows: what it holds.
+    """
+
+    path: Path
+    rows: list[dict[str, float]] = field(default_factory=list)
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Adds a row."""
+        rate = float(trainer.optimizers[0].param_groups[0]["lr"])
+        row = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "learning_rate": rate}
+        self.rows.append({**row, **measured(trainer)})
+        if trainer.is_global_zero:
+            write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Gives what `load_state_dict` takes."""
+        return {"rows": self.rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from an earlier state."""
+        self.rows = list(state["rows"])
+
+
+@dataclass(eq=False)
+class EpochLines(Callback):
+    """Says on standard error what each epoch brought, where there is no terminal for Lightning's bar.
+
+    Args:
+        what: what is trained.
+    """
+
+    what: str
+
+    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        """Says it."""
+        found, epoch = measured(trainer), f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
+        if trainer.is_global_zero:
+            tell(f"{self.what}: {epoch}, {in_words(found, 'valid_') or in_words(found)}")
+
+
+class WholeFiles(TorchCheckpointIO):
+    """Writes a Lightning checkpoint whole or not at all.
+
+    Lightning's own way moves a temporary file, which is no one step where these are on another disk.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Writes it beside its name, then renames it."""
+        with replacing(Path(path), durable=False) as partial:
+            torch.save(checkpoint, partial)
+
+
+def measured(trainer: lightning.Trainer) -> dict[str, float]:
+    """What was measured so far, by name."""
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def in_words(metrics: Mapping[str, float], prefix: str = "") -> str:
+    """Those of some measures whose names begin with a prefix, without it."""
+    chosen = {name.removeprefix(prefix): value for name, value in metrics.items() if name.startswith(prefix)}
+    return ", ".join(f"{name} {value:.4f}" for name, value in chosen.items())

@@ -1,34 +1,33 @@
 """Training the class-wise GPs of a fused model, on maps or on a robot's slip logs."""
 
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchnav.core.errors import CheckpointError
+from benchnav.core.command import Device, tell
+from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.checkpoint import CONFIG, GP, Checkpoint, Part, load_checkpoint
-from benchnav.models.config import LatentGPConfig
+from benchnav.models.checkpoint import GP, Checkpoint, Part
+from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
 from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, measure_latent, sum_split
 from benchnav.models.slope_gp.gp import LatentGPs, load_batches
-from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.slip_logs import ENDINGS, read_slip_logs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
-from benchnav.models.training.data import TRAIN, VALID, training_digest
+from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
-from benchnav.models.training.target import open_target
+from benchnav.models.training.target import existing, fresh_checkpoint, open_target
 
-_DEFAULT = FitOptions()
 _HELD_OUT = 0.1  # of slip logs
 _FEW_ROWS = 10  # of a class in slip logs
 
 
-def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFAULT) -> LatentGPs:
+def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu") -> LatentGPs:
     """Trains the class-wise GPs on sums over cells, in float64 on one device; nothing is drawn.
 
     Args:
         config: what to train.
         sums: of the cells of all classes, from maps or from a robot's logs.
-        options: how to train, of which the device alone counts.
+        device: where to train.
 
     Returns:
         The GPs, on the CPU.
@@ -38,11 +37,11 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFA
     if config.second_component and censored:
         soft, share = find_soft_modes(sums)
         bins = main_bins(sums, soft, share) if soft else bins
-    model = LatentGPs(config, len(sums.count), sums.steepest_deg, soft)
+    model = LatentGPs(config, sums.steepest_deg, soft)
     fit(
         model,
         GP,
-        FitOptions(device=options.device),
+        FitOptions(device=device),
         {},
         [],
         {"train_dataloaders": load_batches(config, bins)},
@@ -52,12 +51,30 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, options: FitOptions = _DEFA
     return model.cpu().eval()
 
 
-def train_gps_on_maps(
-    config: LatentGPConfig, dataset: TerrainDataset, seed: int, options: FitOptions
-) -> Part:
+def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions) -> None:
+    """Trains the GPs on a dataset or on slip logs, into a checkpoint.
+
+    Args:
+        data: path or id of a dataset, or path of slip logs.
+        out: folder of the checkpoint.
+        config: what to train.
+        options: how to train.
+    """
+    check_seed(options.seed)
+    output_path(out)  # refuses addresses
+    how = FitOptions(**vars(options))
+    if data.endswith(ENDINGS):
+        _train_on_logs(data, out, config, how)
+        return
+    dataset = open_dataset(data)
+    target = open_target(out, fresh_checkpoint(dataset), [GP], training_digest(dataset), how)
+    target.add(GP, train_gps_on_maps(config, dataset, how))
+
+
+def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: FitOptions) -> Part:
     """Trains the GPs on the split `train` and gives them as a part of a checkpoint."""
     names = [item.name for item in dataset.recipe.classes]
-    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options)
+    model = _fit_and_say(config, sum_split(dataset, TRAIN), names, options.device)
     known = dataset.truth_of(VALID) == "generated"
     found = measure_latent(model.tabulate(), dataset.terrain_chunks(VALID), known)
     errors = (
@@ -67,43 +84,50 @@ def train_gps_on_maps(
     )
     say(f"gp: validation {errors}NLL {found['nll']:.4f}")
     metrics = {f"valid_{name}": value for name, value in found.items()}
-    return _part(model, seed, metrics, dataset.id, training_digest(dataset))
+    return _part(model, options.seed, metrics, dataset.id, training_digest(dataset))
 
 
-def train_gps_on_logs(
-    data: str, out: str, config: LatentGPConfig, seed: int, options: FitOptions, overwrite: bool
-) -> None:
+def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
     logs = read_slip_logs(data)
-    there = _there(out, overwrite)
+    there = existing(Path(out), options.overwrite)
     names = there.class_names if there else logs.class_names
     cells = logs.cells(names)
     sums, digest = SlopeSums.of(cells, len(names)), f"file:{logs.digest}"
-    target = open_target(Path(out), Checkpoint(class_names=names), [GP], digest, options, overwrite)
+    target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
-    _warn_of_rows(data, counts, out if there and GP in there.parts else "")
+    if missing := [name for name, count in counts.items() if not count]:
+        lost = f", and what {out} had learned of them is dropped" if there and GP in there.parts else ""
+        tell(
+            f"benchnav-train: warning: {data} has no rows of {len(missing)} of {len(counts)} classes "
+            f"({', '.join(missing)}); their GPs become the prior, which is vague{lost}"
+        )
+    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
+        tell(
+            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what "
+            "is predicted of them is little more than the prior"
+        )
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
-        kept, held = hold_out(cells, _HELD_OUT, seed)
-        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options)
+        kept, held = hold_out(cells, _HELD_OUT, options.seed)
+        trial = fit_gps(config, SlopeSums.of(kept, len(names)), options.device)
         metrics["held_out_nll"] = cell_nll(held, trial.tabulate())
         say(
             f"gp: NLL of {len(held)} rows held out, which follow one another in each class, "
             f"{metrics['held_out_nll']:.4f}; now with all rows"
         )
-    model = _fit_and_say(config, sums, names, options)
+    model = _fit_and_say(config, sums, names, options.device)
     say(f"gp: rows learned from: {', '.join(f'{name} {count}' for name, count in counts.items())}")
-    target.add(GP, _part(model, seed, metrics, Path(data).name, digest))
+    target.add(GP, _part(model, options.seed, metrics, Path(data).name, digest))
 
 
 def _fit_and_say(
-    config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], options: FitOptions
+    config: LatentGPConfig, sums: SlopeSums, class_names: Sequence[str], device: Device
 ) -> LatentGPs:
     """Trains the GPs, and names the classes that were found to have a second mode."""
-    model = fit_gps(config, sums, options)
-    if model.soft is not None:
-        numbers = (values.tolist() for values in (model.soft.weight, model.soft.mean, model.soft.std))
-        modes = zip(class_names, *numbers, strict=True)
+    model = fit_gps(config, sums, device)
+    if soft := model.soft:
+        modes = zip(class_names, soft.weight.tolist(), soft.mean.tolist(), soft.std.tolist(), strict=True)
         found = [
             f"{name} {share:.1%} of N({mean:.3f}, {std:.3f})" for name, share, mean, std in modes if share
         ]
@@ -120,40 +144,3 @@ def _part(model: LatentGPs, seed: int, metrics: dict[str, float], data_id: str, 
         data_id=data_id,
         data_digest=data_digest,
     )
-
-
-def _there(out: str, overwrite: bool) -> Checkpoint | None:
-    """The checkpoint that the GPs come into; None where there is none, or a damaged one that is replaced."""
-    if not (Path(out) / CONFIG).is_file():
-        return None
-    try:
-        return load_checkpoint(out)
-    except CheckpointError:
-        if not overwrite:
-            raise
-        return None
-
-
-def _warn_of_rows(data: str, counts: Mapping[str, int], replaced: str) -> None:
-    """Names the classes that a file of slip logs says little or nothing of.
-
-    Args:
-        data: the file.
-        counts: rows by class.
-        replaced: the checkpoint whose GPs the new ones replace; empty where there are none.
-    """
-    if missing := [name for name, count in counts.items() if not count]:
-        lost = f", and what {replaced} had learned of them is dropped" if replaced else ""
-        _warn(
-            f"{data} has no rows of {len(missing)} of {len(counts)} classes ({', '.join(missing)}); their GPs become "
-            f"the prior, which is vague{lost}"
-        )
-    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
-        _warn(
-            f"{data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what is predicted of them "
-            "is little more than the prior"
-        )
-
-
-def _warn(line: str) -> None:
-    print(f"benchnav-train: warning: {line}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """Training networks, whatever they learn: one door for classifiers, mixture-density networks and those to come."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -9,41 +9,94 @@ from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
+from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.checkpoint import Part, as_stored, member_names
-from benchnav.models.config import ClassifierConfig, MDNConfig
+from benchnav.models.checkpoint import (
+    CLASSIFIER,
+    FUSED,
+    GP,
+    Part,
+    as_stored,
+    member_name,
+    member_names,
+    training_folder,
+)
+from benchnav.models.config import ClassifierConfig, LatentGPConfig, NetworkConfig, TrainOptions, check_seed
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.mdn import MixtureDensityNetwork
 from benchnav.models.nets.temperature import fit_pool_temperature
-from benchnav.models.nets.trainable import TrainableNetwork
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import (
     TRAIN,
     VALID,
     MapData,
-    MapDataset,
-    check_known,
     check_maps,
+    open_dataset,
     read_maps,
     training_digest,
 )
-from benchnav.models.training.fit import FitOptions, fit, is_first_process, make_trainer, quietly, say
-from benchnav.models.training.target import Target
+from benchnav.models.training.fit import (
+    FitOptions,
+    KeepBest,
+    fit,
+    in_words,
+    is_first_process,
+    make_trainer,
+    quietly,
+    say,
+)
+from benchnav.models.training.gps import train_gps_on_maps
+from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
-_DEFAULT = FitOptions()
-
-Config = ClassifierConfig | MDNConfig
-NETWORKS: Mapping[type, type[TrainableNetwork]] = {
-    ClassifierConfig: TerrainClassifier,
-    MDNConfig: MixtureDensityNetwork,
+NETWORKS: Mapping[type, Any] = {
+    network.kind: network for network in (TerrainClassifier, MixtureDensityNetwork)
 }
 
 
+def train_networks(
+    how: TrainOptions,
+    data: str,
+    out: str,
+    config: NetworkConfig,
+    gp: LatentGPConfig | None = None,
+    members: int = 1,
+) -> None:
+    """Trains what a checkpoint lacks of a model: the class-wise GPs where they are asked for, then networks.
+
+    Args:
+        how: how to train.
+        data: path or id of a dataset.
+        out: folder of the checkpoint.
+        config: of the networks.
+        gp: of the GPs, if any.
+        members: how many classifiers there are to be.
+    """
+    if members < 1:
+        raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
+    check_seed(how.seed, members)
+    output_path(out)  # refuses addresses
+    dataset, trainer = open_dataset(data), dict(how.trainer or {})
+    # The length of training is the network's own setting, wherever it is said.
+    config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
+    options = FitOptions(**{**vars(how), "trainer": trainer, "folder": training_folder(out)})
+    check_network(config, dataset, options)
+    part = NETWORKS[type(config)].part
+    parts, model = [part], part
+    if part == CLASSIFIER:
+        parts, model = [member_name(index) for index in range(members)], FUSED
+    trained = [GP] * bool(gp) + parts
+    target = open_target(out, fresh_checkpoint(dataset, model), trained, training_digest(dataset), options)
+    if gp and not target.holds(GP, gp, how.seed):
+        target.add(GP, train_gps_on_maps(gp, dataset, options))
+    train_parts(target, config, dataset, parts)
+    if not target.changed:
+        print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
+
+
 def fit_network(
-    config: Config,
+    config: NetworkConfig,
     dataset: TerrainDataset,
-    seed: int = 0,
-    options: FitOptions = _DEFAULT,
+    seed: int,
+    options: FitOptions,
     part: str = "",
     half_precision: bool = False,
 ) -> tuple[Any, dict[str, float]]:
@@ -67,12 +120,17 @@ def fit_network(
         dataset, config.batch_size, seed, config.jitter, kind.fields,
         in_memory=options.in_memory, workers=options.workers,
     )  # fmt: skip
-    network = kind.untrained(config, len(dataset.recipe.classes), data, seed)
+    network = kind(config, len(dataset.recipe.classes), data.scale(), seed)
     metrics = fit(
         network,
         part or kind.part,
         options,
-        {"config": asdict(config), "data": data.digest, "seed": seed, "half_precision": half_precision},
+        {
+            "config": asdict(config),
+            "data": training_digest(dataset),
+            "seed": seed,
+            "half_precision": half_precision,
+        },
         [KeepBest(), EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)],
         {"datamodule": data},
         max_epochs=config.max_epochs,
@@ -80,22 +138,12 @@ def fit_network(
     network.to(options.place).eval()
     if half_precision:
         network.load_state_dict(as_stored(network.state_dict(), half_precision))
-        metrics = {**metrics, **measure(network, data.valid)}
+        metrics = {**metrics, **network.measure(data.valid)}
     network.calibrate(data.valid, seed, options.place)
     return network.cpu(), metrics
 
 
-def measure(network: TrainableNetwork, maps: MapDataset) -> dict[str, float]:
-    """Measures a network as training does, such as `valid_loss`.
-
-    Args:
-        network: in evaluation, on any device.
-        maps: with `rgb` and the network's `fields`.
-    """
-    return network.measure(some for _, some in maps.chunks(network.device))
-
-
-def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) -> None:
+def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOptions) -> None:
     """Refuses what could not be trained before anything is: builds the trainer and tries the network on a batch.
 
     Raises:
@@ -103,28 +151,27 @@ def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) 
         DatasetError: there are too few maps, or none of their cells has what is learned.
     """
     kind = NETWORKS[type(config)]
-    check_maps(dataset)
-    check_known(dataset, kind.fields[-1])
-    network = kind.untrained(config, len(dataset.recipe.classes))
+    check_maps(dataset, kind.fields[-1])
+    network = kind(config, len(dataset.recipe.classes))
     with quietly():
         chosen = options.chosen(max_epochs=config.max_epochs)
         trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
-    every = trainer.check_val_every_n_epoch
-    if every is not None and every > config.max_epochs:
+    every = trainer.check_val_every_n_epoch or 0
+    if every > config.max_epochs:
         raise ConfigError(
             f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
             f"got {every}."
         )
+    counts = {split: dataset.map_count(split) for split in (TRAIN, VALID)}
+    batches = {split: -(-maps // config.batch_size) for split, maps in counts.items()}
     for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
-        maps, limit = dataset.map_count(split), getattr(trainer, name)
-        batches = -(-maps // config.batch_size)
-        if (batches * limit if isinstance(limit, float) else limit) < 1:
+        limit = getattr(trainer, name)
+        if (batches[split] * limit if isinstance(limit, float) else limit) < 1:
             raise ConfigError(
-                f"Expected `trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
+                f"Expected `trainer.{name}` that leaves a batch of the {batches[split]} of split {split}, got {limit}. "
                 "Leave it out to take all."
             )
-    maps = dataset.map_count(TRAIN)
-    together = min(2, maps // -(-maps // config.batch_size))
+    together = min(2, counts[TRAIN] // batches[TRAIN])
     batch = read_maps(dataset, TRAIN, kind.fields).read(range(together))
     try:
         with torch.no_grad():
@@ -137,54 +184,40 @@ def check_network(config: Config, dataset: TerrainDataset, options: FitOptions) 
         ) from error
 
 
-def train_parts(
-    target: Target,
-    config: Config,
-    dataset: TerrainDataset,
-    parts: list[str],
-    seed: int,
-    options: FitOptions,
-    half_precision: bool,
-) -> None:
+def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, parts: list[str]) -> None:
     """Trains the networks that a checkpoint lacks, with the seeds `seed`, `seed` + 1, …, and pools classifiers."""
-    for number, part in enumerate(parts):
-        if target.holds(part, asdict(config), seed + number, asdict(type(config)()), half_precision):
+    options = target.options
+    for seed, part in enumerate(parts, options.seed):
+        if target.holds(part, config, seed):
             continue
-        network, metrics = fit_network(config, dataset, seed + number, options, part, half_precision)
-        names = {"accuracy": "accuracy", "miou": "mIoU", "rmse": "RMSE", "loss": "loss"}
+        network, metrics = fit_network(config, dataset, seed, options, part, options.half_precision)
+        calibrated = sorted(set(network.settings()) - set(asdict(config)))
         shown = [
-            f"{title} {metrics[f'valid_{name}']:.4f}"
-            for name, title in names.items()
-            if f"valid_{name}" in metrics
+            in_words(metrics, "valid_"),
+            *(f"{name} {getattr(network, name):.3f}" for name in calibrated),
         ]
-        calibrated = set(network.settings()) - set(asdict(config))
-        shown += [f"{name} {getattr(network, name):.3f}" for name in sorted(calibrated)]
         say(f"{part}: best epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")
         trained = Part(
             config=network.settings(),
             tensors=dict(network.state_dict()),
-            seed=seed + number,
+            seed=seed,
             metrics=metrics,
             data_id=dataset.id,
             data_digest=training_digest(dataset),
-            half_precision=half_precision,
+            half_precision=options.half_precision,
             trainer=options.trainer_settings,
         )
         target.add(part, trained)
-    if isinstance(config, ClassifierConfig):
-        _calibrate_pool(target, dataset, seed, options.place)
-
-
-def _calibrate_pool(target: Target, dataset: TerrainDataset, seed: int, device: torch.device) -> None:
-    """Fits the temperature of the pool of all classifiers that are there, as they are kept."""
-    parts = [target.checkpoint.part(name) for name in member_names(target.checkpoint)]
-    if len(parts) == 1 or not is_first_process():
+    parts = member_names(target.checkpoint)
+    if not isinstance(config, ClassifierConfig) or len(parts) == 1 or not is_first_process():
         return
-    classes = len(target.checkpoint.class_names)
+    # The classifiers as they are kept.
     members = [
-        TerrainClassifier.from_tensors(part.config, classes, as_stored(part.tensors, part.half_precision))
-        for part in parts
+        TerrainClassifier.from_tensors(
+            part.config, len(target.checkpoint.class_names), as_stored(part.tensors, part.half_precision)
+        )
+        for part in map(target.checkpoint.part, parts)
     ]
-    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), seed, device)
+    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), options.seed, options.place)
     say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)

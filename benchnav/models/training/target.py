@@ -4,20 +4,20 @@ Every refusal comes before any work is done. Where processes train together, the
 and writes.
 """
 
-import json
 import os
-from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from rich.filesize import decimal
 
 from benchnav.core.errors import CheckpointError
 from benchnav.core.store import building, real_place, refuse_taken, restore
+from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
     CLASSIFIER,
+    CONFIG,
+    FUSED,
     Checkpoint,
     Part,
     foreign,
@@ -25,9 +25,11 @@ from benchnav.models.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from benchnav.models.training.fit import FitOptions, forget, interrupted, is_first_process
+from benchnav.models.config import NetworkConfig
+from benchnav.models.training.fit import FitOptions, differing, forget, interrupted, is_first_process
 
 
+@dataclass
 class Target:
     """A checkpoint that parts are added to, one after the other, each saved as soon as it is trained.
 
@@ -36,30 +38,22 @@ class Target:
         checkpoint: what it holds so far.
         digest: of the data that parts are trained on.
         options: how they are trained.
+        changed: whether anything was saved.
     """
 
-    def __init__(self, folder: Path, checkpoint: Checkpoint, digest: str, options: FitOptions) -> None:
-        """Starts with what is there."""
-        self.folder, self.checkpoint = folder, checkpoint
-        self.digest, self.options, self.changed = digest, options, False
+    folder: Path
+    checkpoint: Checkpoint
+    digest: str
+    options: FitOptions
+    changed: bool = False
 
-    def holds(
-        self,
-        name: str,
-        config: Mapping[str, Any],
-        seed: int,
-        defaults: Mapping[str, Any] = MappingProxyType({}),
-        half_precision: bool | None = None,
-    ) -> bool:
+    def holds(self, name: str, config: Any, seed: int) -> bool:
         """Tells whether an interrupted run has left a part, trained in the same way.
 
         Args:
             name: of the part.
-            config: settings of its training.
+            config: settings of its training; such of a `NetworkConfig` under those of the trainer as well.
             seed: its root seed.
-            defaults: what settings are that a part of an earlier version does not name.
-            half_precision: of a network, whether its kernels are kept as float16; such a part was trained under the
-                settings of the trainer as well.
 
         Raises:
             CheckpointError: it was trained in another way.
@@ -67,27 +61,23 @@ class Target:
         part = self.checkpoint.parts.get(name)
         if part is None:
             return False
-        wanted, there = (
-            json.loads(json.dumps(dict(settings))) for settings in (config, {**defaults, **part.config})
-        )
-        others = [key for key, value in wanted.items() if there.get(key) != value]
-        if half_precision is not None:
-            others += ["half_precision"] * (half_precision != part.half_precision)
-            # A part of an earlier version does not say under which settings of the trainer it was trained.
-            asked = self.options.trainer_settings
-            known = asked if part.trainer is None else dict(part.trainer)
-            others += [
-                f"trainer.{key}" for key in sorted({*asked, *known}) if asked.get(key) != known.get(key)
-            ]
-        if not others and (part.seed, part.data_digest) == (seed, self.digest):
-            self._forget(name)  # a kill may have come between saving and forgetting
-            return True
-        remedy = "pass --overwrite instead of --resume"
-        if self.options.folder and interrupted(self.options.folder, [name]):
-            remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
-        named = f", another {' and '.join(f'`{key}`' for key in others)}" if others else ""
-        if not others and part.seed == seed:
+        # A part of an earlier version does not name settings that came later, nor those of the trainer.
+        options, defaults = self.options, asdict(type(config)())
+        wanted, there = asdict(config), {key: part.config.get(key, usual) for key, usual in defaults.items()}
+        if isinstance(config, NetworkConfig):
+            wanted["half_precision"], there["half_precision"] = options.half_precision, part.half_precision
+            if part.trainer is not None:
+                wanted |= {f"trainer.{key}": value for key, value in options.trainer_settings.items()}
+                there |= {f"trainer.{key}": value for key, value in part.trainer.items()}
+        named = f", {others}" if (others := differing(wanted, there)) else ""
+        if not named and part.seed == seed:
+            if part.data_digest == self.digest:
+                forget(options, name)  # a kill may have come between saving and forgetting
+                return True
             named = ", other maps or another class table, or maps as recorded by benchnav before 0.7"
+        remedy = "pass --overwrite instead of --resume"
+        if interrupted(options, [name]):
+            remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
             f"{part.seed} and {part.data_id}{named}. Repeat its settings, or {remedy}."
@@ -96,95 +86,96 @@ class Target:
     def add(self, name: str, part: Part) -> None:
         """Saves a trained part with the rest."""
         self.checkpoint = self.checkpoint.with_part(name, part)
-        if is_first_process():
-            self._save()
-            self._forget(name)
+        self._save()
+        forget(self.options, name)
 
     def set_pool_temperature(self, temperature: float) -> None:
         """Saves the temperature of the pool of classifiers with the rest."""
-        if temperature != self.checkpoint.pool_temperature and is_first_process():
+        if temperature != self.checkpoint.pool_temperature:
             self.checkpoint = replace(self.checkpoint, pool_temperature=temperature)
             self._save()
 
     def _save(self) -> None:
+        if not is_first_process():
+            return
         self.changed = True
         save_checkpoint(self.folder, self.checkpoint)
         size = sum(path.stat().st_size for path in self.folder.iterdir())
         parts = " and ".join(sorted(self.checkpoint.parts))
         print(f"wrote {self.folder} with {parts} ({decimal(size)})")
 
-    def _forget(self, name: str) -> None:
-        if self.options.folder and is_first_process():
-            forget(self.options.folder, name)
+
+def fresh_checkpoint(dataset: TerrainDataset, model: str = FUSED) -> Checkpoint:
+    """A checkpoint without parts, of a family of models and the classes of a dataset."""
+    return Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
 
 
 def open_target(
-    folder: Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions, overwrite: bool
+    out: str | Path, fresh: Checkpoint, parts: list[str], digest: str, options: FitOptions
 ) -> Target:
     """Opens the checkpoint that training goes into.
 
     Args:
-        folder: where it is, or will be.
+        out: folder where it is, or will be.
         fresh: without parts, of the family and classes that are to be trained.
         parts: names of the parts to train.
         digest: of the data that they are trained on.
-        options: how to train.
-        overwrite: whether what is there may be replaced.
+        options: how to train, and whether what is there may be replaced.
 
     Raises:
         CheckpointError: what is there would be lost or does not fit.
         ConfigError: the folder is something else.
     """
-    folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
-    left = interrupted(options.folder, parts) if options.folder else []
-    if left and not (options.resume or overwrite) and is_first_process():
+    folder = real_place(Path(os.path.normpath(out)))  # a/../b is b, whether or not there is an a
+    is_first, left = is_first_process(), interrupted(options, parts)
+    if left and is_first and not (options.resume or options.overwrite):
         raise CheckpointError(
             f"Expected no interrupted training in {options.folder}, got one of {' and '.join(left)}. "
             "Pass --resume to go on with it, or --overwrite to begin anew."
         )
-    checkpoint = _what_is_there(folder, fresh, overwrite)
-    trained = [name for name in checkpoint.parts if name in parts]
-    if overwrite:
+    restore(folder)
+    refuse_taken(folder, True, foreign)
+    # Whether a checkpoint can be written there shows now rather than after the training.
+    with building(folder):
+        checkpoint = existing(folder, options.overwrite) or fresh
+    if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
+        if not options.overwrite:
+            raise CheckpointError(
+                f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(checkpoint)}. "
+                "Choose another `out`, or pass --overwrite to replace it."
+            )
+        checkpoint = fresh
+    if options.overwrite:
         # Members of an ensemble stand or fall together.
-        dropped = {
-            name for name in checkpoint.parts if name in parts or (is_member(name) and CLASSIFIER in parts)
+        kept = {
+            name: part
+            for name, part in checkpoint.parts.items()
+            if name not in parts and not (is_member(name) and CLASSIFIER in parts)
         }
-        kept = {name: part for name, part in checkpoint.parts.items() if name not in dropped}
         checkpoint = replace(checkpoint, parts=kept)
-    elif trained and not options.resume and is_first_process():
-        # The processes alone are trained in a moment, and so not gone on with.
-        resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
-        raise CheckpointError(
-            f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
-            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
-            f"{resume}."
-        )
-    elif trained and not options.resume:
+    elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):
+        if is_first:
+            # The processes alone are trained in a moment, and so not gone on with.
+            resume = (
+                ", or --resume to go on with what an interrupted training has left" if options.folder else ""
+            )
+            raise CheckpointError(
+                f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
+                f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
+                f"{resume}."
+            )
         checkpoint = fresh
     return Target(folder, checkpoint, digest, options)
 
 
-def _what_is_there(folder: Path, fresh: Checkpoint, overwrite: bool) -> Checkpoint:
-    restore(folder)
-    refuse_taken(folder, True, foreign)
-    if not folder.exists():
-        # Whether a checkpoint can be written there shows now rather than after the training.
-        with building(folder):
-            return fresh
+def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
+    """The checkpoint in a folder; None where there is none, or a damaged one that may be replaced."""
     try:
-        there = load_checkpoint(folder)
+        return load_checkpoint(folder) if (folder / CONFIG).is_file() else None
     except CheckpointError:
         if overwrite:
-            return fresh
+            return None
         raise
-    if (there.model, there.class_names) == (fresh.model, fresh.class_names):
-        return there
-    if overwrite:
-        return fresh
-    raise CheckpointError(
-        f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(there)}. "
-        "Choose another `out`, or pass --overwrite to replace it."
-    )
 
 
 def _describe(checkpoint: Checkpoint) -> str:

@@ -14,16 +14,18 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
 from benchnav.models.nets.network import build_network
-from benchnav.models.training.callbacks import KeepBest
-from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.networks import fit_network, measure
+from benchnav.models.nets.trainable import MapScale
+from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.networks import fit_network
 
 CPU = FitOptions(device="cpu", trainer={"precision": "32-true"})
 MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
 
 
 def build(seed: int = 0, **settings: object) -> TerrainClassifier:
-    return TerrainClassifier(ClassifierConfig(**settings), 4, MEAN, STD, seed).eval()  # type: ignore[arg-type]
+    return TerrainClassifier(
+        ClassifierConfig(**settings), 4, MapScale(MEAN, STD, torch.ones(())), seed
+    ).eval()  # type: ignore[arg-type]
 
 
 def image(height: int, width: int, batch: int = 1) -> torch.Tensor:
@@ -210,7 +212,7 @@ def test_the_best_epoch_is_kept() -> None:
         best.on_validation_epoch_end(trainer, model)  # type: ignore[arg-type]
     best.on_fit_end(trainer, model)  # type: ignore[arg-type]
     assert model.weight.item() == 1
-    assert best.metrics == {"valid_loss": 1.0, "epoch": 2}
+    assert best.best["metrics"] == {"valid_loss": 1.0, "epoch": 2}
     assert trainer.callback_metrics == {"valid_loss": 1.0, "epoch": 2}
 
 
@@ -290,7 +292,7 @@ def test_mean_iou_is_over_the_classes_that_occur_in_truth() -> None:
     found[:4], found[500:502] = torch.tensor([2, 3, 4, 5]), 0
     ious = (496 / 502, 498 / 500)
     assert float(MulticlassJaccardIndex(6)(found, class_id)) == pytest.approx(sum(ious) / 6)
-    metric = MeanIoU(6, ignore_index=UNLABELLED)
+    metric = MeanIoU(6)
     unknown = torch.full((50,), UNLABELLED)
     for some, true in ((found, class_id), (torch.full((50,), 4), unknown)):
         metric.update(some, true)
@@ -323,8 +325,8 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
         def forward(self, seen: torch.Tensor) -> torch.Tensor:
             return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
 
-    colour = Colour(ClassifierConfig(encoder="mobilenet_v2"), 4, torch.zeros(3), torch.ones(3)).eval()
-    found, wanted = (measure(colour, maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
+    colour = Colour(ClassifierConfig(encoder="mobilenet_v2"), 4).eval()
+    found, wanted = (colour.measure(maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     assert 0 < found["valid_accuracy"] < 1
 
@@ -345,7 +347,7 @@ def test_losses_of_validation_are_weighed_by_labelled_cells() -> None:
         def chunks(self, device: torch.device) -> list[tuple[list[int], dict[str, torch.Tensor]]]:
             return [([place], batch) for place, batch in enumerate(batches)]
 
-    found = measure(model, Maps())  # type: ignore[arg-type]
+    found = model.measure(Maps())  # type: ignore[arg-type]
     assert found["valid_loss"] == pytest.approx(float(wanted), rel=1e-5)
     trainer = lightning.Trainer(
         accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,

@@ -1,4 +1,5 @@
 import json
+import re
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,12 +30,12 @@ from benchnav.models.nets.mdn import (
     MixtureDensityNetwork,
     censored_nll,
 )
+from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import networks
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions
-from benchnav.models.training.networks import fit_network, measure
+from benchnav.models.training.fit import FitOptions, KeepBest
+from benchnav.models.training.networks import fit_network
 from tests.factories import normal
 from tests.models.support import make_terrain
 
@@ -45,8 +46,8 @@ QUICK = ["--mdn.encoder", "mobilenet_v2", "--mdn.batch_size", "5", "--trainer.pr
 
 def build(seed: int = 0, **changes: object) -> MixtureDensityNetwork:
     config = replace(SMALL, **changes)  # type: ignore[arg-type]
-    mean, std, scale = torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30]), torch.tensor(10.0)
-    return MixtureDensityNetwork(config, mean, std, scale, seed).eval()
+    scale = MapScale(torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30]), torch.tensor(10.0))
+    return MixtureDensityNetwork(config, 0, scale, seed).eval()
 
 
 def observe(batch: int, height: int, width: int) -> Observation:
@@ -363,9 +364,9 @@ def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: Ter
     for name, value in as_stored(whole.state_dict(), True).items():
         assert torch.equal(value, network.state_dict()[name]), name
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
-    assert measure(network, valid).items() <= metrics.items()
+    assert network.measure(valid).items() <= metrics.items()
     # Measured in the same way as in training, of which the rounding is all that changes it.
-    for name, value in measure(whole, valid).items():
+    for name, value in whole.measure(valid).items():
         assert value == pytest.approx(before[name], rel=1e-4), name
         assert value != metrics[name]
 
@@ -426,7 +427,7 @@ def test_a_checkpoint_gives_the_network_back() -> None:
     first, second = MixtureDensityModel(network).predict(seen), again.predict(seen)
     assert isinstance(again, MixtureDensityModel)
     assert not network.training
-    assert not MixtureDensityNetwork.from_tensors(asdict(network.config), network.state_dict()).training
+    assert not MixtureDensityNetwork.from_tensors(asdict(network.config), 0, network.state_dict()).training
     for name in ("weights", "means", "stds"):
         assert torch.equal(getattr(first, name), getattr(second, name))
 
@@ -434,7 +435,7 @@ def test_a_checkpoint_gives_the_network_back() -> None:
 def test_a_checkpoint_of_a_pretrained_network_downloads_nothing() -> None:
     network = build()
     settings = {**asdict(network.config), "pretrained": True}
-    again = MixtureDensityNetwork.from_tensors(settings, network.state_dict())
+    again = MixtureDensityNetwork.from_tensors(settings, 0, network.state_dict())
     assert not again.ground.config.pretrained
 
 
@@ -461,7 +462,7 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     where = ["mdn", "--data", dataset.path, "--out", "mine", *QUICK]
     assert call(monkeypatch, *where, "--trainer.max_epochs", 2, "--seed", 7, "--mdn.components", 2) == 0
     out, err = capfd.readouterr()
-    assert "validation RMSE" in out
+    assert re.search(r"validation loss -?[\d.]+, rmse [\d.]+", out)
     assert "wrote mine with mdn" in out
     assert [line.split(",")[0] for line in err.strip().splitlines()] == ["mdn: epoch 1/2", "mdn: epoch 2/2"]
     there = load_checkpoint("mine")
@@ -471,9 +472,9 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     assert (part.config["max_epochs"], part.config["components"], part.half_precision) == (2, 2, True)
     assert load_model("mine").predict(observe(1, 32, 32)).weights.shape == (1, 2, 32, 32)  # type: ignore[union-attr]
     # What it says of itself was measured on what is kept.
-    kept = MixtureDensityNetwork.from_tensors(part.config, part.tensors)
+    kept = MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors)
     valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
-    assert measure(kept, valid).items() <= dict(part.metrics).items()
+    assert kept.measure(valid).items() <= dict(part.metrics).items()
 
     assert call(monkeypatch, "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0
     assert "test/std" in capfd.readouterr().out

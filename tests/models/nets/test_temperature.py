@@ -1,11 +1,9 @@
-from collections.abc import Sequence
-
 import pytest
 import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.fused import sharpen
 from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
-from benchnav.models.probabilities import sharpen
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 from benchnav.models.training.data import MapData, MapDataset
 
@@ -82,6 +80,15 @@ class Witness(torch.nn.Module):
         return self.boldness * evidence / self.temperature
 
 
+class Held(MapDataset):
+    """Maps of no dataset."""
+
+    shape = (16, 16)  # type: ignore[assignment]
+
+    def __init__(self, rgb: torch.Tensor, class_id: torch.Tensor) -> None:
+        self._memory, self._maps = {"rgb": rgb, "class_id": class_id}, len(rgb)
+
+
 def witnessed(maps: int, seed: int) -> MapDataset:
     """Maps of single cells' classes; each channel has noisy evidence of its own, in six steps a class."""
     generator = torch.Generator().manual_seed(seed)
@@ -90,12 +97,7 @@ def witnessed(maps: int, seed: int) -> MapDataset:
     noise = torch.randn(maps, 3, CLASSES, 16, 16, generator=generator)
     steps = (2 + STRENGTH * (shown - 0.2) + noise).round().clamp(0, 5).long()
     rgb = steps[:, :, 0] + 6 * steps[:, :, 1] + 36 * steps[:, :, 2]
-    fields = {"rgb": rgb.to(torch.uint8), "class_id": class_id.to(torch.uint8)}
-
-    def read(indices: Sequence[int]) -> dict[str, torch.Tensor]:
-        return {name: values[list(indices)] for name, values in fields.items()}
-
-    return MapDataset(read, len(rgb), (rgb.shape[-2], rgb.shape[-1]))
+    return Held(rgb.to(torch.uint8), class_id.to(torch.uint8))
 
 
 def ece(probabilities: torch.Tensor, class_id: torch.Tensor) -> float:

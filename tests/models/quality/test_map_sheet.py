@@ -10,6 +10,7 @@ from benchnav.datagen.preview import class_colours
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.map_sheet import map_sheet_figure, read_sheet, shared_scales
 from benchnav.models.quality.scores import mutual_information, predictive_entropy
+from tests.factories import draw
 from tests.models.stub import ColourModel
 
 
@@ -39,7 +40,7 @@ def test_a_sheet_holds_truth_prediction_error_and_uncertainty(dataset: TerrainDa
     assert set(layers) == {*expected, "width"}
     parameters = (mixture.weights, mixture.means, mixture.stds)
     corner = TraversabilityMixture(*(values[..., :4, :4] for values in parameters))
-    drawn = corner.sample(4000, torch.Generator().manual_seed(0))
+    drawn = draw(corner, 4000, torch.Generator().manual_seed(0))
     ends = torch.quantile(drawn, torch.tensor([0.05, 0.95]), dim=0)
     np.testing.assert_allclose(layers["width"][:, :4, :4], (ends[1] - ends[0]).numpy(), atol=0.06)
 

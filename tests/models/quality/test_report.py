@@ -8,7 +8,6 @@ import pytest
 from benchnav.core.tables import to_terminal
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.predictor import Oracle
-from benchnav.models.quality.command import _figures
 from benchnav.models.quality.measure import Quality, evaluate
 from benchnav.models.quality.report import (
     COLUMNS,
@@ -16,6 +15,7 @@ from benchnav.models.quality.report import (
     caption,
     numbers,
     quality_csv,
+    quality_figures,
     quality_json,
     quality_markdown,
     quality_table,
@@ -137,10 +137,7 @@ def test_every_column_of_the_page_is_explained_and_no_other(
 
 
 def test_every_figure_has_a_caption(dataset: TerrainDataset, qualities: Qualities) -> None:
-    named = [
-        name
-        for name, _ in _figures("m on d", ColourModel(), dataset, dict(evaluate(ColourModel(), dataset)), 1)
-    ]
+    named, _ = quality_figures("m on d", ColourModel(), dataset, dict(evaluate(ColourModel(), dataset)), 1)
     assert {"confusion", "reliability", "pit", "latent", "maps-test-std", "maps-test-hs"} == set(named)
     captions = [caption(name, dataset.splits) for name in (*named, "severity")]
     assert len({title for title, _ in captions}) == len(captions)

@@ -323,7 +323,7 @@ def test_the_data_change_the_kernel_from_its_start_within_its_bounds() -> None:
     config = LatentGPConfig(**settings)  # type: ignore[arg-type]
     sums = make_sums(2_000)
     for model, limits in (
-        (LatentGPs(config, 3, sums.steepest_deg), {"length": (3.5, 3.5), "spread": (0.605, 0.605)}),
+        (LatentGPs(config, sums.steepest_deg), {"length": (3.5, 3.5), "spread": (0.605, 0.605)}),
         (fit_gps(config, sums), {"length": (3.0, 4.0), "spread": (0.6, 0.61)}),
     ):
         kernel = model.gp.matern
@@ -397,9 +397,17 @@ def test_the_trainer_counts_every_step_once() -> None:
     assert model.trainer.global_step == 10
 
 
+def test_each_epoch_is_told_with_its_loss(capfd: pytest.CaptureFixture[str]) -> None:
+    fit_gps(LatentGPConfig(epochs=2, epoch_steps=5), make_sums(50))
+    lines = capfd.readouterr().err.splitlines()
+    losses = [float(line.partition(f"gp: epoch {epoch}/2, loss ")[2]) for epoch, line in enumerate(lines, 1)]
+    assert len(losses) == 2
+    assert losses[1] < losses[0]
+
+
 def test_gps_that_know_each_class_own_reach_lay_their_points_there() -> None:
     cells = make_cells(200)
-    model = LatentGPs(LatentGPConfig(inducing_points=3), 3, torch.tensor([20.0, 1.0, 90.0]))
+    model = LatentGPs(LatentGPConfig(inducing_points=3), torch.tensor([20.0, 1.0, 90.0]))
     points = 10 * model.gp.variational_strategy.inducing_points[..., 0]
     assert points.tolist() == [[0, 10, 20], [0, 2.5, 5], [0, 45, 90]]
     assert model.steepest_deg == [20, 1, 90]
@@ -408,7 +416,7 @@ def test_gps_that_know_each_class_own_reach_lay_their_points_there() -> None:
 
 
 def test_the_parameters_in_a_checkpoint_give_the_same_functions(model: LatentGPs) -> None:
-    rebuilt = LatentGPs(model.config, 3, torch.tensor(model.steepest_deg), model.soft)
+    rebuilt = LatentGPs(model.config, torch.tensor(model.steepest_deg), model.soft)
     kept = {n.removeprefix("state."): v for n, v in model.to_tensors().items() if n.startswith("state.")}
     rebuilt.load_state_dict(kept)
     assert torch.equal(rebuilt.tabulate().mean, model.tabulate().mean)
@@ -462,7 +470,7 @@ def errors_of_lookup(model: LatentGPs, slopes: torch.Tensor) -> tuple[torch.Tens
     """Largest errors of the table's mean and standard deviation at some slopes, each of shape [C]."""
     mean, std = model.tabulate().lookup(slopes[None].double())
     with torch.no_grad():
-        exact = model(slopes.expand(model.class_count, -1))
+        exact = model(slopes.expand(len(model.steepest_deg), -1))
         total = (exact.variance + model.likelihood.noise).sqrt()
     return (mean[:, 0] - exact.mean).abs().amax(-1), (std[:, 0] - total).abs().amax(-1)
 
@@ -476,7 +484,7 @@ def test_lookup_of_fitted_tables_is_within_the_bound_of_its_error(model: LatentG
 
 def test_the_bound_of_the_tables_error_holds_for_the_worst_gps_and_is_not_idle() -> None:
     # Inducing points far closer than the length scale, so that the posterior can be made to bend at will.
-    model = LatentGPs(LatentGPConfig(inducing_points=40), 3, torch.full((3,), 10.0))
+    model = LatentGPs(LatentGPConfig(inducing_points=40), torch.full((3,), 10.0))
     model.gp.matern.base_kernel.lengthscale = 0.2
     model.gp.matern.outputscale = torch.tensor([1.0, 0.2, 1.0])
     model.likelihood.noise = torch.tensor([[0.2], [0.05], [0.05]]) ** 2

@@ -101,10 +101,8 @@ def test_a_bad_csv_is_refused_in_one_line(tmp_path: Path, text: str | bytes, why
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="not there"):
+    with pytest.raises(DatasetError, match="No such file"):
         read_slip_logs(tmp_path / "none.csv")
-    with pytest.raises(DatasetError, match=r"ends in \.csv, \.tsv, .*\.parquet"):
-        read_slip_logs(write(tmp_path, GOOD, "log.txt"))
     with pytest.raises(DatasetError, match="PARQUET table"):
         read_slip_logs(write(tmp_path, GOOD, "log.parquet"))
 

@@ -101,8 +101,8 @@ def test_loaders_give_fixed_keys_and_leave_the_global_generator_alone(dataset: T
     assert torch.equal(valid, data.valid.read(range(len(data.valid)))["class_id"])
 
 
-def test_colour_statistics_are_those_of_the_training_maps(dataset: TerrainDataset) -> None:
-    mean, std = MapData(dataset, 4, seed=0).colour_statistics()
+def test_the_scale_of_colours_is_that_of_the_training_maps(dataset: TerrainDataset) -> None:
+    mean, std, _ = MapData(dataset, 4, seed=0).scale()
     rgb = dataset.read("train", fields=["rgb"])["rgb"].astype(float)
     np.testing.assert_allclose(mean, rgb.mean((0, 2, 3)), rtol=1e-5)
     np.testing.assert_allclose(std, rgb.std((0, 2, 3)), rtol=1e-5)

@@ -25,9 +25,8 @@ from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.temperature import fit_temperature, sample_logits
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
-from benchnav.models.training.callbacks import KeepBest
 from benchnav.models.training.data import MapData
-from benchnav.models.training.fit import FitOptions, default_precision, fit
+from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
 from benchnav.models.training.networks import check_network, fit_network
 
 EXACT = {"precision": "32-true"}
@@ -147,7 +146,7 @@ def test_settings_of_the_optimiser_reach_it(dataset: TerrainDataset) -> None:
 
     data = MapData(dataset, 4, 0)
     config = replace(SMALL, weight_decay=0.123, learning_rate=0.045)
-    model = TerrainClassifier(config, 10, *data.colour_statistics())
+    model = TerrainClassifier(config, 10, data.scale())
     options = FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(0.123, 0.045)]
@@ -316,7 +315,7 @@ def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
         device="cpu", trainer={**EXACT, "limit_train_batches": 1, "accumulate_grad_batches": 2}
     )
     data = MapData(dataset, 4, 0)
-    model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+    model = TerrainClassifier(SMALL, 10, data.scale())
     fit(model, "x", options, {}, [KeepBest(), Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(1, 2)]
     with pytest.raises(ConfigError, match="Lightning takes"):
@@ -347,7 +346,7 @@ def test_the_precision_is_that_of_what_is_trained_on(
     asked: list[str] = []
     monkeypatch.setattr(fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed")
     data = MapData(dataset, 4, 0)
-    model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+    model = TerrainClassifier(SMALL, 10, data.scale())
     options = FitOptions(device="cpu", trainer={"limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert asked == ["cpu"]
@@ -364,7 +363,7 @@ def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) ->
 
     data = MapData(dataset, 4, 0)
     for settings in ({}, {"gradient_clip_val": 1e-3}):
-        model = TerrainClassifier(SMALL, 10, *data.colour_statistics())
+        model = TerrainClassifier(SMALL, 10, data.scale())
         trainer = {**EXACT, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
         fit(
             model,

@@ -1,4 +1,4 @@
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -13,11 +13,22 @@ from benchnav.models.checkpoint import (
     member_names,
     save_checkpoint,
 )
-from benchnav.models.config import ClassifierConfig
+from benchnav.models.config import ClassifierConfig, NetworkConfig
 from benchnav.models.predictor import find_checkpoint
 from benchnav.models.training import target as module
 from benchnav.models.training.fit import STATE, FitOptions
 from benchnav.models.training.target import Target, open_target
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    width: int = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetConfig(NetworkConfig):
+    width: int = 3
+
 
 FRESH = Checkpoint(class_names=("a", "b"))
 PART = Part(
@@ -33,8 +44,8 @@ def there(folder: Path, *parts: str) -> Path:
 def start(
     folder: Path, parts: list[str], resume: bool = False, overwrite: bool = False, fresh: Checkpoint = FRESH
 ) -> Target:
-    options = FitOptions(folder=folder.with_suffix(".training"), resume=resume)
-    return open_target(folder, fresh, parts, "d", options, overwrite)
+    options = FitOptions(folder=folder.with_suffix(".training"), resume=resume, overwrite=overwrite)
+    return open_target(folder, fresh, parts, "d", options)
 
 
 def test_members_are_counted_from_the_plain_name() -> None:
@@ -81,15 +92,15 @@ def test_resuming_keeps_parts_of_the_same_settings_seed_and_maps(tmp_path: Path)
     state = tmp_path / "m.training" / "gp" / STATE  # of a kill after the part was saved
     state.parent.mkdir(parents=True)
     state.touch()
-    assert target.holds("gp", {"width": 3}, 0)
+    assert target.holds("gp", Config(), 0)
     assert not state.exists()
-    assert not target.holds("classifier", {"width": 3}, 0)
-    for config, seed in (({"width": 4}, 0), ({"width": 3}, 1)):
+    assert not target.holds("classifier", NetConfig(), 0)
+    for config, seed in ((Config(width=4), 0), (Config(), 1)):
         with pytest.raises(CheckpointError, match="Repeat its settings"):
             target.holds("gp", config, seed)
     target.digest = "other"
     with pytest.raises(CheckpointError, match="Repeat its settings"):
-        target.holds("gp", {"width": 3}, 0)
+        target.holds("gp", Config(), 0)
 
 
 def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(tmp_path: Path) -> None:
@@ -97,12 +108,10 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(tmp_pat
     asked = FitOptions(device="cpu", trainer=trainer)
     kept = replace(PART, trainer={**trainer, "devices": 1}, half_precision=True)
 
-    def holds(part: Part, half_precision: bool | None = True, **changed: object) -> bool:
+    def holds(part: Part, half_precision: bool = True, kind: type = NetConfig, **changed: object) -> bool:
         checkpoint = replace(FRESH, parts={"classifier": part})
-        options = replace(asked, trainer={**trainer, **changed})
-        return Target(tmp_path / "m", checkpoint, "d", options).holds(
-            "classifier", {"width": 3}, 0, half_precision=half_precision
-        )
+        options = replace(asked, trainer={**trainer, **changed}, half_precision=half_precision)
+        return Target(tmp_path / "m", checkpoint, "d", options).holds("classifier", kind(), 0)
 
     assert holds(kept)
     assert holds(kept, log_every_n_steps=7)
@@ -113,20 +122,20 @@ def test_a_network_is_kept_if_the_trainer_and_the_precision_are_the_same(tmp_pat
         holds(kept, limit_train_batches=2)
     with pytest.raises(CheckpointError, match=r"another `half_precision`\. Repeat"):
         holds(kept, half_precision=False)
-    assert holds(kept, None, gradient_clip_val=0.6)  # processes, which no such trainer trains
+    assert holds(kept, False, Config, gradient_clip_val=0.6)  # processes, which no such trainer trains
 
 
 def test_a_training_that_was_to_replace_a_part_is_gone_on_with_when_asked(tmp_path: Path) -> None:
     folder = there(tmp_path / "m", "classifier")
     with pytest.raises(CheckpointError, match=r"pass --overwrite instead of --resume\."):
-        start(folder, ["classifier"], resume=True).holds("classifier", {"width": 4}, 0)
+        start(folder, ["classifier"], resume=True).holds("classifier", NetConfig(width=4), 0)
     state = tmp_path / "m.training" / "classifier" / STATE
     state.parent.mkdir(parents=True)
     state.write_text("what a kill has left")
     with pytest.raises(CheckpointError, match="pass --overwrite with --resume to go on"):
-        start(folder, ["classifier"], resume=True).holds("classifier", {"width": 4}, 0)
+        start(folder, ["classifier"], resume=True).holds("classifier", NetConfig(width=4), 0)
     target = start(folder, ["classifier"], resume=True, overwrite=True)
-    assert not target.holds("classifier", {"width": 4}, 0)
+    assert not target.holds("classifier", NetConfig(width=4), 0)
     assert state.exists()
 
 
@@ -160,7 +169,7 @@ def test_processes_beside_the_first_refuse_and_write_nothing(
     before = (folder / "config.json").read_bytes()
     monkeypatch.setattr(module, "is_first_process", lambda: False)
     target = start(folder, ["gp"])  # as the first process left it, which trains the rest with this one
-    assert not target.holds("gp", {"width": 3}, 0)
+    assert not target.holds("gp", Config(), 0)
     target.add("classifier", PART)
     assert (folder / "config.json").read_bytes() == before
 
@@ -170,8 +179,7 @@ def test_a_part_of_an_earlier_version_has_the_defaults_of_settings_that_came_lat
     shipped = load_checkpoint(find_checkpoint("paper-v1"))
     classifier = shipped.parts["classifier"]
     target = Target(tmp_path / "mine", shipped, classifier.data_digest, FitOptions())
-    defaults = asdict(ClassifierConfig())
     assert "encoder_depth" not in classifier.config
-    assert target.holds("classifier", defaults, 0, defaults)
+    assert target.holds("classifier", ClassifierConfig(), 0)
     with pytest.raises(CheckpointError, match="got others"):
-        target.holds("classifier", asdict(ClassifierConfig(encoder_depth=3)), 0, defaults)
+        target.holds("classifier", ClassifierConfig(encoder_depth=3), 0)
