@@ -84,6 +84,14 @@ def quantise(values: np.ndarray, bits: int) -> np.ndarray:
     return steps
 
 
+def stored_arrays(
+    fields: Mapping[str, Field], height: int, width: int
+) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Dtype and shape of a map's entry in each array that is stored of a split: its fields', and of their digests."""
+    arrays = {name: (field.dtype, field.entry_shape(height, width)) for name, field in fields.items()}
+    return {**arrays, ENTRY_DIGESTS: ("|u1", (len(fields), DIGEST_BYTES))}
+
+
 def fields_in(maps: Mapping[str, np.ndarray]) -> dict[str, Field]:
     """The fields that maps have, in the order of being stored."""
     return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
@@ -107,22 +115,21 @@ def entry_digests(maps: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -
     return digests.reshape(-1, len(fields), DIGEST_BYTES)
 
 
-class SplitDigest:
-    """The digest of a split: SHA-256 over its field table and its entries' digests, map by map."""
+def split_digest(digests: np.ndarray, height: int, width: int, fields: Mapping[str, Field]) -> str:
+    """The digest of a split: SHA-256 over its field table and its entries' digests, map by map.
 
-    def __init__(self, maps: int, height: int, width: int, fields: Mapping[str, Field]) -> None:
-        """Starts the digest of a split of `maps` maps of height × width cells with some fields."""
-        shapes = {name: [maps, *field.entry_shape(height, width)] for name, field in fields.items()}
-        table = [[name, field.dtype, shapes[name]] for name, field in fields.items()]
-        self._hash = hashlib.sha256(json.dumps(table, separators=(",", ":")).encode())
-
-    def update(self, digests: np.ndarray) -> None:
-        """Adds the next maps' `entry_digests`, shape [B, F, 32]."""
-        self._hash.update(digests.tobytes())
-
-    def hexdigest(self) -> str:
-        """The digest of the maps so far."""
-        return self._hash.hexdigest()
+    Args:
+        digests: of all maps' entries, from `entry_digests`, shape [N, F, 32].
+        height: rows of a map.
+        width: columns of a map.
+        fields: the F fields.
+    """
+    table = [
+        [name, field.dtype, [len(digests), *field.entry_shape(height, width)]]
+        for name, field in fields.items()
+    ]
+    text = json.dumps(table, separators=(",", ":")).encode()
+    return hashlib.sha256(text + digests.tobytes()).hexdigest()
 
 
 def version_of(

@@ -9,7 +9,7 @@ it replaces a finished one it is made in such a folder too.
 import platform
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from benchnav.datagen.files.hdf5 import (
     recipe_entry,
     whole,
 )
-from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset
+from benchnav.datagen.files.reader import FOLDER_MANIFEST, read_manifest
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
 
@@ -113,11 +113,9 @@ def create(
                 done += file.maps
                 yield done, total
         except ConfigError:
-            if folder != path and done > begun:  # the recipe cannot be met: there is nothing to go on to
+            # Where this run made maps the recipe cannot be met, and there is nothing to go on to.
+            if folder != path and (done > begun or not any(folder.iterdir())):
                 shutil.rmtree(folder, ignore_errors=True)
-            elif folder != path:
-                with suppress(OSError):  # it holds what an earlier run has made
-                    folder.rmdir()
             raise
         if shard is None or not _missing(folder, recipe, shards, (), may_replace=overwrite):
             files = {
@@ -156,16 +154,13 @@ def make(recipe: Recipe, shard: ShardFile) -> bytes:
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
     """Tells whether a file is this shard of this recipe, made by this version."""
     try:
-        manifest = TerrainDataset(path).manifest
+        manifest = read_manifest(path)
     except DatasetError:
         return False
-    entry = {
-        name: value for name, value in manifest["splits"].get(shard.split, {}).items() if name != "digest"
-    }
-    return (manifest["recipes"], manifest["generator"]["version"], entry) == (
-        [recipe.to_dict()],
-        benchnav.__version__,
-        recipe_entry(recipe, shard.split, shard.first, shard.stop),
+    entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
+    made_by = manifest["recipes"], manifest["generator"]["version"]
+    return made_by == ([recipe.to_dict()], benchnav.__version__) and (
+        entry.items() <= manifest["splits"].get(shard.split, {}).items()
     )
 
 

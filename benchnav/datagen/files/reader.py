@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
-from itertools import accumulate
+from itertools import accumulate, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -75,7 +75,6 @@ class TerrainDataset:
         self.path, self.keep_open = Path(path), keep_open
         self.manifest: dict[str, Any] = read_manifest(self.path)
         self._opened: tuple[int, dict[Path, tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]]] = (0, {})
-        self._pieces: dict[str, list[Piece]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Leaves out the open files, so that it may be sent to other processes."""
@@ -122,7 +121,11 @@ class TerrainDataset:
             DatasetError: there is no such split.
         """
         self.map_count(split)
-        known = all(_truth(part) == "generated" for part in self.splits[split]["parts"])
+        # Files before 1.3 do not say it of what they import.
+        known = all(
+            "recipe" in part or part["source"].get("truth") == "generated"
+            for part in self.splits[split]["parts"]
+        )
         return "generated" if known else "unknown"
 
     def about_digest(self, split: str) -> str:
@@ -226,44 +229,53 @@ class TerrainDataset:
 
     def pieces(self, split: str) -> list[Piece]:
         """The files that hold a split's maps, in their order."""
-        count = self.map_count(split)
-        if split not in self._pieces:
-            files = [
-                (shard["file"], shard["maps"]) for shard in self.manifest.get("shards", {}).get(split, ())
-            ]
-            firsts = accumulate((maps for _, maps in files), initial=0)
-            self._pieces[split] = [
-                Piece(path=self.path / name, first=first, maps=maps)
-                for (name, maps), first in zip(files, firsts, strict=False)
-            ] or [Piece(path=self.path, first=0, maps=count)]
+        self.map_count(split)
         return self._pieces[split]
+
+    @cached_property
+    def _pieces(self) -> dict[str, list[Piece]]:
+        pieces = {}
+        for split, entry in self.splits.items():
+            shards = self.manifest.get("shards", {}).get(split) or [{"file": "", "maps": entry["maps"]}]
+            firsts = accumulate((shard["maps"] for shard in shards), initial=0)
+            pieces[split] = [
+                Piece(path=self.path / shard["file"], first=first, maps=shard["maps"])
+                for shard, first in zip(shards, firsts, strict=False)
+            ]
+        return pieces
+
+    @cached_property
+    def files(self) -> set[Path]:
+        """The files that hold maps."""
+        return {piece.path for pieces in self._pieces.values() for piece in pieces}
 
     def _read(self, split: str, names: Sequence[str], indices: Sequence[int]) -> Maps:
         """Reads maps run by run: those that follow one another in a file together."""
-        pieces, runs, place = self.pieces(split), list[Maps](), 0
-        while place < len(indices):
-            index, start = indices[place], place
-            piece = pieces[bisect_right(pieces, index, key=_first) - 1]
-            end = min(len(indices), place + piece.first + piece.maps - index)
-            while place < end and indices[place] == index + place - start:
-                place += 1
-            first = index - piece.first
-            runs.append(self._read_run(split, piece, names, slice(first, first + place - start)))
-        if len(runs) == 1:
-            return runs[0]
-        empty = [{name: np.empty((0, *self._shapes[name][1]), self._shapes[name][0]) for name in names}]
-        return {name: np.concatenate([run[name] for run in runs or empty]) for name in names}
+        pieces = self.pieces(split)
+        firsts = [piece.first for piece in pieces]
+
+        def run_of(item: tuple[int, int]) -> tuple[int, int]:
+            place, index = item
+            return bisect_right(firsts, index) - 1, index - place
+
+        runs = []
+        for (number, _), items in groupby(enumerate(indices), run_of):
+            within = [index - firsts[number] for _, index in items]
+            runs.append(self._read_run(split, pieces[number], names, slice(within[0], within[-1] + 1)))
+        if not runs:
+            return self._read_run(split, pieces[0], names, slice(0, 0))
+        return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
 
     def _read_run(self, split: str, piece: Piece, names: Sequence[str], which: slice) -> Maps:
         file, arrays = self._open(piece.path)
-        read: Maps = {}
+        read, most = Maps(), len(self.recipe.classes) - 1
         try:
             for name in names:
                 if (split, name) not in arrays:
-                    arrays[split, name] = self._array(file, split, name, piece.maps)
+                    arrays[split, name] = self.stored_array(file, split, name, piece.maps)
                 read[name] = _values(arrays[split, name], which)
-                if name == "class_id":
-                    self._check_classes(read[name])
+                if name == "class_id" and ((read[name] > most) & (read[name] != schema.UNLABELLED)).any():
+                    raise ValueError(f"it has classes beyond {most}")
         except READ_ERRORS as error:
             raise damage(piece.path, split, name, error) from error
         finally:
@@ -284,26 +296,13 @@ class TerrainDataset:
             opened[path] = open_file(path), {}
         return opened[path]
 
-    @cached_property
-    def _shapes(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """Dtype and shape of a map's entry in each stored array."""
-        shapes = {
-            name: (field.dtype, field.entry_shape(*self.grid.shape)) for name, field in self.fields.items()
-        }
-        return {**shapes, schema.ENTRY_DIGESTS: ("|u1", (len(self.fields), schema.DIGEST_BYTES))}
-
-    def _array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
-        """A stored array; refuses, by a ValueError, one that is not what the manifest says."""
-        array, (kind, entry) = file[split][name], self._shapes[name]
+    def stored_array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
+        """An array of so many maps in a file; refuses, by a ValueError, one that is not what the manifest says."""
+        array = file[split][name]
+        kind, entry = schema.stored_arrays(self.fields, *self.grid.shape)[name]
         if (array.dtype.str, array.shape) != (kind, (maps, *entry)):
             raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {[maps, *entry]}")
         return array
-
-    def _check_classes(self, found: np.ndarray) -> None:
-        """Refuses, by a ValueError, classes that the table lacks."""
-        most = len(self.recipe.classes) - 1
-        if found.max() > most and ((found > most) & (found != schema.UNLABELLED)).any():
-            raise ValueError(f"it has classes beyond {most}")
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
@@ -400,15 +399,6 @@ def _manifest_text(path: Path) -> str | bytes:
         return file[schema.MANIFEST][()]
 
 
-def _truth(part: dict[str, Any]) -> str:
-    """Whether the truth of a part is known; files before 1.3 do not say it of what they import."""
-    return "generated" if "recipe" in part else part["source"].get("truth", "unknown")
-
-
-def _first(piece: Piece) -> int:
-    return piece.first
-
-
 def dataset_folders() -> list[Path]:
     """Where datasets are looked for by id: `datasets/` here, and the shipped ones."""
     here, shipped = Path("datasets"), shipped_folder("datasets")
@@ -432,11 +422,6 @@ def find_dataset(source: str | Path) -> Path:
         for name in (f"{source}.h5", f"{source}", f"{source}-test.h5"):
             if is_dataset(folder / name):
                 return folder / name
-    if Path(source).suffix == ".h5":
-        raise DatasetError(
-            f"Expected a dataset, got {str(source)!r}, which is not there. "
-            "Make one with `benchnav-datagen create`."
-        )
     raise DatasetError(
         f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
         f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."
