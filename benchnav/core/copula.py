@@ -11,7 +11,7 @@ Batched NumPy in float64, the same on every machine. Letters in shapes: B fields
 import numpy as np
 
 from benchnav.core import rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 
 LONGEST_CORRELATION = 1 / 4  # of a map's shorter side, so that the torus it is made on does not show
 
@@ -35,11 +35,11 @@ def correlated_normal(
         ConfigError: ℓ is out of range.
     """
     height, width = shape
-    if not 0 <= correlation_cells <= LONGEST_CORRELATION * min(shape):
-        raise ConfigError(
-            "Expected a correlation length of at most a quarter of the map's shorter side, "
-            f"{LONGEST_CORRELATION * min(shape):g} cells, got {correlation_cells:g} cells."
-        )
+    expect(
+        0 <= correlation_cells <= LONGEST_CORRELATION * min(shape),
+        "a correlation length of at most a quarter of the map's shorter side, "
+        f"{LONGEST_CORRELATION * min(shape):g} cells, got {correlation_cells:g} cells.",
+    )
     white = rng.normal(key, indices, (2 * height, 2 * width))
     if correlation_cells == 0:
         return white[:, :height, :width].copy()

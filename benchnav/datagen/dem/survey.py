@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.datagen.dem.raster import Lattice, Layer, Raster, opened
+from benchnav.core.errors import DatasetError, expect
+from benchnav.datagen.dem.raster import Lattice, Layer, opened
 from benchnav.datagen.dem.tiling import Run, Tiling, cut
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
@@ -53,17 +53,16 @@ class Rasters:
 
     def __post_init__(self) -> None:
         """Refuses what does not go together."""
-        if self.class_ids is not None and not self.classes:
-            raise ConfigError(
-                "Expected `classes` with `class_ids`, got none. Pass the raster they belong to."
-            )
-        if self.classes and self.random_classes:
-            raise ConfigError("Expected either `classes` or `random_classes`, got both.")
-        real = [name for name in ("photo", "traversability") if getattr(self, name)]
-        if real and not self.classes and not self.random_classes:
-            raise ConfigError(
-                f"Expected `classes` with `{real[0]}`, got none: what is real would be joined to classes laid out "
-                "at random. Pass --classes RASTER, or --random-classes if that is what you want."
+        expect(
+            self.classes or self.class_ids is None,
+            "`classes` with `class_ids`, got none. Pass the raster they belong to.",
+        )
+        expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
+        for name in ("photo", "traversability"):
+            expect(
+                not getattr(self, name) or self.classes or self.random_classes,
+                f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
+                "Pass --classes RASTER, or --random-classes if that is what you want.",
             )
 
 
@@ -182,8 +181,7 @@ def survey(
     names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
     named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
     unknown = sorted({name for name in named.values() if name is not None} - set(names))
-    if unknown:
-        raise ConfigError(f"Expected `class_ids` to name classes of the recipe, {names}, got {unknown}.")
+    expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
     dem = stack.enter_context(opened("dem", rasters.dem))
     unit = dem.file.units[0] or "m"
     if unit.lower() not in _METRES:
@@ -205,29 +203,34 @@ def survey(
             f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem.name} of "
             f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
         )
-    tiling = cut((rows, columns), recipe.grid.shape, _stride(recipe, stride_m), shares)
+    stride = recipe.grid.shape
+    if stride_m is not None:
+        cells = stride_m / step
+        expect(
+            cells > 0.5 and abs(cells - round(cells)) < 1e-6,
+            f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
+        )
+        stride = round(cells), round(cells)
+    tiling = cut((rows, columns), recipe.grid.shape, stride, shares)
     # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
     offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
     south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
     lattice = Lattice(crs=crs, west_m=west_m, south_m=south_m, cells=tiling.cells, resolution_m=step)
+    sources = [("elevation_m", dem, how)]
+    for field, argument, kinds, how in (
+        ("class_id", "classes", (), "mode"),
+        ("rgb", "photo", ("uint8",) * 3, "average"),
+        ("traversability", "traversability", (), "average"),
+    ):
+        if name := getattr(rasters, argument):
+            sources.append((field, stack.enter_context(opened(argument, name, kinds)), how))
     layers: dict[str, Layer] = {}
-
-    def lay(field: str, raster: Raster, how: str, bands: Sequence[int] = (1,)) -> None:
-        layers[field] = stack.enter_context(raster.laid(lattice, list(bands), how))
-        if how in ("average", "cubic") and field != "rgb":
-            for end in ("min", "max"):
-                layers[f"{field} {end}"] = stack.enter_context(raster.laid(lattice, list(bands), end))
-
-    lay("elevation_m", dem, how)
-    if rasters.classes:
-        lay("class_id", stack.enter_context(opened("classes", rasters.classes)), "mode")
-    if rasters.photo:
-        photo = stack.enter_context(opened("photo", rasters.photo, ("uint8",) * 3))
-        lay("rgb", photo, "average", (1, 2, 3))
-    if rasters.traversability:
-        measured = stack.enter_context(opened("traversability", rasters.traversability))
-        lay("traversability", measured, "average")
-    origins = {name: provenance(layer.raster.name) for name, layer in layers.items() if " " not in name}
+    for field, raster, how in sources:
+        bands = [1, 2, 3] if field == "rgb" else [1]
+        ends = ("min", "max") if how in ("average", "cubic") and field != "rgb" else ()
+        for layer, way in ((field, how), *((f"{field} {end}", end) for end in ends)):
+            layers[layer] = stack.enter_context(raster.laid(lattice, bands, way))
+    origins = {field: provenance(raster.name) for field, raster, _ in sources}
     ids = {str(value): name for value, name in sorted(named.items())}
     source = {
         "kind": "dem",
@@ -241,28 +244,13 @@ def survey(
         "photo": origins.get("rgb"),
         "traversability": origins.get("traversability"),
     }
-    edges_m = [
-        offset + step * np.arange(-1, count + 2) for offset, count in zip(offset_m, tiling.cells, strict=True)
-    ]
-    known = [
-        (edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step)
-        for edges, size in zip(edges_m, size_m, strict=True)
-    ]
+    known = []
+    for offset, count, size in zip(offset_m, tiling.cells, size_m, strict=True):
+        edges = offset + step * np.arange(-1, count + 2)
+        known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
     indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
     cliff_m = np.inf if dem.says_what_is_missing else _CLIFF * max(*cell_m, step)
     return Survey(tiling=tiling, layers=layers, known=known, indices=indices, cliff_m=cliff_m, source=source)
-
-
-def _stride(recipe: Recipe, stride_m: float | None) -> tuple[int, int]:
-    """Cells from one map to the next, northward and eastward."""
-    if stride_m is None:
-        return recipe.grid.shape
-    cells = stride_m / recipe.resolution_m
-    if not (cells > 0.5 and abs(cells - round(cells)) < 1e-6):
-        raise ConfigError(
-            f"Expected `stride` as a multiple of the maps' resolution, {recipe.resolution_m:g} m, got {stride_m:g}."
-        )
-    return round(cells), round(cells)
 
 
 def provenance(name: str) -> dict[str, str | None]:

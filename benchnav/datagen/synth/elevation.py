@@ -23,8 +23,7 @@ def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: fl
     Returns:
         Surfaces scaled to a relief (highest minus lowest) of 1, float64, shape [B, H, W].
     """
-    height, width = shape
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    frequency = _frequencies(shape)
     frequency[0, 0] = np.inf
     spectrum = np.fft.rfft2(rng.normal(key, indices, shape)) * frequency ** -(roughness + 1)
     surface = np.fft.irfft2(spectrum, s=shape)
@@ -60,15 +59,19 @@ def open_fractal(
     """
     tiles_y, tiles_x = (-(-cells // reference_cells) for cells in shape)
     covered = tiles_y * reference_cells, tiles_x * reference_cells
-    height, width = 2 * covered[0], 2 * covered[1]
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
-    amplitude = np.hypot(frequency, 1 / reference_cells) ** -(roughness + 1)
-    spectrum = np.fft.rfft2(rng.normal(key, indices, (height, width))) * amplitude
-    surface = np.fft.irfft2(spectrum, s=(height, width))[:, : covered[0], : covered[1]]
+    twice = 2 * covered[0], 2 * covered[1]
+    amplitude = np.hypot(_frequencies(twice), 1 / reference_cells) ** -(roughness + 1)
+    spectrum = np.fft.rfft2(rng.normal(key, indices, twice)) * amplitude
+    surface = np.fft.irfft2(spectrum, s=twice)[:, : covered[0], : covered[1]]
     tiles = surface.reshape(len(surface), tiles_y, reference_cells, tiles_x, reference_cells)
     relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
     low = surface.min(axis=(1, 2))
     return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
+
+
+def _frequencies(shape: tuple[int, int]) -> np.ndarray:
+    """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
+    return np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
 
 
 def place_craters(
