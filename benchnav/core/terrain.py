@@ -5,6 +5,7 @@ Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,12 +88,16 @@ class Terrain:
 
     def select(self, members: Tensor) -> "Terrain":
         """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
-        layers = {name: layer[members] for name, layer in vars(self).items() if isinstance(layer, Tensor)}
+        layers: dict[str, Any] = {
+            name: layer[members] for name, layer in vars(self).items() if isinstance(layer, Tensor)
+        }
         return replace(self, truth=self.truth.select(members), **layers)
 
     def to(self, device: torch.device | str) -> "Terrain":
         """The maps on a device."""
-        layers = {name: layer.to(device) for name, layer in vars(self).items() if isinstance(layer, Tensor)}
+        layers: dict[str, Any] = {
+            name: layer.to(device) for name, layer in vars(self).items() if isinstance(layer, Tensor)
+        }
         return replace(self, truth=self.truth.to(device), **layers)
 
     def observe(self) -> Observation:

@@ -226,7 +226,11 @@ class _Part:
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """The manifest's entry of the maps from one on, to the last or before another."""
-        about = {"kept": self.kept, "lowest_m": self.lowest_m, "unlabelled": self.unlabelled}
+        about: Mapping[str, list[Any]] = {
+            "kept": self.kept,
+            "lowest_m": self.lowest_m,
+            "unlabelled": self.unlabelled,
+        }
         kept = {name: values[first:stop] for name, values in about.items()}
         left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
         source = {**self.ground.source, "truth": "unknown", **kept, "left_out": left_out}

@@ -253,7 +253,7 @@ def stretch(crs: Any, x: float, y: float) -> float:
     return float(np.abs(scales - 1).max())
 
 
-def _transformed(crs: Any, to: Any, x: Sequence[float], y: Sequence[float]) -> np.ndarray:
+def _transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
     """Moves N places from one CRS to another, shape [2, N]; not finite where no way leads, as from another planet."""
     try:
         return np.array(load_rasterio().warp.transform(crs, to, list(x), list(y)))

@@ -100,7 +100,7 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
         yield from (f"  {name:12} {entry[key]}" for name, entry in described["splits"].items())
     headings, rows = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots"], []
     for number, item in enumerate(described["classes"]):
-        colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
+        colour = f"#{bytes(item['colour']).hex()}"
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
         soft = "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"]) if item["soft"] else ""
         rows.append((str(number), item["name"], colour, *numbers, soft))

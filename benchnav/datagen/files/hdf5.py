@@ -35,7 +35,7 @@ _SPARE_BYTES_A_MAP = 1024
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
 _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 
-Source = Mapping[str, np.ndarray] | h5py.Group  # arrays by name, `ENTRY_DIGESTS` among them
+Source = Mapping[str, Any]  # stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,9 +104,7 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
     file.flush()
 
 
-def pack(
-    dataset_id: str, recipe: Recipe, split: str, entry: Mapping[str, Any], maps: Mapping[str, np.ndarray]
-) -> bytes:
+def pack(dataset_id: str, recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps) -> bytes:
     """Makes what a file of a few maps of one split holds, in memory.
 
     Args:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, groupby
@@ -157,7 +157,7 @@ class TerrainDataset:
         return ",".join(f"{name}:{self.split_digest(name)}" for name in self.splits)
 
     def read(
-        self, split: str, indices: Sequence[int] | None = None, fields: Iterable[str] | None = None
+        self, split: str, indices: Sequence[int] | None = None, fields: Collection[str] | None = None
     ) -> Maps:
         """Reads stored arrays.
 
@@ -173,9 +173,9 @@ class TerrainDataset:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
         size = self.map_count(split)
-        names = self.field_names if fields is None else self.check_fields(tuple(fields))
+        names = self.field_names if fields is None else self.check_fields(fields)
         chosen = range(size) if indices is None else np.asarray(indices).tolist()
-        if indices is not None and not all(type(i) is int and 0 <= i < size for i in chosen):
+        if not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
         return self._read(split, names, chosen)
 
@@ -185,12 +185,11 @@ class TerrainDataset:
         Raises:
             DatasetError: no such split, or a stored chunk is damaged.
         """
-        every = range(self.map_count(split))
-        chosen = every if indices is None else indices
+        chosen = range(self.map_count(split)) if indices is None else indices
         return self._read(split, (schema.ENTRY_DIGESTS,), chosen)[schema.ENTRY_DIGESTS]
 
     def chunks(
-        self, split: str, fields: Iterable[str] | None = None, cells: int = CHUNK_CELLS
+        self, split: str, fields: Collection[str] | None = None, cells: int = CHUNK_CELLS
     ) -> Iterator[tuple[range, Maps]]:
         """Reads a split from its first map to its last, some maps at a time.
 
@@ -202,21 +201,20 @@ class TerrainDataset:
         Yields:
             Which maps, and what `read` gives of them.
         """
-        names = None if fields is None else tuple(fields)
         size = max(1, cells // (self.grid.height * self.grid.width))
         count = self.map_count(split)
         for first in range(0, count, size):
             indices = range(first, min(first + size, count))
-            yield indices, self.read(split, indices, names)
+            yield indices, self.read(split, indices, fields)
 
-    def terrain_chunks(self, split: str, cells: int = CHUNK_CELLS) -> "Iterator[Terrain]":
+    def terrain_chunks(self, split: str) -> "Iterator[Terrain]":
         """Reads a split as Terrain, some maps at a time, as `chunks` does."""
         from benchnav.datagen.files.terrain import terrain_of
 
-        for _, maps in self.chunks(split, schema.MAP_FIELDS, cells):
+        for _, maps in self.chunks(split, schema.MAP_FIELDS):
             yield terrain_of(maps, self.recipe)
 
-    def check_fields(self, names: tuple[str, ...]) -> tuple[str, ...]:
+    def check_fields(self, names: Collection[str]) -> Collection[str]:
         """Gives names of fields back.
 
         Raises:
@@ -249,7 +247,7 @@ class TerrainDataset:
         """The files that hold maps."""
         return {piece.path for pieces in self._pieces.values() for piece in pieces}
 
-    def _read(self, split: str, names: Sequence[str], indices: Sequence[int]) -> Maps:
+    def _read(self, split: str, names: Collection[str], indices: Sequence[int]) -> Maps:
         """Reads maps run by run: those that follow one another in a file together."""
         pieces = self.pieces(split)
         firsts = [piece.first for piece in pieces]
@@ -266,7 +264,7 @@ class TerrainDataset:
             return self._read_run(split, pieces[0], names, slice(0, 0))
         return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
 
-    def _read_run(self, split: str, piece: Piece, names: Sequence[str], which: slice) -> Maps:
+    def _read_run(self, split: str, piece: Piece, names: Collection[str], which: slice) -> Maps:
         file, arrays = self._open(piece.path)
         read, most = Maps(), len(self.recipe.classes) - 1
         try:

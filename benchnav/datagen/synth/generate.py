@@ -133,7 +133,8 @@ def complete(
     brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     if recipe.places is None:
-        start_m, goal_m = (np.tile(end, (len(indices), 1)) for end in (recipe.start_m, recipe.goal_m))
+        ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
+        start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
         start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places"), indices)
     return {
