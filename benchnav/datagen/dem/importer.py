@@ -203,7 +203,7 @@ class _Part:
 
     def _write(self, file: Path, maps: Maps, first: int) -> None:
         entry = self.entry(first, first + len(maps["environment"]))
-        file.write_bytes(pack(self.recipe.id, self.recipe, self.name, entry, maps))
+        file.write_bytes(pack(self.recipe, self.name, entry, maps))
 
     def _add_groups(self) -> None:
         """Writes the shards anew with each map's group, which is known only when all maps are.

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from benchnav.core.errors import DatasetError
+from benchnav.core.errors import expect
 from benchnav.core.store import building, refuse_taken, restore, sole_writer, take_place
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
@@ -35,13 +35,12 @@ def export(
         overwrite: replace an exported dataset that is there.
 
     Raises:
-        DatasetError: no such split or field, the dataset is damaged, or `out` cannot be written.
-        ConfigError: `out` is taken.
+        DatasetError: the dataset is damaged, or `out` cannot be written.
+        ConfigError: no such split or field, or `out` is taken.
     """
     names = split_names(_chosen("splits", splits, list(dataset.splits)))
     columns = _chosen("fields", fields, list(dataset.fields))
-    if maps_a_file < 0:
-        raise DatasetError(f"Expected `maps_per_file` ≥ 0, got {maps_a_file}.")
+    expect(maps_a_file >= 0, f"`maps_per_file` ≥ 0, got {maps_a_file}.")
     if not publication.date:
         today = datetime.datetime.now(datetime.UTC).date()
         publication = replace(publication, date=today.isoformat())
@@ -69,9 +68,7 @@ def _foreign(out: Path) -> str:
 
 
 def _chosen(what: str, asked: Sequence[str] | None, known: list[str]) -> list[str]:
-    if asked is None:
-        return known
+    asked = known if asked is None else asked
     unknown = [name for name in asked if name not in known]
-    if unknown or not asked:
-        raise DatasetError(f"Expected `{what}` among {known}, got {unknown or 'none'}.")
+    expect(asked and not unknown, f"`{what}` among {known}, got {unknown or 'none'}.")
     return [name for name in known if name in asked]

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import benchnav
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import ConfigError, DatasetError, expect
 from benchnav.core.store import Shard, real_place, replacing, restore, sole_writer
 from benchnav.core.workers import run_calls
 from benchnav.datagen.files.hdf5 import (
@@ -89,8 +89,9 @@ def create(
         BenchnavError: another run is writing it, a worker was killed, or the cluster was lost.
     """
     path = real_place(path)
-    if shard is not None and is_one_file(path):
-        raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
+    expect(
+        shard is None or not is_one_file(path), f"`out` to be a folder, since a shard is made, got {path}."
+    )
     shards = cut(recipe, shard_cells)
     own = shards if shard is None else shards[shard.index - 1 :: shard.of]
     with named_errors(path), _held(path, shard):
@@ -98,10 +99,10 @@ def create(
         folder = _workplace(path, shards, shard, overwrite)
         folder.mkdir(parents=True, exist_ok=True)
         missing = _missing(folder, recipe, shards, own, may_replace=overwrite or folder != path)
-        if (folder / FOLDER_MANIFEST).exists():
-            if not missing:
-                check_place(path, overwrite)
-            (folder / FOLDER_MANIFEST).unlink(missing_ok=True)  # until what was lost is there again
+        manifest = folder / FOLDER_MANIFEST
+        if manifest.exists() and not missing:
+            check_place(path, overwrite)
+        manifest.unlink(missing_ok=True)  # until what was lost is there again
         total = sum(shard.maps for shard in own)
         begun = done = total - sum(shard.maps for shard in missing)
         yield done, total
@@ -148,7 +149,7 @@ def make(recipe: Recipe, shard: ShardFile) -> bytes:
     """
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
     entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
-    return pack(recipe.id, recipe, shard.split, entry, maps)
+    return pack(recipe, shard.split, entry, maps)
 
 
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
@@ -184,12 +185,9 @@ def _workplace(path: Path, shards: Sequence[ShardFile], shard: Shard | None, ove
     beside = path.with_name(f".{path.name}.partial")
     # Of a folder, shards of this recipe are gone on with.
     check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
-    if is_one_file(path):
-        return beside
-    if not overwrite or not (path / FOLDER_MANIFEST).exists():
+    if not is_one_file(path) and not (overwrite and (path / FOLDER_MANIFEST).exists()):
         return path
-    if shard is not None:
-        raise ConfigError(f"Expected no finished dataset to replace by a shard, got {path}. Remove it first.")
+    expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
     return beside
 
 
@@ -212,10 +210,11 @@ def _missing(
     every = sorted(folder.glob("*.h5"))
     there = {file.name for file in every if file.name in known and is_there(file, recipe, known[file.name])}
     foreign = [file for file in every if file.name not in there]
-    if foreign and not may_replace:
-        raise ConfigError(
-            f"Expected `out` to be new or to hold shards of one recipe and version, but {foreign[0]} is of another. "
-            "Choose another `out`, or pass --overwrite with the recipe, settings and version of the others."
+    for file in foreign:
+        expect(
+            may_replace,
+            f"`out` to be new or to hold shards of one recipe and version, but {file} is of another. "
+            "Choose another `out`, or pass --overwrite with the recipe, settings and version of the others.",
         )
     # Those of other shards are for these to replace; what is half-written of these is of a killed run.
     mine = {shard.name for shard in own}

@@ -104,17 +104,16 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
     file.flush()
 
 
-def pack(dataset_id: str, recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps) -> bytes:
+def pack(recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps) -> bytes:
     """Makes what a file of a few maps of one split holds, in memory.
 
     Args:
-        dataset_id: name and version of the dataset.
-        recipe: by which they were made.
+        recipe: by which they were made, with the dataset's id.
         split: name of the split.
         entry: the manifest's entry of the split without its digest.
         maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
     """
-    contents = Contents(id=dataset_id, recipes=[recipe], splits={split: entry}, fields=schema.fields_in(maps))
+    contents = Contents(id=recipe.id, recipes=[recipe], splits={split: entry}, fields=schema.fields_in(maps))
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
         digests = schema.entry_digests(maps, contents.fields)
         _fill(file, contents, {split: [{**maps, schema.ENTRY_DIGESTS: digests}]})

@@ -9,7 +9,7 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 
 import numpy as np
 
-from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
@@ -45,44 +45,36 @@ def truth(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainCla
         Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2 where the table has
         soft spots; a class without them has them at weight 0. Where the class is not known, means are NaN.
     """
-    unlabelled = class_id == UNLABELLED
-    if unlabelled.any():
-        share, mean, std = truth(np.where(unlabelled, 0, class_id), slope_deg, classes)
-        return share, np.where(unlabelled[:, None], np.nan, mean), std
-    firm = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
-    if not any(c.soft for c in classes):
-        return np.ones((len(firm[0]), 1, *firm[0].shape[1:])), firm[0][:, None], firm[1][:, None]
-    none = SoftSpots(weight=0.5, mean=0.0, std=1.0)
-    spots = [c.soft or none for c in classes]
-    weight = np.take([c.soft.weight if c.soft else 0.0 for c in classes], class_id)
-    soft = np.take([s.mean for s in spots], class_id), np.take([s.std for s in spots], class_id)
-    weights, means, stds = ((1 - weight, weight), (firm[0], soft[0]), (firm[1], soft[1]))
-    return np.stack(weights, 1), np.stack(means, 1), np.stack(stds, 1)
+    labelled = class_id != UNLABELLED
+    class_id = np.where(labelled, class_id, 0)
+    mean, std = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
+    components: list[tuple[np.ndarray, ...]] = [(np.ones(mean.shape), mean, std)]
+    if any(c.soft for c in classes):
+        spots = [(c.soft.weight, c.soft.mean, c.soft.std) if c.soft else (0.0, 0.0, 1.0) for c in classes]
+        soft = tuple(np.take(values, class_id) for values in zip(*spots, strict=True))
+        components = [(1 - soft[0], mean, std), soft]
+    weights, means, stds = (np.stack(values, axis=1) for values in zip(*components, strict=True))
+    return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
-def look_alikes(
-    class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]
-) -> Parameters | None:
+def look_alikes(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
     """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
 
     They are shown together, and which of them takes which ground is drawn anew in each map, so that each
     weighs the same.
 
     Returns:
-        As `truth`, with a component for each of the most classes that look alike; None where no two do.
+        As `truth`, with a component for each of the most classes that look alike.
     """
     alike = look_alike_classes(classes)
-    most = max(len(own) for own in alike)
-    if most == 1:
-        return None
-    unlabelled = class_id == UNLABELLED
-    class_id = np.where(unlabelled, 0, class_id)
+    labelled = class_id != UNLABELLED
+    class_id = np.where(labelled, class_id, 0)
     pieces = []
-    for place in range(most):
+    for place in range(max(len(own) for own in alike)):
         other = np.take([own[place % len(own)] for own in alike], class_id)
         share = np.take([1 / len(own) if place < len(own) else 0.0 for own in alike], class_id)
-        weights, means, stds = truth(other, slope_deg, classes)
-        pieces.append((weights * share[:, None], np.where(unlabelled[:, None], np.nan, means), stds))
+        weights, means, stds = truth(np.where(labelled, other, UNLABELLED), slope_deg, classes)
+        pieces.append((weights * share[:, None], means, stds))
     weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
     return weights, means, stds
 
