@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -249,24 +250,29 @@ class TerrainDataset:
 
     def _read(self, split: str, names: Collection[str], indices: Sequence[int]) -> Maps:
         """Reads maps run by run: those that follow one another in a file together."""
-        pieces = self.pieces(split)
-        firsts = [piece.first for piece in pieces]
 
-        def run_of(item: tuple[int, int]) -> tuple[int, int]:
+        def run_of(item: tuple[int, int]) -> tuple[Path, int]:
             place, index = item
-            return bisect_right(firsts, index) - 1, index - place
+            return self._piece_of(split, index).path, index - place
 
         runs = []
-        for (number, _), items in groupby(enumerate(indices), run_of):
-            within = [index - firsts[number] for _, index in items]
-            runs.append(self._read_run(split, pieces[number], names, slice(within[0], within[-1] + 1)))
+        for _, items in groupby(enumerate(indices), run_of):
+            run = [index for _, index in items]
+            runs.append(self.read_run(split, run[0], len(run), names))
         if not runs:
-            return self._read_run(split, pieces[0], names, slice(0, 0))
+            return self.read_run(split, 0, 0, names)
         return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
 
-    def _read_run(self, split: str, piece: Piece, names: Collection[str], which: slice) -> Maps:
+    def _piece_of(self, split: str, index: int) -> Piece:
+        pieces = self._pieces[split]
+        return pieces[0 if len(pieces) == 1 else bisect_right(pieces, index, key=attrgetter("first")) - 1]
+
+    def read_run(self, split: str, first: int, count: int, names: Collection[str]) -> Maps:
+        """Reads maps that follow one another in a file, as `read` does; what is asked for has to be there."""
+        piece = self._piece_of(split, first)
         file, arrays = self._open(piece.path)
         read, most = Maps(), len(self.recipe.classes) - 1
+        which = slice(first - piece.first, first - piece.first + count)
         try:
             for name in names:
                 if (split, name) not in arrays:
