@@ -22,16 +22,12 @@ def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np
         widths (1 or √2), each of shape [E]. The arrays are shared: do not write to them.
     """
     index = np.arange(height * width).reshape(height, width)
-    sources, targets, lengths = [], [], []
-    for step_y, step_x in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = index[: height - step_y, max(0, -step_x) : width - max(0, step_x)].ravel()
-        there = index[step_y:, max(0, step_x) : width + min(0, step_x)].ravel()
-        sources += [here, there]
-        targets += [there, here]
-        lengths += [np.full(2 * here.size, np.hypot(step_x, step_y))]
-    source, target, length = (np.concatenate(parts) for parts in (sources, targets, lengths))
-    order = np.lexsort((source, target))
-    return source[order], target[order], length[order]
+    padded = np.pad(index, 1, constant_values=NO_CELL)
+    # Of each cell the nine around it, row by row.
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(-1, 9)
+    lengths = np.hypot(*(np.indices((3, 3)) - 1)).ravel()
+    target, place = np.nonzero((around != NO_CELL) & (lengths > 0))
+    return around[target, place], target, lengths[place]
 
 
 def cost_to_go(

@@ -4,8 +4,8 @@ What is heavy is imported where it is called, or asked of `datagen` there, so th
 """
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,7 +16,6 @@ from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
 
 if TYPE_CHECKING:
-    from benchnav.datagen.files.check import Fault
     from benchnav.datagen.files.reader import TerrainDataset
 
 
@@ -80,7 +79,10 @@ def create(
     is_folder = own is not None or cells > _MOST_CELLS_OF_A_FILE
     path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = create_dataset(chosen, path, jobs, scheduler, own, overwrite)
-    show_progress(_tell_kept(steps), "maps")
+    done, total = next(steps)
+    if done:
+        print(f"{done} of {total} maps were there already", file=sys.stderr)
+    show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
         print(f"{path}: shard {own} is made")
         print(
@@ -159,24 +161,22 @@ def validate(file: str) -> int:
         return 1
     for line in summarise(faults):
         print(line)
-    dataset = datagen.TerrainDataset(path)
-    if faults:
-        print(f"{path}: {len(faults)} fault(s)\n{_remedy(dataset, faults)}")
-        return 1
-    splits = dataset.splits
-    print(f"{path}: sound, {sum(entry['maps'] for entry in splits.values())} maps in {len(splits)} split(s)")
-    return 0
-
-
-def _remedy(dataset: "TerrainDataset", faults: "list[Fault]") -> str:
-    """How damaged maps are made anew."""
-    if not all("recipe" in part for entry in dataset.splits.values() for part in entry["parts"]):
-        return "These maps were imported: import them again."
+    entries = datagen.TerrainDataset(path).splits.values()
+    if not faults:
+        print(f"{path}: sound, {sum(entry['maps'] for entry in entries)} maps in {len(entries)} split(s)")
+        return 0
+    print(f"{path}: {len(faults)} fault(s)")
     files = sorted({fault.file for fault in faults if fault.file})
-    if files:
-        names = " ".join(files)
-        return f"To make them anew, remove {names} in {dataset.path} and give the command again that made it."
-    return "To make them anew, make the file again with --overwrite: the same recipe and version give the same digests."
+    if not all("recipe" in part for entry in entries for part in entry["parts"]):
+        print("These maps were imported: import them again.")
+    elif files:
+        print(
+            f"To make them anew, remove {' '.join(files)} in {path} and give the command again that made it."
+        )
+    else:
+        same = "the same recipe and version give the same digests"
+        print(f"To make them anew, make the file again with --overwrite: {same}.")
+    return 1
 
 
 def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> None:
@@ -365,15 +365,6 @@ def preview(
 def _opened(file: str) -> "TerrainDataset":
     """The dataset of a path or an id."""
     return datagen.TerrainDataset(datagen.find_dataset(file))
-
-
-def _tell_kept(steps: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Passes the steps of `create` on, and says first what a killed run has left of them."""
-    done, total = next(steps)
-    if done:
-        print(f"{done} of {total} maps were there already", file=sys.stderr)
-    yield done, total
-    yield from steps
 
 
 def main() -> None:

@@ -138,13 +138,13 @@ def table(dataset: TerrainDataset) -> Table:
     stuck = dataset.recipe.stuck_threshold
     rows = []
     for split in dataset.splits:
-        found = of_split(dataset, split)
-        shares = (f"{100 * share:.1f}" for share in (found.stuck, found.soft_ground, found.soft_spots))
-        times = found.reference_times_s
-        typical, spread = NOTHING, NOTHING
+        measured = of_split(dataset, split)
+        shares = (measured.stuck, measured.soft_ground, measured.soft_spots)
+        times, typical, spread = measured.reference_times_s, NOTHING, NOTHING
         if len(times):
             typical, spread = f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}"
-        rows.append((split, *shares, typical, spread, f"{found.straight}/{found.maps}"))
+        percent = (f"{100 * share:.1f}" for share in shares)
+        rows.append((split, *percent, typical, spread, f"{measured.straight}/{measured.maps}"))
     return Table(
         title=f"how hard the maps are: what stands in a robot's way (λ_stuck {stuck:g})",
         headings=_HEADINGS,

@@ -109,10 +109,10 @@ class Survey:
                 expected = "elevations of `dem` without a gap next to 0"
                 other = "Where 0 is a height, declare a value that does not occur, such as -9999."
                 raise self._out_of_range("elevation_m", expected, low, high, 0, other)
-        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        ground[:, ~self.known[0][run.row * north :][: height + 2]] = np.nan
-        for place, column in enumerate(run.columns):
-            ground[place][:, ~self.known[1][column * east :][: width + 2]] = np.nan
+        (north, east), (rows, columns) = self.tiling.stride, self.known
+        ground[:, ~rows[run.row * north :][: ground.shape[1]]] = np.nan
+        for map_m, column in zip(ground, run.columns, strict=True):
+            map_m[:, ~columns[column * east :][: ground.shape[2]]] = np.nan
         if "traversability" in framed:
             low, high = self._range("traversability", framed)
             if low < 0 or high > 1:
@@ -126,10 +126,9 @@ class Survey:
     def _cut(self, layer: Layer, run: Run) -> np.ndarray:
         """Cuts maps out of a layer, each framed by a cell, shape [B, K, H + 2, W + 2]."""
         (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        south, west = run.row * north, run.columns.start * east
-        stop = west + (len(run.columns) - 1) * east + width
-        strip = layer.read(range(south, south + height), range(west, stop))
-        return np.stack([strip[:, :, i * east : i * east + width + 2] for i in range(len(run.columns))])
+        south, wests = run.row * north, [column * east for column in run.columns]
+        strip = layer.read(range(south, south + height), range(wests[0], wests[-1] + width))
+        return np.stack([strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests])
 
     def _range(self, name: str, maps: Maps) -> tuple[float, float]:
         """The least and the greatest value, of what is averaged too."""
@@ -147,12 +146,12 @@ class Survey:
         )
 
     def _classes(self, values: np.ndarray) -> np.ndarray:
-        indices, unknown = np.full_like(values, np.nan), ~np.isnan(values)
+        indices = np.full_like(values, np.nan)
         for value, index in self.indices.items():
             indices[values == value] = index
-            unknown &= values != value
-        if unknown.any():
-            name, strange = self.layers["class_id"].raster.name, np.unique(values[unknown])
+        strange = np.setdiff1d(values[~np.isnan(values)], list(self.indices))
+        if len(strange):
+            name = self.layers["class_id"].raster.name
             few = ", ".join(f"{value:g}" for value in strange[:10]) + (", …" if len(strange) > 10 else "")
             raise DatasetError(
                 f"Expected values of `classes` in {sorted(self.indices)}, got [{few}] too in {name}. Name each by "

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import h5py
@@ -46,14 +48,15 @@ class Fault:
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
     """Writes a line a fault, consecutive maps with the same fault in one."""
-    kinds: dict[tuple[str, str, str, str], list[Fault]] = {}
-    for fault in sorted(faults):
-        kinds.setdefault((fault.split, fault.field, fault.problem, fault.file), []).append(fault)
-    for alike in kinds.values():
-        maps = np.array([fault.map for fault in alike])
-        for run in np.split(maps, np.flatnonzero(np.diff(maps) != 1) + 1):
-            several = f"maps {run[0]}–{run[-1]}"
-            yield alike[0].line(several) if len(run) > 1 else str(replace(alike[0], map=int(run[0])))
+
+    def run_of(item: tuple[int, Fault]) -> Fault:
+        place, fault = item
+        return replace(fault, map=fault.map - place)
+
+    order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
+    for _, items in groupby(enumerate(order), run_of):
+        run = [fault for _, fault in items]
+        yield run[0].line(f"maps {run[0].map}–{run[-1].map}") if len(run) > 1 else str(run[0])
 
 
 def find_faults(path: str | Path) -> list[Fault]:

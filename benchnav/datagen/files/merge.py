@@ -7,7 +7,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -68,10 +68,10 @@ def merge(
 def _copies(contents: Contents, folder: Path) -> dict[str, list[Path]]:
     """Copies each file into a folder, under its own name where that is free; gives the copies by split."""
     copies: dict[Path, Path] = {}
-    for path in (path for files in contents.files.values() for path in files):
-        if path not in copies:
-            name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
-            copies[path] = Path(shutil.copy2(path, folder / name))
+    for path in dict.fromkeys(chain(*contents.files.values())):
+        name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
+        copies[path] = folder / name
+        shutil.copy2(path, copies[path])
     return {split: [copies[path] for path in files] for split, files in contents.files.items()}
 
 
@@ -114,14 +114,12 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
         raise DatasetError(
             f"Expected datasets or shards of one, got {', '.join(map(str, folders))} without any."
         )
-    first = shards[0].manifest
-    for shard in shards:
-        for name in ("recipes", "generator"):
-            if shard.manifest[name] != first[name]:
-                raise DatasetError(
-                    f"Expected shards of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
-                )
-    recipe = recipe_from_dict(first["recipes"][0], f"in {shards[0].path}")
+    for shard, name in product(shards, ("recipes", "generator")):
+        if shard.manifest[name] != shards[0].manifest[name]:
+            raise DatasetError(
+                f"Expected shards of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
+            )
+    recipe = shards[0].recipe
     files: dict[str, list[Path]] = {}
     lacking = []
     for name, spec in recipe.splits.items():
@@ -181,8 +179,8 @@ def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
 def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
     """The digests of all elevation maps, shape [N]."""
     column = dataset.field_names.index("elevation_m")
-    digests = [dataset.entry_digests(split)[:, column] for split in dataset.splits]
-    return np.ascontiguousarray(np.concatenate(digests)).view(f"S{schema.DIGEST_BYTES}").ravel()
+    digests = np.concatenate([dataset.entry_digests(split) for split in dataset.splits])
+    return np.ascontiguousarray(digests[:, column]).view(f"S{schema.DIGEST_BYTES}").ravel()
 
 
 def _check(dataset: TerrainDataset, split: str, indices: Sequence[int], maps: Maps) -> None:

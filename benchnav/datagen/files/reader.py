@@ -9,7 +9,7 @@ import json
 import os
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, groupby
 from operator import attrgetter
@@ -21,6 +21,7 @@ import numpy as np
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
+from benchnav.core.settings import plain
 from benchnav.core.shipped import shipped_folder
 from benchnav.core.store import unseal
 from benchnav.datagen import schema
@@ -135,13 +136,10 @@ class TerrainDataset:
         Raises:
             DatasetError: there is no such split.
         """
-        about = {
-            "classes": [asdict(item) for item in self.recipe.classes],
-            "stuck_threshold": self.recipe.stuck_threshold,
-            "resolution_m": self.recipe.resolution_m,
-            "truth": self.truth_of(split),
-        }
-        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+        recipe = plain(self.recipe)
+        about = {name: recipe[name] for name in ("classes", "stuck_threshold", "resolution_m")}
+        text = json.dumps(about | {"truth": self.truth_of(split)}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
 
     def split_digest(self, split: str) -> str:
         """SHA-256 of a split's maps and of what they mean, which models and results record: `about_digest` too.
