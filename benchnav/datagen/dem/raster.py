@@ -48,9 +48,9 @@ class Raster:
     file: Any
 
     @property
-    def says_what_is_missing(self) -> bool:
-        """Whether it declares a value, or a mask, for cells without one."""
-        return any(flag.name != "all_valid" for flags in self.file.mask_flag_enums for flag in flags)
+    def mask_kinds(self) -> set[str]:
+        """How it tells cells without a value, in GDAL's words; `all_valid` alone where it does not."""
+        return {flag.name for flags in self.file.mask_flag_enums for flag in flags}
 
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
         """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.
@@ -86,10 +86,9 @@ class Raster:
 
     def warped(self, crs: Any, **settings: Any) -> Any:
         """The raster in another CRS; where it has no values, that shows, if need be by one more band."""
-        kinds = {flag.name for flags in self.file.mask_flag_enums for flag in flags}
-        if kinds == {"all_valid"} and np.dtype(self.file.dtypes[0]).kind == "f":
+        if self.mask_kinds == {"all_valid"} and np.dtype(self.file.dtypes[0]).kind == "f":
             settings |= {"src_nodata": np.nan, "nodata": np.nan}
-        elif not kinds & {"nodata", "alpha"}:
+        elif not self.mask_kinds & {"nodata", "alpha"}:
             settings |= {"add_alpha": True}
         with _naming(self.argument, self.name):
             return load_rasterio().vrt.WarpedVRT(

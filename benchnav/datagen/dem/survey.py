@@ -248,7 +248,7 @@ def survey(
         edges = offset + step * np.arange(-1, count + 2)
         known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
     indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
-    cliff_m = np.inf if dem.says_what_is_missing else _CLIFF * max(*cell_m, step)
+    cliff_m = _CLIFF * max(*cell_m, step) if dem.mask_kinds == {"all_valid"} else np.inf
     return Survey(tiling=tiling, layers=layers, known=known, indices=indices, cliff_m=cliff_m, source=source)
 
 

@@ -107,7 +107,7 @@ def create(
         begun = done = total - sum(shard.maps for shard in missing)
         yield done, total
         try:
-            calls = [partial(_make, recipe, file, benchnav.__version__) for file in missing]
+            calls = [partial(make, recipe, file, benchnav.__version__) for file in missing]
             for file, content in run_calls(calls, jobs, scheduler):
                 with replacing(folder / file.name) as unfinished:
                     unfinished.write_bytes(content)
@@ -138,18 +138,23 @@ def cut(recipe: Recipe, cells: int = SHARD_CELLS) -> list[ShardFile]:
     ]
 
 
-def make(recipe: Recipe, shard: ShardFile) -> bytes:
-    """Makes a shard.
+def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
+    """Makes a shard, perhaps in a process on another machine.
 
     Returns:
-        What its file holds.
+        The shard, and what its file holds.
 
     Raises:
+        DatasetError: another version of this package is installed there.
         ConfigError: the recipe cannot be met.
     """
+    if benchnav.__version__ != version:
+        raise DatasetError(
+            f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
+        )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
     entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
-    return pack(recipe, shard.split, entry, maps)
+    return shard, pack(recipe, shard.split, entry, maps)
 
 
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
@@ -222,17 +227,3 @@ def _missing(
     for file in [file for file in foreign if own and (file.name in mine or file.name not in known)] + half:
         file.unlink(missing_ok=True)
     return [shard for shard in own or shards if shard.name not in there]
-
-
-def _make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
-    """Makes a shard, perhaps in a process on another machine.
-
-    Raises:
-        DatasetError: another version of this package is installed there.
-        ConfigError: the recipe cannot be met.
-    """
-    if benchnav.__version__ != version:
-        raise DatasetError(
-            f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
-        )
-    return shard, make(recipe, shard)

@@ -104,14 +104,21 @@ class Recipe:
         _check_environments(self)
         _check_splits(self)
         if self.synthesis == 1:
-            _check_first_synthesis(self)
-        else:
-            _check_look_alikes(self)
-            most_m = LONGEST_CORRELATION * min(self.grid.extent_m)
-            expect(
-                0 <= self.correlation_m <= most_m,
-                f"`correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, got {self.correlation_m:g}.",
-            )
+            soft = any(item.soft for item in self.classes)
+            asked = {"soft": soft, "places": self.places, "correlation_m": self.correlation_m}
+            for name, value in asked.items():
+                expect(
+                    not value,
+                    f"`synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 did. "
+                    "Set `synthesis: 2` in the recipe.",
+                )
+            return
+        _check_look_alikes(self)
+        most_m = LONGEST_CORRELATION * min(self.grid.extent_m)
+        expect(
+            0 <= self.correlation_m <= most_m,
+            f"`correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, got {self.correlation_m:g}.",
+        )
 
     @property
     def grid(self) -> Grid:
@@ -314,20 +321,6 @@ def _check_splits(recipe: Recipe) -> None:
         expect(
             split.scenario in recipe.scenarios,
             f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, got {split.scenario!r}.",
-        )
-
-
-def _check_first_synthesis(recipe: Recipe) -> None:
-    asked = {
-        "soft": any(item.soft for item in recipe.classes),
-        "places": recipe.places is not None,
-        "correlation_m": recipe.correlation_m != 0,
-    }
-    for name, is_asked in asked.items():
-        expect(
-            not is_asked,
-            f"`synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 did. "
-            "Set `synthesis: 2` in the recipe.",
         )
 
 

@@ -130,6 +130,14 @@ def complete(
     slope = quantise(inclination_deg(*gradient), 10)
     azimuth, lift = rng.uniform(key("light"), indices, (2,)).T
     light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
+    noise_key, shape = key("traversability"), recipe.grid.shape
+    if recipe.synthesis == 1:
+        noise = rng.normal(noise_key, indices, shape) * latent.latent_std(class_id, recipe.classes)
+        realised = np.clip(latent.latent_mean(class_id, slope, recipe.classes) + noise, 0, 1)
+    else:
+        cells = recipe.correlation_m / recipe.resolution_m
+        noise = copula.correlated_normal(noise_key, indices, shape, cells)
+        realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
     brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     if recipe.places is None:
@@ -142,25 +150,11 @@ def complete(
         "class_id": class_id,
         "elevation_m": ground[:, 1:-1, 1:-1],
         "slope_deg": slope,
-        "traversability": quantise(_realised(recipe, key("traversability"), indices, class_id, slope), 16),
+        "traversability": quantise(realised, 16),
         "environment": indices % recipe.environments,
         "start_m": start_m,
         "goal_m": goal_m,
     }
-
-
-def _realised(
-    recipe: Recipe, key: int, indices: np.ndarray, class_id: np.ndarray, slope_deg: np.ndarray
-) -> np.ndarray:
-    """Draws λ from the truth of each cell, shape [B, H, W]."""
-    if recipe.synthesis == 1:
-        mean = latent.latent_mean(class_id, slope_deg, recipe.classes)
-        noise = rng.normal(key, indices, recipe.grid.shape)
-        noise *= latent.latent_std(class_id, recipe.classes)
-        return np.minimum(np.maximum(mean + noise, 0), 1)
-    correlation_cells = recipe.correlation_m / recipe.resolution_m
-    noise = copula.correlated_normal(key, indices, recipe.grid.shape, correlation_cells)
-    return latent.quantile_of(latent.truth(class_id, slope_deg, recipe.classes), noise)
 
 
 def _draw(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
