@@ -27,7 +27,7 @@ from benchnav.datagen.dem.raster import load_rasterio
 from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
-from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, held, pack
+from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, foreign_in, held, pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
@@ -85,7 +85,7 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         ground = survey(stack, rasters, recipe, shares, stride_m)
-        stack.enter_context(held(out, overwrite))
+        stack.enter_context(held(out, overwrite, foreign_in))
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
         done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
@@ -130,13 +130,13 @@ class _Part:
         kept = np.ones(len(run.columns), dtype=bool)
         lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
         if "class_id" in given:
-            unlabelled = np.isnan(given["class_id"])
+            lacks = np.isnan(given["class_id"])
             if "rgb" in given:
                 # A measured λ is worth learning from without a class.
-                unmeasured = np.isnan(given.get("traversability", np.nan))
-                lacking["missing_classes"] = (unlabelled & unmeasured).all(axis=(1, 2, 3))
+                lacks = lacks & np.isnan(given.get("traversability", np.nan))
+                lacking["missing_classes"] = lacks.all(axis=(1, 2, 3))
             else:  # a cell is painted in the colour of its class
-                lacking["missing_classes"] = unlabelled.any(axis=(1, 2, 3))
+                lacking["missing_classes"] = lacks.any(axis=(1, 2, 3))
         if "rgb" in given:
             lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
         for reason, which in lacking.items():
@@ -145,12 +145,11 @@ class _Part:
         numbers = (run.row * tiling.tiles[1] + np.array(run.columns))[kept]
         if not len(numbers):
             return
-        given = {name: values[kept] for name, values in given.items()}
         framed_m = quantise(framed_m[kept], 13)
         lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
         class_id = class_map(recipe, self.name, numbers)
         if "class_id" in given:
-            class_id = np.nan_to_num(given["class_id"][:, 0], nan=UNLABELLED).astype(np.int64)
+            class_id = np.nan_to_num(given["class_id"][kept, 0], nan=UNLABELLED).astype(np.int64)
         labelled = class_id != UNLABELLED
         height_m = framed_m - lowest_m[:, None, None]
         maps = complete(recipe, self.name, numbers, np.where(labelled, class_id, 0), height_m)
@@ -159,14 +158,13 @@ class _Part:
         if "class_id" in given:
             maps["environment"] = np.zeros(len(numbers))
         if "rgb" in given:
-            maps["rgb"] = np.rint(given["rgb"])
+            maps["rgb"] = np.rint(given["rgb"][kept])
         if "traversability" in given:
-            maps["traversability"] = quantise(given["traversability"][:, 0], 16)
-        maps["reference_time_s"] = np.full(len(numbers), np.nan)
-        solved = np.ones(len(numbers), dtype=bool)
-        if recipe.splits[self.name].solvable:
-            maps["reference_time_s"] = reference_time_s(recipe, maps)
-            solved = np.isfinite(maps["reference_time_s"])
+            maps["traversability"] = quantise(given["traversability"][kept, 0], 16)
+        solvable = recipe.splits[self.name].solvable
+        times_s = reference_time_s(recipe, maps) if solvable else np.full(len(numbers), np.nan)
+        maps["reference_time_s"] = times_s
+        solved = np.isfinite(times_s) | (not solvable)
         self.left_out["not_solvable"] += int((~solved).sum())
         self.kept += numbers[solved].tolist()
         self.lowest_m += lowest_m[solved].tolist()

@@ -62,7 +62,7 @@ class Publication:
         license: name in the SPDX list, such as CC-BY-4.0, or a URL.
         creator: who made it.
         url: where it is to be found; empty where it is nowhere yet.
-        date: of publication, YYYY-MM-DD.
+        date: of publication, YYYY-MM-DD; that of today when empty.
     """
 
     license: str = "MIT"
@@ -162,7 +162,7 @@ def metadata(
         "license": publication.license_url,
         "creator": {"@type": "sc:Organization", "name": publication.creator},
         "url": publication.url or f"urn:sha256:{content.hexdigest()}",
-        "datePublished": publication.date,
+        "datePublished": publication.date or datetime.datetime.now(datetime.UTC).date().isoformat(),
         **({"version": f"{found[1]}.0.0"} if found else {}),
         "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
         **({"citeAs": PAPER} if is_ours(dataset, names) else {}),

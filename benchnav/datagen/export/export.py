@@ -1,16 +1,14 @@
 """Exports a dataset to a folder of Parquet files with Croissant metadata, whole or not at all."""
 
-import datetime
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from benchnav.core.errors import expect
-from benchnav.core.store import building, refuse_taken, restore, sole_writer, take_place
+from benchnav.core.store import building, take_place
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
-from benchnav.datagen.files.hdf5 import named_errors
+from benchnav.datagen.files.hdf5 import held
 from benchnav.datagen.files.reader import TerrainDataset
 
 
@@ -41,26 +39,19 @@ def export(
     names = split_names(_chosen("splits", splits, list(dataset.splits)))
     columns = _chosen("fields", fields, list(dataset.fields))
     expect(maps_a_file >= 0, f"`maps_per_file` ≥ 0, got {maps_a_file}.")
-    if not publication.date:
-        today = datetime.datetime.now(datetime.UTC).date()
-        publication = replace(publication, date=today.isoformat())
-    refuse_taken(out, overwrite, _foreign)
     out = out.resolve()
     done, total = 0, sum(dataset.map_count(split) for split in names)
-    with named_errors(out), sole_writer(out, str(out)):
-        restore(out)
-        refuse_taken(out, overwrite, _foreign)  # it may have come while another run held it
-        with building(out) as folder:
-            (folder / FOLDER).mkdir()
-            yield done, total
-            for split, name in names.items():
-                for maps in write_split(folder / FOLDER, name, dataset, split, columns, maps_a_file):
-                    done += maps
-                    yield done, total
-            about = metadata(dataset, names, columns, publication, folder)
-            (folder / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-            (folder / CARD).write_text(card(dataset, names, publication))
-            take_place(folder, out)
+    with held(out, overwrite, _foreign), building(out) as folder:
+        (folder / FOLDER).mkdir()
+        yield done, total
+        for split, name in names.items():
+            for maps in write_split(folder / FOLDER, name, dataset, split, columns, maps_a_file):
+                done += maps
+                yield done, total
+        about = metadata(dataset, names, columns, publication, folder)
+        (folder / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+        (folder / CARD).write_text(card(dataset, names, publication))
+        take_place(folder, out)
 
 
 def _foreign(out: Path) -> str:

@@ -6,9 +6,10 @@ HDF5's own filters compress and checksum: byte shuffle, deflate, Fletcher-32. Le
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -136,10 +137,10 @@ def check_place(path: Path, overwrite: bool, names: Collection[str] = ()) -> Non
     Raises:
         ConfigError: it is.
     """
-    refuse_taken(path, overwrite, lambda path: _foreign(path, names))
+    refuse_taken(path, overwrite, partial(foreign_in, names=names))
 
 
-def _foreign(path: Path, names: Collection[str]) -> str:
+def foreign_in(path: Path, names: Collection[str] = ()) -> str:
     """Says what of another kind a place holds; a folder may hold shards and their manifest alone."""
     if is_one_file(path) or not path.is_dir():
         return "" if is_one_file(path) == path.is_file() else f"is a {'folder' if path.is_dir() else 'file'}"
@@ -236,11 +237,11 @@ def named_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def held(out: Path, overwrite: bool) -> Iterator[None]:
-    """Holds the place of a dataset that is made whole, for one process; see `check_place` and `named_errors`."""
+def held(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> Iterator[None]:
+    """Holds the place of what is made whole, for one process; see `refuse_taken` and `named_errors`."""
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)
-        check_place(out, overwrite)
+        refuse_taken(out, overwrite, foreign)
         yield
 
 

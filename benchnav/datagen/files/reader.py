@@ -11,7 +11,7 @@ from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import accumulate, groupby
+from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -231,14 +231,13 @@ class TerrainDataset:
 
     @cached_property
     def _pieces(self) -> dict[str, list[Piece]]:
-        pieces = {}
-        for split, entry in self.splits.items():
-            shards = self.manifest.get("shards", {}).get(split) or [{"file": "", "maps": entry["maps"]}]
-            firsts = accumulate((shard["maps"] for shard in shards), initial=0)
-            pieces[split] = [
-                Piece(path=self.path / shard["file"], first=first, maps=shard["maps"])
-                for shard, first in zip(shards, firsts, strict=False)
-            ]
+        pieces: dict[str, list[Piece]] = {split: [] for split in self.splits}
+        for split, own in pieces.items():
+            one = [{"file": "", "maps": self.splits[split]["maps"]}]
+            first = 0
+            for shard in self.manifest.get("shards", {}).get(split, one):
+                own.append(Piece(path=self.path / shard["file"], first=first, maps=shard["maps"]))
+                first += shard["maps"]
         return pieces
 
     @cached_property

@@ -25,8 +25,7 @@ def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: fl
     """
     frequency = _frequencies(shape)
     frequency[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.normal(key, indices, shape)) * frequency ** -(roughness + 1)
-    surface = np.fft.irfft2(spectrum, s=shape)
+    surface = _filtered(rng.normal(key, indices, shape), frequency ** -(roughness + 1))
     low = surface.min(axis=(1, 2), keepdims=True)
     return (surface - low) / (surface.max(axis=(1, 2), keepdims=True) - low)
 
@@ -61,8 +60,7 @@ def open_fractal(
     covered = tiles_y * reference_cells, tiles_x * reference_cells
     twice = 2 * covered[0], 2 * covered[1]
     amplitude = np.hypot(_frequencies(twice), 1 / reference_cells) ** -(roughness + 1)
-    spectrum = np.fft.rfft2(rng.normal(key, indices, twice)) * amplitude
-    surface = np.fft.irfft2(spectrum, s=twice)[:, : covered[0], : covered[1]]
+    surface = _filtered(rng.normal(key, indices, twice), amplitude)[:, : covered[0], : covered[1]]
     tiles = surface.reshape(len(surface), tiles_y, reference_cells, tiles_x, reference_cells)
     relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
     low = surface.min(axis=(1, 2))
@@ -72,6 +70,11 @@ def open_fractal(
 def _frequencies(shape: tuple[int, int]) -> np.ndarray:
     """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
     return np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
+
+
+def _filtered(white: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+    """Noise of a spectrum, shape of `white`, [B, H, W]."""
+    return np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=white.shape[1:])
 
 
 def place_craters(
@@ -136,10 +139,9 @@ def crater_elevation(
     """
     y, x = ((np.arange(n) + 0.5) * resolution_m for n in shape)
     added = np.zeros((len(radii_m), *shape))
-    for i in range(radii_m.shape[1]):
-        radius = radii_m[:, i, None, None]
-        centre_x, centre_y = (centres_m[:, i, k, None, None] for k in (0, 1))
-        distance = np.hypot(x[None, None, :] - centre_x, y[None, :, None] - centre_y)
+    for radius, centre_x, centre_y in zip(radii_m.T, *centres_m.T, strict=True):
+        radius = radius[:, None, None]
+        distance = np.hypot(x - centre_x[:, None, None], y[:, None] - centre_y[:, None, None])
         ratio = distance / np.where(radius > 0, radius, 1)
         depth = 2 * radius * depth_ratio
         bowl = depth * (ratio**2 - 0.8)
