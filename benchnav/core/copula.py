@@ -9,6 +9,7 @@ Batched NumPy in float64, the same on every machine. Letters in shapes: B fields
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
 from benchnav.core.errors import expect
@@ -17,8 +18,8 @@ LONGEST_CORRELATION = 1 / 4  # of a map's shorter side, so that the torus it is 
 
 
 def correlated_normal(
-    key: int, indices: np.ndarray, shape: tuple[int, int], correlation_cells: float
-) -> np.ndarray:
+    key: int, indices: ndarray, shape: tuple[int, int], correlation_cells: float
+) -> ndarray:
     """Draws fields of standard normals.
 
     Args:
@@ -49,7 +50,7 @@ def correlated_normal(
     return field[:, :height, :width].copy()
 
 
-def _bell(size: int, correlation_cells: float) -> np.ndarray:
+def _bell(size: int, correlation_cells: float) -> ndarray:
     """exp(−d²/ℓ²) at the distances of cells from the first one on a ring, shape [size]."""
     distance = np.minimum(np.arange(size), size - np.arange(size))
     return np.exp(-((distance / correlation_cells) ** 2))

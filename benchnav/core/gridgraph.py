@@ -7,6 +7,7 @@ Letters in shapes: B maps, H×W cells; a cell's flat index is row·W + column.
 from functools import lru_cache
 
 import numpy as np
+from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,7 +15,7 @@ NO_CELL = -1
 
 
 @lru_cache(maxsize=8)
-def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def neighbour_pairs(height: int, width: int) -> tuple[ndarray, ndarray, ndarray]:
     """Lists the directed edges between 8-connected cells, in the order of their targets.
 
     Returns:
@@ -30,9 +31,7 @@ def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np
     return around[target, place], target, lengths[place]
 
 
-def cost_to_go(
-    edge_costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
+def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> tuple[ndarray, ndarray]:
     """Finds the least cost from every cell to the nearest goal cell of its own map.
 
     Args:
@@ -65,7 +64,7 @@ def cost_to_go(
     return cost.reshape(batch, *shape), np.where(following >= 0, following - offset, NO_CELL)
 
 
-def travel_time_costs(traversability: np.ndarray, free: np.ndarray, resolution_m: float) -> np.ndarray:
+def travel_time_costs(traversability: ndarray, free: ndarray, resolution_m: float) -> ndarray:
     """Gives the time each edge takes at a commanded 1 m/s, each half at its own cell's speed.
 
     Args:

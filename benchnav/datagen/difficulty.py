@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core.grid import Grid
 from benchnav.core.tables import NOTHING, Table
@@ -51,7 +52,7 @@ class Difficulty:
     soft_ground: float
     soft_spots: float
     straight: int
-    reference_times_s: np.ndarray
+    reference_times_s: ndarray
 
 
 def of_maps(maps: Maps, recipe: Recipe) -> Difficulty:
@@ -103,7 +104,7 @@ def _summarise(pieces: Iterable[Maps]) -> Difficulty:
     )
 
 
-def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.ndarray:
+def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     """The cells that the straight line between two positions runs through.
 
     A line along a border between cells lies in those beyond it, as positions do; a corner that is only

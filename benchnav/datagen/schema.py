@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 FORMAT = "benchnav-dataset"
 FORMAT_VERSION = (1, 3)  # the newest that is read
@@ -21,7 +22,7 @@ ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
 UNLABELLED = 255  # `class_id` of a cell whose class is not known, as on real ground
 
-Maps = dict[str, np.ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
+Maps = dict[str, ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ OPTIONAL: dict[str, Field] = {
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 
-def quantise(values: np.ndarray, bits: int) -> np.ndarray:
+def quantise(values: ndarray, bits: int) -> ndarray:
     """Rounds to multiples of 2^−bits, so that the last bits of a machine's arithmetic do not show."""
     steps = values * 2.0**bits
     np.rint(steps, out=steps)
@@ -97,7 +98,7 @@ def fields_in(maps: Maps) -> dict[str, Field]:
     return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
 
 
-def entry_digests(maps: Maps, fields: Fields) -> np.ndarray:
+def entry_digests(maps: Maps, fields: Fields) -> ndarray:
     """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
 
     Args:
@@ -115,7 +116,7 @@ def entry_digests(maps: Maps, fields: Fields) -> np.ndarray:
     return digests.reshape(-1, len(fields), DIGEST_BYTES)
 
 
-def split_digest(digests: np.ndarray, height: int, width: int, fields: Fields) -> str:
+def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:
     """The digest of a split: SHA-256 over its field table and its entries' digests, map by map.
 
     Args:

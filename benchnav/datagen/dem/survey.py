@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
 from benchnav.datagen.dem.raster import Lattice, Layer, opened
@@ -81,12 +82,12 @@ class Survey:
 
     tiling: Tiling
     layers: Mapping[str, Layer]
-    known: Sequence[np.ndarray]
+    known: Sequence[ndarray]
     indices: Mapping[int, float]
     cliff_m: float
     source: Mapping[str, Any]
 
-    def read(self, run: Run) -> tuple[np.ndarray, Maps]:
+    def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Reads some maps.
 
         Returns:
@@ -123,7 +124,7 @@ class Survey:
             given["class_id"] = self._classes(given["class_id"])
         return ground, given
 
-    def _cut(self, layer: Layer, run: Run) -> np.ndarray:
+    def _cut(self, layer: Layer, run: Run) -> ndarray:
         """Cuts maps out of a layer, each framed by a cell, shape [B, K, H + 2, W + 2]."""
         (north, east), (height, width) = self.tiling.stride, self.tiling.shape
         south, wests = run.row * north, [column * east for column in run.columns]
@@ -145,7 +146,7 @@ class Survey:
             f"declare it: rio edit-info --nodata {odd:.9g} {raster}{other and f'. {other}'}"
         )
 
-    def _classes(self, values: np.ndarray) -> np.ndarray:
+    def _classes(self, values: ndarray) -> ndarray:
         indices = np.full_like(values, np.nan)
         for value, index in self.indices.items():
             indices[values == value] = index

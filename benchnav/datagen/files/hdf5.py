@@ -15,6 +15,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy import ndarray
 
 import benchnav
 from benchnav.core.errors import DatasetError
@@ -57,7 +58,7 @@ class Contents:
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
     fields: Mapping[str, schema.Field] = field(default_factory=lambda: schema.FIELDS)
 
-    def manifest(self, entry_digests: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    def manifest(self, entry_digests: Mapping[str, ndarray]) -> dict[str, Any]:
         """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of each split."""
         synthesis, shape = [recipe.synthesis for recipe in self.recipes], self.recipes[0].grid.shape
         return {
@@ -178,7 +179,7 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     if is_one_file(out):
         _join(out, contents)
         return
-    digests: dict[str, np.ndarray] = {}
+    digests: dict[str, ndarray] = {}
     shards: dict[str, list[dict[str, Any]]] = {}
     for split, files in contents.files.items():
         entries = [source[schema.ENTRY_DIGESTS][:] for source in _opened(split, files)]
@@ -261,9 +262,9 @@ def _new_arrays(group: h5py.Group, maps: int, contents: Contents) -> dict[str, h
     return arrays
 
 
-def _put(source: np.ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:
+def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:
     """Writes maps as those from one on; stored ones that are packed alike, a map a chunk, are not unpacked."""
-    if target.chunks[0] > 1 or isinstance(source, np.ndarray) or _packing(source) != _packing(target):
+    if target.chunks[0] > 1 or isinstance(source, ndarray) or _packing(source) != _packing(target):
         target[first : first + len(source)] = source[:]
         return
     within = (0,) * (source.ndim - 1)

@@ -7,6 +7,7 @@ B maps.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
 from benchnav.core.errors import expect
@@ -63,9 +64,7 @@ def check_places(places: PlacesRule, grid: Grid) -> None:
     )
 
 
-def draw_places(
-    places: PlacesRule, grid: Grid, key: int, indices: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def draw_places(places: PlacesRule, grid: Grid, key: int, indices: ndarray) -> tuple[ndarray, ndarray]:
     """Draws start and goal of some maps: of a map's candidate pairs the first that is far enough apart.
 
     Where none is, as may be when hardly any two places are so far apart, opposite corners are taken.
@@ -89,7 +88,7 @@ def draw_places(
     return chosen[:, 0], chosen[:, 1]
 
 
-def _inside(places: PlacesRule, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _inside(places: PlacesRule, grid: Grid) -> tuple[ndarray, ndarray]:
     """The first step inside the margin along x and y, and the number of steps inside, each of shape [2]."""
     extent = np.asarray(grid.extent_m)
     first = np.ceil(places.margin_m * _STEPS_A_M)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy import ndarray
 
 from benchnav.core.copula import LONGEST_CORRELATION
 from benchnav.core.errors import ConfigError, expect
@@ -125,7 +126,7 @@ class Recipe:
         """Size and resolution of every map."""
         return Grid(self.height, self.width, self.resolution_m)
 
-    def cells_of(self, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
         """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
         column, row = (
             np.floor(positions_m.astype(np.float32) / np.float32(self.resolution_m)).astype(np.int64).T
@@ -140,7 +141,7 @@ class Recipe:
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     @cached_property
-    def environment_classes(self) -> np.ndarray:
+    def environment_classes(self) -> ndarray:
         """The classes that each environment shows: indices, distinct in a row, shape [E, len(occupancy)]."""
         shown = len(self.occupancy)
         if self.synthesis == 1:

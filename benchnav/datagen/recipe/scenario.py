@@ -142,10 +142,9 @@ def find_series(splits: Iterable[str]) -> SeriesOfShifts:
             severity = int(hundredths) / 100 if hundredths else float(named["severity"])
             all_series.setdefault(named["scenario"], []).append((severity, split))
     for scenario, pairs in all_series.items():
-        folder, slash, _ = scenario.rpartition("/")
-        if f"{folder}{slash}std" in splits and all(severity > 0 for severity, _ in pairs):
-            pairs.append((0.0, f"{folder}{slash}std"))
-        if scenario in splits and all(severity != 1 for severity, _ in pairs):
-            pairs.append((1.0, scenario))
+        std = f"{scenario[: scenario.rfind('/') + 1]}std"
+        for severity, split in ((0.0, std), (1.0, scenario)):
+            if split in splits and severity not in dict(pairs):
+                pairs.append((severity, split))
         pairs.sort()
     return {scenario: pairs for scenario, pairs in all_series.items() if len(pairs) > 1}

@@ -7,11 +7,12 @@ Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) f
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
 
 
-def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: float) -> np.ndarray:
+def fractal(key: int, indices: ndarray, shape: tuple[int, int], roughness: float) -> ndarray:
     """Synthesises fractal surfaces from a power-law spectrum.
 
     Args:
@@ -32,11 +33,11 @@ def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: fl
 
 def open_fractal(
     key: int,
-    indices: np.ndarray,
+    indices: ndarray,
     shape: tuple[int, int],
     roughness: float,
     reference_cells: int,
-) -> np.ndarray:
+) -> ndarray:
     """Synthesises pieces of fractal ground that goes on beyond the map.
 
     The spectrum is `fractal`'s for wavelengths under the reference side and levels off above it (von
@@ -67,24 +68,24 @@ def open_fractal(
     return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
 
 
-def _frequencies(shape: tuple[int, int]) -> np.ndarray:
+def _frequencies(shape: tuple[int, int]) -> ndarray:
     """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
     return np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
 
 
-def _filtered(white: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+def _filtered(white: ndarray, amplitude: ndarray) -> ndarray:
     """Noise of a spectrum, shape of `white`, [B, H, W]."""
     return np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=white.shape[1:])
 
 
 def place_craters(
     key: int,
-    indices: np.ndarray,
+    indices: ndarray,
     extent_m: tuple[float, float],
-    count: np.ndarray,
+    count: ndarray,
     radius_m: tuple[float, float],
     most: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[ndarray, ndarray]:
     """Draws centres and radii of craters whose rims do not overlap, by sequential rejection.
 
     Args:
@@ -118,12 +119,12 @@ def place_craters(
 
 
 def crater_elevation(
-    centres_m: np.ndarray,
-    radii_m: np.ndarray,
+    centres_m: ndarray,
+    radii_m: ndarray,
     shape: tuple[int, int],
     resolution_m: float,
     depth_ratio: float,
-) -> np.ndarray:
+) -> ndarray:
     """Raises rims and sinks parabolic bowls.
 
     Args:

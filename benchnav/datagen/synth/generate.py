@@ -5,6 +5,7 @@ float64. Letters in shapes: B maps, H×W cells.
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import copula, gridgraph, rng
 from benchnav.core.errors import ConfigError
@@ -21,7 +22,7 @@ _PIECE = 16  # maps at a time, so that what is worked on stays in the processor'
 _PIECE_CELLS = 2**20
 
 
-def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
+def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     """Makes some maps of a split.
 
     Args:
@@ -46,7 +47,7 @@ def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
     }
 
 
-def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
+def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     maps, pending = Maps(), np.arange(len(indices))
     for attempt in range(MOST_ATTEMPTS):
         drawn = _draw(recipe, split, indices[pending], attempt)
@@ -64,7 +65,7 @@ def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
     )
 
 
-def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
+def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
     """Grid reference time: least time from start to goal over truly free cells at a commanded 1 m/s.
 
     A reference, not a bound: the grid has eight headings, and noise is at its mean.
@@ -81,7 +82,7 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     return cost[(every, *recipe.cells_of(maps["start_m"]))]
 
 
-def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0) -> np.ndarray:
+def class_map(recipe: Recipe, split: str, indices: ndarray, attempt: int = 0) -> ndarray:
     """Lays out the classes of each map's environment; maps show the environments in turns.
 
     Returns:
@@ -101,9 +102,9 @@ def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0)
 def complete(
     recipe: Recipe,
     split: str,
-    indices: np.ndarray,
-    class_id: np.ndarray,
-    framed_m: np.ndarray,
+    indices: ndarray,
+    class_id: ndarray,
+    framed_m: ndarray,
     attempt: int = 0,
 ) -> Maps:
     """Derives all else from classes and elevation: slope, colour under a random light, λ.
@@ -157,7 +158,7 @@ def complete(
     }
 
 
-def _draw(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
+def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
     """Draws maps that may or may not be solvable; see `complete`."""
 
     def key(purpose: str) -> int:
@@ -184,5 +185,5 @@ def _draw(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps
     return complete(recipe, split, indices, class_id, framed(ground), attempt)
 
 
-def _within(limits: tuple[float, float], share: np.ndarray) -> np.ndarray:
+def _within(limits: tuple[float, float], share: ndarray) -> ndarray:
     return limits[0] + (limits[1] - limits[0]) * share

@@ -4,9 +4,10 @@ Source: Horn (1981), "Hill shading and the reflectance map".
 """
 
 import numpy as np
+from numpy import ndarray
 
 
-def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndarray, np.ndarray]:
+def horn_gradient(elevation_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
     """Estimates ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
 
     At the border the surface is continued linearly, so that planes are exact everywhere.
@@ -21,7 +22,7 @@ def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndar
     return framed_gradient(framed(elevation_m), resolution_m)
 
 
-def framed_gradient(framed_m: np.ndarray, resolution_m: float) -> tuple[np.ndarray, np.ndarray]:
+def framed_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
     """Estimates ∂z/∂x and ∂z/∂y as `horn_gradient` does, with the ground one cell beyond the map.
 
     Args:
@@ -42,7 +43,7 @@ def framed_gradient(framed_m: np.ndarray, resolution_m: float) -> tuple[np.ndarr
     return along_x, along_y
 
 
-def inclination_deg(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
     """Angle between the ground and the horizontal.
 
     Args:
@@ -57,12 +58,12 @@ def inclination_deg(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
     return angle
 
 
-def framed(elevation_m: np.ndarray) -> np.ndarray:
+def framed(elevation_m: ndarray) -> ndarray:
     """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H + 2, W + 2]."""
     return np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
 
 
-def _continue_linearly(framed_m: np.ndarray) -> np.ndarray:
+def _continue_linearly(framed_m: ndarray) -> ndarray:
     """Where the frame is not known, takes the plane through the two cells next to it."""
     z = framed_m.copy()
     for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
