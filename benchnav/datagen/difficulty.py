@@ -55,27 +55,25 @@ class Difficulty:
     reference_times_s: ndarray
 
 
-def of_maps(maps: Maps, recipe: Recipe) -> Difficulty:
-    """Measures some maps.
-
-    Args:
-        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
-        recipe: class table, resolution and λ_stuck.
-    """
-    return _summarise([_measure(maps, recipe)])
-
-
 def of_split(dataset: TerrainDataset, split: str) -> Difficulty:
     """Measures all maps of a split, some at a time.
 
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    return _summarise(_measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS))
+    return summarise(measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS))
 
 
-def _measure(maps: Maps, recipe: Recipe) -> Maps:
-    """The figures of each map, as `Difficulty` has them of all, each of shape [B]."""
+def measure(maps: Maps, recipe: Recipe) -> Maps:
+    """Measures some maps.
+
+    Args:
+        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
+        recipe: class table, resolution and λ_stuck.
+
+    Returns:
+        The figures of each map, as `Difficulty` has them of all, each of shape [B].
+    """
     slope = maps["slope_deg"].astype(np.float64)
     expected = latent.expected_of(latent.truth(maps["class_id"], slope, recipe.classes))
     stuck = expected <= recipe.stuck_threshold  # not where it is NaN
@@ -92,7 +90,8 @@ def _measure(maps: Maps, recipe: Recipe) -> Maps:
     }
 
 
-def _summarise(pieces: Iterable[Maps]) -> Difficulty:
+def summarise(pieces: Iterable[Maps]) -> Difficulty:
+    """Puts what `measure` gave of some maps after others together."""
     parts = list(pieces)
     maps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     times = maps["reference_times_s"]

@@ -72,35 +72,36 @@ def find_faults(path: str | Path) -> list[Fault]:
         DatasetError: the file or its manifest cannot be read at all.
     """
     dataset = TerrainDataset(path)
-    return [fault for split in dataset.splits for fault in _split_faults(dataset, split)]
+    return [Fault(split, *about) for split in dataset.splits for about in _split_faults(dataset, split)]
 
 
-def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
+def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, str, str, str]]:
+    """The faults of a split: map, field, problem and file of each."""
     fields, count = list(dataset.fields), dataset.map_count(split)
     stored = np.zeros((count, len(fields), schema.DIGEST_BYTES), np.uint8)
     computed = np.zeros_like(stored)
     is_read = {name: np.zeros(count, dtype=bool) for name in (*fields, schema.ENTRY_DIGESTS)}
     files: list[str] = []  # of each map
     for piece in dataset.pieces(split):
-        file_name = piece.path.name if piece.path != dataset.path else ""
-        files += [file_name] * piece.maps
+        own = piece.path.name if piece.path != dataset.path else ""
+        files += [own] * piece.maps
         try:
             file = open_file(piece.path)
         except DatasetError:
-            yield Fault(split, -1, "", _MISSING, file_name)
+            yield -1, "", _MISSING, own
             continue
         with file:
             for name in is_read:
                 try:
                     array = dataset.stored_array(file, split, name, piece.maps)
                 except (*READ_ERRORS, TypeError, AttributeError) as error:
-                    problem = str(error).removeprefix("it ") if type(error) is ValueError else _MISSING
-                    yield Fault(split, -1, name, problem, file_name)
+                    is_other = type(error) is ValueError
+                    yield -1, name, str(error).removeprefix("it ") if is_other else _MISSING, own
                     continue
                 for place, values in _read_some(array):
                     first = piece.first + place
                     if values is None:
-                        yield Fault(split, first, name, "is damaged", file_name)
+                        yield first, name, "is damaged", own
                         continue
                     maps = slice(first, first + len(values))
                     is_read[name][maps] = True
@@ -108,21 +109,21 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
                         stored[maps] = values
                         continue
                     for index in _out_of_range(dataset, split, name, values):
-                        yield Fault(split, first + index, name, "is out of range", file_name)
-                    own = {name: dataset.fields[name]}
-                    computed[maps, fields.index(name)] = schema.entry_digests({name: values}, own)[:, 0]
+                        yield first + index, name, "is out of range", own
+                    digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
+                    computed[maps, fields.index(name)] = digests[:, 0]
     readable = np.stack([is_read[name] for name in fields], axis=1)
     unlike = (computed != stored).any(axis=2) & readable & is_read[schema.ENTRY_DIGESTS][:, None]
     digest = schema.split_digest(computed, *dataset.grid.shape, dataset.fields)
     if readable.all() and digest == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
         for index in np.flatnonzero(unlike.any(axis=1)).tolist():
-            yield Fault(split, index, schema.ENTRY_DIGESTS, "does not match the map", files[index])
+            yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
     for index, column in np.argwhere(unlike).tolist():
-        yield Fault(split, index, fields[column], "does not match its digest", files[index])
+        yield index, fields[column], "does not match its digest", files[index]
     if readable.all() and not unlike.any():
-        yield Fault(split, -1, "", "the maps do not match the digest in the manifest")
+        yield -1, "", "the maps do not match the digest in the manifest", ""
 
 
 def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
