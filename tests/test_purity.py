@@ -65,7 +65,7 @@ def test_datagen() -> None:
     maps = generate(tiny_recipe(), "test/hg", np.arange(2))
     same_after(lambda: entry_digests(maps, FIELDS), *maps.values())
     entry = {"scenario": "hg", "maps": 2, "parts": []}
-    same_after(lambda: pack("d", tiny_recipe(), "test/hg", entry, maps), *maps.values())
+    same_after(lambda: pack(tiny_recipe(), "test/hg", entry, maps), *maps.values())
 
 
 def maps_of(problem: Problem) -> tuple[torch.Tensor, ...]:

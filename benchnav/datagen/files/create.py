@@ -128,7 +128,7 @@ def create(
                 shutil.rmtree(folder)
 
 
-def cut(recipe: Recipe, cells: int = SHARD_CELLS) -> list[ShardFile]:
+def cut(recipe: Recipe, cells: int) -> list[ShardFile]:
     """Cuts a recipe into shards of about so many cells, in the order of splits and maps."""
     size = max(1, cells // (recipe.height * recipe.width))
     return [

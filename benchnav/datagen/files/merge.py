@@ -166,13 +166,12 @@ def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
     """What the maps of a split are by their recipes: scenario, and whether all can be solved."""
     kinds = set()
     for part in dataset.splits[split]["parts"]:
-        if "recipe" not in part:
-            kinds.add("imported")
-            continue
-        recipe = dataset.manifest["recipes"][part["recipe"]]
-        spec = recipe["splits"][part["split"]]
-        scenario = recipe["scenarios"][spec["scenario"]]
-        kinds.add(json.dumps([spec["scenario"], scenario, spec["solvable"]], sort_keys=True))
+        kind: Any = "imported"
+        if "recipe" in part:
+            recipe = dataset.manifest["recipes"][part["recipe"]]
+            spec = recipe["splits"][part["split"]]
+            kind = [spec["scenario"], recipe["scenarios"][spec["scenario"]], spec["solvable"]]
+        kinds.add(json.dumps(kind, sort_keys=True))
     return kinds
 
 
