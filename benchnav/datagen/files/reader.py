@@ -38,6 +38,8 @@ CHUNK_CELLS = 2**17
 _MOST_OPEN = 100  # files that a process keeps open; far fewer than systems allow
 FOLDER_MANIFEST = "manifest.json"
 
+Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
+
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
@@ -76,11 +78,11 @@ class TerrainDataset:
         """Reads and checks the manifest."""
         self.path, self.keep_open = Path(path), keep_open
         self.manifest: dict[str, Any] = read_manifest(self.path)
-        self._opened: tuple[int, dict[Path, tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]]] = (0, {})
+        self._opened: dict[tuple[int, Path], Opened] = {}  # by process, since one's files are not for another
 
     def __getstate__(self) -> dict[str, Any]:
         """Leaves out the open files, so that it may be sent to other processes."""
-        return self.__dict__ | {"_opened": (0, {})}
+        return self.__dict__ | {"_opened": {}}
 
     @property
     def id(self) -> str:
@@ -262,7 +264,7 @@ class TerrainDataset:
 
     def _piece_of(self, split: str, index: int) -> Piece:
         pieces = self._pieces[split]
-        return pieces[0 if len(pieces) == 1 else bisect_right(pieces, index, key=attrgetter("first")) - 1]
+        return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1]
 
     def read_run(self, split: str, first: int, count: int, names: Collection[str]) -> Maps:
         """Reads maps that follow one another in a file, as `read` does; what is asked for has to be there."""
@@ -274,9 +276,11 @@ class TerrainDataset:
             for name in names:
                 if (split, name) not in arrays:
                     arrays[split, name] = self.stored_array(file, split, name, piece.maps)
-                read[name] = _values(arrays[split, name], which)
-                if name == "class_id" and ((read[name] > most) & (read[name] != schema.UNLABELLED)).any():
-                    raise ValueError(f"it has classes beyond {most}")
+                read[name] = values = _values(arrays[split, name], which)
+                # The greatest is looked at first, since that is quicker than to compare each.
+                if name == "class_id" and values.max(initial=0) > most:
+                    if ((values > most) & (values != schema.UNLABELLED)).any():
+                        raise ValueError(f"it has classes beyond {most}")
         except READ_ERRORS as error:
             raise damage(piece.path, split, name, error) from error
         finally:
@@ -284,18 +288,16 @@ class TerrainDataset:
                 file.close()
         return read
 
-    def _open(self, path: Path) -> tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]:
+    def _open(self, path: Path) -> Opened:
         """A file, and those of its arrays that were read before, by split and name."""
         if not self.keep_open:
             return open_file(path), {}
-        if self._opened[0] != os.getpid():  # another process's files are not for this one
-            self._opened = os.getpid(), {}
-        opened = self._opened[1]
-        if path not in opened:
-            if len(opened) == _MOST_OPEN:
-                opened.pop(next(iter(opened)))[0].close()
-            opened[path] = open_file(path), {}
-        return opened[path]
+        place = os.getpid(), path
+        if place not in self._opened:
+            if len(self._opened) == _MOST_OPEN:
+                self._opened.pop(next(iter(self._opened)))[0].close()
+            self._opened[place] = open_file(path), {}
+        return self._opened[place]
 
     def stored_array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
         """An array of so many maps in a file; refuses, by a ValueError, one that is not what the manifest says."""
