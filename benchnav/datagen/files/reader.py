@@ -278,9 +278,9 @@ class TerrainDataset:
                     arrays[split, name] = self.stored_array(file, split, name, piece.maps)
                 read[name] = values = _values(arrays[split, name], which)
                 # The greatest is looked at first, since that is quicker than to compare each.
-                if name == "class_id" and values.max(initial=0) > most:
-                    if ((values > most) & (values != schema.UNLABELLED)).any():
-                        raise ValueError(f"it has classes beyond {most}")
+                is_beyond = name == "class_id" and values.max(initial=0) > most
+                if is_beyond and ((values > most) & (values != schema.UNLABELLED)).any():
+                    raise ValueError(f"it has classes beyond {most}")
         except READ_ERRORS as error:
             raise damage(piece.path, split, name, error) from error
         finally:
