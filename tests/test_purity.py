@@ -53,7 +53,7 @@ def test_datagen() -> None:
     light = appearance.light_direction(np.zeros(2), np.full(2, 0.5))
     classes = load_recipe("paper-v1").classes
     colours = np.full((10, 3), 99.0)
-    same_after(lambda: slope.slope_deg(z, 0.5), z)
+    same_after(lambda: slope.inclination_deg(*slope.horn_gradient(z, 0.5)), z)
     same_after(lambda: appearance.shade(z, 0.5, light, 0.1), z, light)
     same_after(lambda: appearance.paint(class_id, colours, z), class_id, colours, z)
     same_after(lambda: appearance.class_bands(z, np.array([0.5, 0.5])), z)
@@ -64,7 +64,7 @@ def test_datagen() -> None:
     maps = generate(tiny_recipe(), "test/hg", np.arange(2))
     same_after(lambda: entry_digests(maps, FIELDS), *maps.values())
     entry = {"scenario": "hg", "maps": 2, "parts": []}
-    same_after(lambda: pack("d", tiny_recipe(), "test/hg", entry, maps), *maps.values())
+    same_after(lambda: pack(tiny_recipe(), "test/hg", entry, maps), *maps.values())
 
 
 def maps_of(problem: Problem) -> tuple[torch.Tensor, ...]:

@@ -9,16 +9,17 @@ Batched NumPy in float64, the same on every machine. Letters in shapes: B fields
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 
 LONGEST_CORRELATION = 1 / 4  # of a map's shorter side, so that the torus it is made on does not show
 
 
 def correlated_normal(
-    key: int, indices: np.ndarray, shape: tuple[int, int], correlation_cells: float
-) -> np.ndarray:
+    key: int, indices: ndarray, shape: tuple[int, int], correlation_cells: float
+) -> ndarray:
     """Draws fields of standard normals.
 
     Args:
@@ -35,11 +36,11 @@ def correlated_normal(
         ConfigError: ℓ is out of range.
     """
     height, width = shape
-    if not 0 <= correlation_cells <= LONGEST_CORRELATION * min(shape):
-        raise ConfigError(
-            "Expected a correlation length of at most a quarter of the map's shorter side, "
-            f"{LONGEST_CORRELATION * min(shape):g} cells, got {correlation_cells:g} cells."
-        )
+    expect(
+        0 <= correlation_cells <= LONGEST_CORRELATION * min(shape),
+        "a correlation length of at most a quarter of the map's shorter side, "
+        f"{LONGEST_CORRELATION * min(shape):g} cells, got {correlation_cells:g} cells.",
+    )
     white = rng.normal(key, indices, (2 * height, 2 * width))
     if correlation_cells == 0:
         return white[:, :height, :width].copy()
@@ -49,7 +50,7 @@ def correlated_normal(
     return field[:, :height, :width].copy()
 
 
-def _bell(size: int, correlation_cells: float) -> np.ndarray:
+def _bell(size: int, correlation_cells: float) -> ndarray:
     """exp(−d²/ℓ²) at the distances of cells from the first one on a ring, shape [size]."""
     distance = np.minimum(np.arange(size), size - np.arange(size))
     return np.exp(-((distance / correlation_cells) ** 2))

@@ -16,6 +16,20 @@ class ConfigError(BenchnavError, ValueError):
     """A setting, recipe or argument is not usable as given."""
 
 
+def expect(holds: object, what: str) -> None:
+    """Refuses a setting, recipe or argument that is not usable.
+
+    Args:
+        holds: whether it is.
+        what: the argument, what was expected, what came and what to do, in a sentence that goes on from "Expected".
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if not holds:
+        raise ConfigError(f"Expected {what}")
+
+
 class DatasetError(BenchnavError):
     """A dataset file is missing, damaged, of another format, or lacks what was asked for."""
 

@@ -10,7 +10,7 @@ PyTorch is imported where it is called: making and listing datasets does without
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,10 +32,8 @@ class Grid:
 
     def __post_init__(self) -> None:
         """Refuses empty grids and resolutions that are not positive."""
-        if self.height < 3 or self.width < 3:
-            raise ConfigError(f"Expected a grid of at least 3×3 cells, got {self.height}×{self.width}.")
-        if not 0 < self.resolution_m < float("inf"):
-            raise ConfigError(f"Expected `resolution_m` > 0, got {self.resolution_m}.")
+        expect(min(self.shape) >= 3, f"a grid of at least 3×3 cells, got {self.height}×{self.width}.")
+        expect(0 < self.resolution_m < float("inf"), f"`resolution_m` > 0, got {self.resolution_m}.")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -7,6 +7,7 @@ Letters in shapes: B maps, H×W cells; a cell's flat index is row·W + column.
 from functools import lru_cache
 
 import numpy as np
+from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -14,7 +15,7 @@ NO_CELL = -1
 
 
 @lru_cache(maxsize=8)
-def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def neighbour_pairs(height: int, width: int) -> tuple[ndarray, ndarray, ndarray]:
     """Lists the directed edges between 8-connected cells, in the order of their targets.
 
     Returns:
@@ -22,21 +23,15 @@ def neighbour_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np
         widths (1 or √2), each of shape [E]. The arrays are shared: do not write to them.
     """
     index = np.arange(height * width).reshape(height, width)
-    sources, targets, lengths = [], [], []
-    for step_y, step_x in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = index[: height - step_y, max(0, -step_x) : width - max(0, step_x)].ravel()
-        there = index[step_y:, max(0, step_x) : width + min(0, step_x)].ravel()
-        sources += [here, there]
-        targets += [there, here]
-        lengths += [np.full(2 * here.size, np.hypot(step_x, step_y))]
-    source, target, length = (np.concatenate(parts) for parts in (sources, targets, lengths))
-    order = np.lexsort((source, target))
-    return source[order], target[order], length[order]
+    padded = np.pad(index, 1, constant_values=NO_CELL)
+    # Of each cell the nine around it, row by row.
+    around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(-1, 9)
+    lengths = np.hypot(*(np.indices((3, 3)) - 1)).ravel()
+    target, place = np.nonzero((around != NO_CELL) & (lengths > 0))
+    return around[target, place], target, lengths[place]
 
 
-def cost_to_go(
-    edge_costs: np.ndarray, goals: np.ndarray, shape: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
+def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> tuple[ndarray, ndarray]:
     """Finds the least cost from every cell to the nearest goal cell of its own map.
 
     Args:
@@ -69,7 +64,7 @@ def cost_to_go(
     return cost.reshape(batch, *shape), np.where(following >= 0, following - offset, NO_CELL)
 
 
-def travel_time_costs(traversability: np.ndarray, free: np.ndarray, resolution_m: float) -> np.ndarray:
+def travel_time_costs(traversability: ndarray, free: ndarray, resolution_m: float) -> ndarray:
     """Gives the time each edge takes at a commanded 1 m/s, each half at its own cell's speed.
 
     Args:

@@ -14,6 +14,7 @@ import json
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy import ndarray
 
 if TYPE_CHECKING:
     import torch
@@ -29,7 +30,7 @@ def stream_key(seed: int, *names: Name) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
 
 
-def random_bits(key: int, indices: np.ndarray, count: int) -> np.ndarray:
+def random_bits(key: int, indices: ndarray, count: int) -> ndarray:
     """Draws the raw bits of some elements of a stream.
 
     Args:
@@ -54,7 +55,7 @@ def random_bits(key: int, indices: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate(words).reshape(len(indices), -1)[:, :count]
 
 
-def uniform(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
+def uniform(key: int, indices: ndarray, shape: tuple[int, ...] = ()) -> ndarray:
     """Draws uniforms in the open interval (0, 1), float64, shape [B, *shape]."""
     bits = random_bits(key, indices, int(np.prod(shape, dtype=int)))
     drawn = (bits >> np.uint64(11)).astype(np.float64)
@@ -65,7 +66,7 @@ def uniform(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.nd
     return drawn.reshape(len(bits), *shape)
 
 
-def normal(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
+def normal(key: int, indices: ndarray, shape: tuple[int, ...] = ()) -> ndarray:
     """Draws standard normals by inversion, float64, shape [B, *shape]."""
     from scipy.special import ndtri
 
@@ -73,7 +74,7 @@ def normal(key: int, indices: np.ndarray, shape: tuple[int, ...] = ()) -> np.nda
     return ndtri(drawn, out=drawn)
 
 
-def permutation(key: int, indices: np.ndarray, n: int) -> np.ndarray:
+def permutation(key: int, indices: ndarray, n: int) -> ndarray:
     """Draws uniformly random permutations of range(n), int64, shape [B, n]."""
     return np.argsort(uniform(key, indices, (n,)), axis=1, kind="stable")
 

@@ -4,13 +4,13 @@ Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 
@@ -35,11 +35,11 @@ class Observation:
         """Checks that the layers fit the grid and one another."""
         batch = self.rgb.shape[0]
         _check_shapes(self.grid, batch, elevation_m=self.elevation_m, slope_deg=self.slope_deg)
-        if self.rgb.dtype != torch.uint8 or self.rgb.shape != (batch, 3, *self.grid.shape):
-            raise ConfigError(
-                f"Expected `rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
-                f"got {self.rgb.dtype} of shape {list(self.rgb.shape)}."
-            )
+        expect(
+            self.rgb.dtype == torch.uint8 and self.rgb.shape == (batch, 3, *self.grid.shape),
+            f"`rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
+            f"got {self.rgb.dtype} of shape {list(self.rgb.shape)}.",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,22 +88,17 @@ class Terrain:
 
     def select(self, members: Tensor) -> "Terrain":
         """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
-        kept: dict[str, Any] = {}
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, TraversabilityMixture):
-                kept[f.name] = value.select(members)
-            else:
-                kept[f.name] = value[members] if isinstance(value, Tensor) else value
-        return Terrain(**kept)
+        layers: dict[str, Any] = {
+            name: layer[members] for name, layer in vars(self).items() if isinstance(layer, Tensor)
+        }
+        return replace(self, truth=self.truth.select(members), **layers)
 
     def to(self, device: torch.device | str) -> "Terrain":
         """The maps on a device."""
-        movable = (Tensor, TraversabilityMixture)
-        moved: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name, value in moved.items():
-            moved[name] = value.to(device) if isinstance(value, movable) else value
-        return Terrain(**moved)
+        layers: dict[str, Any] = {
+            name: layer.to(device) for name, layer in vars(self).items() if isinstance(layer, Tensor)
+        }
+        return replace(self, truth=self.truth.to(device), **layers)
 
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""
@@ -112,8 +107,8 @@ class Terrain:
 
 def _check_shapes(grid: Grid, batch: int, **layers: Tensor) -> None:
     for name, layer in layers.items():
-        if layer.shape != (batch, *grid.shape):
-            raise ConfigError(
-                f"Expected `{name}` of shape [{batch}, {grid.height}, {grid.width}], "
-                f"got {list(layer.shape)}. Pass a batch of maps on one grid."
-            )
+        expect(
+            layer.shape == (batch, *grid.shape),
+            f"`{name}` of shape [{batch}, {grid.height}, {grid.width}], got {list(layer.shape)}. "
+            "Pass a batch of maps on one grid.",
+        )

@@ -1,17 +1,21 @@
-"""The command `benchnav-datagen`: make, list, show, check, combine, import, export and draw datasets."""
+"""The command `benchnav-datagen`: make, list, show, check, combine, import, export and draw datasets.
+
+What is heavy is imported where it is called, or asked of `datagen` there, so that the command's help is quick.
+"""
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from benchnav.core.command import INTERRUPTED, Command, run
-from benchnav.datagen.dem.command import import_dem
-from benchnav.datagen.export.command import export
+from benchnav import datagen
+from benchnav.core.command import INTERRUPTED, Command, run, show_progress
+from benchnav.core.errors import DatasetError, expect
+from benchnav.core.store import output_path, read_shard, replacing
+from benchnav.core.tables import Table, print_table
 
 if TYPE_CHECKING:
-    from benchnav.datagen.files.check import Fault
     from benchnav.datagen.files.reader import TerrainDataset
 
 
@@ -47,41 +51,38 @@ def create(
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
         overwrite: Replace what is there.
     """
-    from benchnav.core.command import show_progress
-    from benchnav.core.errors import ConfigError
-    from benchnav.core.store import output_path, read_shard
-    from benchnav.core.tables import print_table
     from benchnav.datagen.difficulty import table
     from benchnav.datagen.files.create import create as create_dataset
     from benchnav.datagen.files.describe import say_written
-    from benchnav.datagen.files.reader import TerrainDataset, is_dataset
-    from benchnav.datagen.recipe.recipe import load_recipe
+    from benchnav.datagen.files.reader import is_dataset
 
-    if jobs < 1:
-        raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
-    if (backend == "dask") != bool(scheduler):
-        raise ConfigError("Expected `backend` dask and `scheduler` together, got one without the other.")
+    expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
+    expect(
+        (backend == "dask") == bool(scheduler),
+        "`backend` dask and `scheduler` together, got one without the other.",
+    )
+    expect(first >= 0, f"`first` ≥ 0, got {first}.")
     own = read_shard(shard)
-    chosen = load_recipe(recipe, overrides)
+    chosen = datagen.load_recipe(recipe, overrides)
     if seed is not None and seed != chosen.seed:
         chosen = replace(chosen, seed=seed, id=f"{chosen.id}-seed{seed}")
-    if splits is not None:
-        unknown = [name for name in splits if name not in chosen.splits]
-        if unknown or not splits:
-            raise ConfigError(f"Expected `splits` among {sorted(chosen.splits)}, got {unknown or 'none'}.")
-        chosen = replace(
-            chosen, splits={name: chosen.splits[name] for name in chosen.splits if name in splits}
-        )
-    if first < 0:
-        raise ConfigError(f"Expected `first` ≥ 0, got {first}.")
-    if first:
-        kept = {name: replace(spec, maps=min(first, spec.maps)) for name, spec in chosen.splits.items()}
-        chosen = replace(chosen, splits=kept)
-    cells = sum(spec.maps for spec in chosen.splits.values()) * chosen.height * chosen.width
+    names = list(chosen.splits) if splits is None else splits
+    unknown = [name for name in names if name not in chosen.splits]
+    expect(names and not unknown, f"`splits` among {sorted(chosen.splits)}, got {unknown or 'none'}.")
+    sizes = {
+        name: replace(spec, maps=min(first or spec.maps, spec.maps))
+        for name, spec in chosen.splits.items()
+        if name in names
+    }
+    chosen = replace(chosen, splits=sizes)
+    cells = sum(spec.maps for spec in sizes.values()) * chosen.height * chosen.width
     is_folder = own is not None or cells > _MOST_CELLS_OF_A_FILE
     path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = create_dataset(chosen, path, jobs, scheduler, own, overwrite)
-    show_progress(_tell_kept(steps), "maps")
+    done, total = next(steps)
+    if done:
+        print(f"{done} of {total} maps were there already", file=sys.stderr)
+    show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
         print(f"{path}: shard {own} is made")
         print(
@@ -89,9 +90,9 @@ def create(
         )
         print("same folder, nothing more: the last of them finishes it")
         return
-    made = TerrainDataset(path)
-    say_written(made)
-    print_table(table(made))
+    dataset = datagen.TerrainDataset(path)
+    say_written(dataset)
+    print_table(table(dataset))
 
 
 def list_datasets(folder: str = "") -> None:
@@ -100,24 +101,21 @@ def list_datasets(folder: str = "") -> None:
     Args:
         folder: Where to look for files; where ids are looked up when not given.
     """
-    from benchnav.core.errors import DatasetError
-    from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset, dataset_folders
-    from benchnav.datagen.recipe.recipe import shipped_recipes, shipped_sizes
+    from benchnav.datagen.files.reader import FOLDER_MANIFEST, dataset_folders
+    from benchnav.datagen.recipe.recipe import shipped_sizes
 
     print("recipes:")
-    for name in shipped_recipes():
+    for name in datagen.shipped_recipes():
         sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
         print(f"  {name:12} {sizes}")
-    if folder and not Path(folder).is_dir():
-        raise DatasetError(f"Expected `folder` to be one, got {folder!r}.")
+    expect(not folder or Path(folder).is_dir(), f"`folder` to be one, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
-        files = sorted(
-            [*place.glob("*.h5"), *(manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}"))]
-        )
+        folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
+        files = sorted([*place.glob("*.h5"), *folders])
         print(f"files in {place}:" if files else f"no files in {place}")
         for path in files:
             try:
-                dataset = TerrainDataset(path)
+                dataset = datagen.TerrainDataset(path)
             except DatasetError as error:
                 print(f"  {path.name:20} not readable: {error}")
                 continue
@@ -134,11 +132,9 @@ def show(file: str, json: bool = False) -> None:
     """
     from json import dumps
 
-    from benchnav.core.tables import Table, print_table
     from benchnav.datagen.files.describe import describe, tables
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
-    described = describe(TerrainDataset(find_dataset(file)))
+    described = describe(_opened(file))
     if json:
         print(dumps(described, indent=1))
         return
@@ -155,11 +151,9 @@ def validate(file: str) -> int:
     Args:
         file: Path or id of a dataset.
     """
-    from benchnav.core.errors import DatasetError
     from benchnav.datagen.files.check import find_faults, summarise
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
-    path = find_dataset(file)
+    path = datagen.find_dataset(file)
     try:
         faults = find_faults(path)
     except DatasetError as error:
@@ -167,24 +161,22 @@ def validate(file: str) -> int:
         return 1
     for line in summarise(faults):
         print(line)
-    dataset = TerrainDataset(path)
-    if faults:
-        print(f"{path}: {len(faults)} fault(s)\n{_remedy(dataset, faults)}")
-        return 1
-    splits = dataset.splits
-    print(f"{path}: sound, {sum(entry['maps'] for entry in splits.values())} maps in {len(splits)} split(s)")
-    return 0
-
-
-def _remedy(dataset: "TerrainDataset", faults: "list[Fault]") -> str:
-    """How damaged maps are made anew."""
-    if not all("recipe" in part for entry in dataset.splits.values() for part in entry["parts"]):
-        return "These maps were imported: import them again."
+    entries = datagen.TerrainDataset(path).splits.values()
+    if not faults:
+        print(f"{path}: sound, {sum(entry['maps'] for entry in entries)} maps in {len(entries)} split(s)")
+        return 0
+    print(f"{path}: {len(faults)} fault(s)")
     files = sorted({fault.file for fault in faults if fault.file})
-    if files:
-        names = " ".join(files)
-        return f"To make them anew, remove {names} in {dataset.path} and give the command again that made it."
-    return "To make them anew, make the file again with --overwrite: the same recipe and version give the same digests."
+    if not all("recipe" in part for entry in entries for part in entry["parts"]):
+        print("These maps were imported: import them again.")
+    elif files:
+        print(
+            f"To make them anew, remove {' '.join(files)} in {path} and give the command again that made it."
+        )
+    else:
+        same = "the same recipe and version give the same digests"
+        print(f"To make them anew, make the file again with --overwrite: {same}.")
+    return 1
 
 
 def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> None:
@@ -196,16 +188,144 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
         id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
         overwrite: Replace what is there.
     """
-    from benchnav.core.command import show_progress
-    from benchnav.core.store import output_path
     from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.merge import merge as merge_datasets
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 
     path = output_path(out)
-    sources = [Path(file) if Path(file).is_dir() else find_dataset(file) for file in files]
+    sources = [Path(file) if Path(file).is_dir() else datagen.find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
-    say_written(TerrainDataset(path))
+    say_written(datagen.TerrainDataset(path))
+
+
+def import_dem(
+    dem: str,
+    overrides: list[str],
+    out: str,
+    id: str = "",
+    recipe: str = "paper-v1",
+    splits: str = "test/real",
+    stride: float | None = None,
+    scenario: str = "std",
+    classes: str = "",
+    class_ids: dict[int, str | None] | None = None,
+    random_classes: bool = False,
+    photo: str = "",
+    traversability: str = "",
+    solvable: bool = False,
+    overwrite: bool = False,
+) -> None:
+    """Make a dataset from a real elevation model; needs the extra benchnav[geo].
+
+    Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip:// archives, mosaics (.vrt).
+
+    Args:
+        dem: Raster of elevations in metres, in any coordinate reference system.
+        overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
+        out: File .h5 to write, or else a folder of many files.
+        id: Id of the dataset; the name of the output when not given.
+        recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
+        splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
+        stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
+        scenario: Which of the recipe's scenarios lights the maps.
+        classes: Raster of terrain classes; laid out at random when not given.
+        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
+        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
+        photo: Raster of red, green and blue; painted by the class when not given.
+        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
+        solvable: Keep only maps whose goal can be reached, and store the grid reference time.
+        overwrite: Replace what is there.
+    """
+    from benchnav.datagen.dem.importer import import_dem as import_maps
+    from benchnav.datagen.dem.survey import Rasters
+    from benchnav.datagen.dem.tiling import read_shares
+    from benchnav.datagen.files.describe import say_written
+    from benchnav.datagen.files.hdf5 import is_one_file
+
+    path = output_path(out)
+    rasters = Rasters(
+        dem=dem,
+        classes=classes,
+        class_ids=class_ids,
+        random_classes=random_classes,
+        photo=photo,
+        traversability=traversability,
+    )
+    name = id or (path.stem if is_one_file(path) else path.name)
+    chosen = datagen.load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
+    steps = import_maps(
+        rasters,
+        path,
+        chosen,
+        dataset_id=chosen.id if overrides and not id else name,
+        shares=read_shares(splits),
+        scenario=scenario,
+        stride_m=stride,
+        solvable=solvable,
+        overwrite=overwrite,
+    )
+    show_progress(steps, "maps")
+    made = datagen.TerrainDataset(path)
+    say_written(made)
+    for split, entry in made.splits.items():
+        left_out = entry["parts"][0]["source"]["left_out"]
+        between = left_out.pop("between_splits")
+        reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in left_out.items())
+        print(f"  left out of {split}: {reasons}")
+        if "group" in made.fields:
+            groups = len(set(made.read(split, fields=["group"])["group"].tolist()))
+            print(
+                f"  {entry['maps']} maps of {split} overlap and are {groups} group(s), the unit of statistics: for "
+                "a test split leave --stride out, so that maps lie side by side"
+            )
+    if between:
+        print(f"  left out between splits: {between}")
+
+
+def export(
+    file: str,
+    out: str,
+    splits: list[str] | None = None,
+    fields: list[str] | None = None,
+    maps_per_file: int = 0,
+    license: str = "",
+    creator: str = "",
+    url: str = "",
+    date: str = "",
+    overwrite: bool = False,
+) -> None:
+    """Export a dataset to Parquet files with Croissant metadata, which other tools read without this package.
+
+    Args:
+        file: Path or id of a dataset.
+        out: Folder to write.
+        splits: Only these splits, for example [test/std,test/hg].
+        fields: Only these fields, for example [rgb,class_id].
+        maps_per_file: Most maps of a file; 0 makes files of a few hundred MB at most.
+        license: Name in the SPDX list, such as CC-BY-4.0, or a URL; of maps of a shipped recipe MIT when not given.
+        creator: Who made the maps; of maps of a shipped recipe the BenchNav authors when not given.
+        url: Where the dataset will be found.
+        date: Date of publication, YYYY-MM-DD; today when not given.
+        overwrite: Replace an exported dataset that is there.
+    """
+    from rich.filesize import decimal
+
+    from benchnav.datagen.export.croissant import AUTHORS, Publication, is_ours
+    from benchnav.datagen.export.export import export as export_dataset
+
+    dataset = _opened(file)
+    chosen = [name for name in dataset.splits if splits is None or name in splits]
+    expect(
+        (license and creator) or is_ours(dataset, chosen),
+        f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped recipe, got none. Pass yours; of "
+        "imported maps those of the elevation model, its classes and photo.",
+    )
+    publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
+    path = output_path(out)
+    steps = export_dataset(dataset, path, publication, splits, fields, maps_per_file, overwrite)
+    show_progress(steps, "maps")
+    files = sorted(path.rglob("*.parquet"))
+    size = decimal(sum(item.stat().st_size for item in files))
+    print(f"wrote {path} ({size} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)")
 
 
 def preview(
@@ -224,20 +344,15 @@ def preview(
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
         contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
-    from benchnav.core.errors import ConfigError
-    from benchnav.core.store import output_path, replacing
-    from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.datagen.preview import save_contact_sheet, save_preview
 
-    dataset = TerrainDataset(find_dataset(file))
+    dataset = _opened(file)
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
     path = output_path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
-    if path.suffix not in (".png", ".pdf", ".svg", ".jpg"):
-        raise ConfigError(f"Expected `out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
-    if maps is not None and contact_sheet:
-        raise ConfigError("Expected either `maps` or `contact-sheet`, got both.")
-    if maps is not None and not maps:
-        raise ConfigError("Expected `maps` with at least one index, got none.")
+    is_picture = path.suffix in (".png", ".pdf", ".svg", ".jpg")
+    expect(is_picture, f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
+    expect(maps is None or not contact_sheet, "either `maps` or `contact-sheet`, got both.")
+    expect(maps is None or maps, "`maps` with at least one index, got none.")
     with replacing(path) as partial:
         if contact_sheet:
             save_contact_sheet(dataset, split, partial, path.suffix[1:])
@@ -247,13 +362,9 @@ def preview(
     print(f"wrote {path}")
 
 
-def _tell_kept(steps: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Passes the steps of `create` on, and says first what a killed run has left of them."""
-    done, total = next(steps)
-    if done:
-        print(f"{done} of {total} maps were there already", file=sys.stderr)
-    yield done, total
-    yield from steps
+def _opened(file: str) -> "TerrainDataset":
+    """The dataset of a path or an id."""
+    return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
 def main() -> None:

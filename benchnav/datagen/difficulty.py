@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core.grid import Grid
 from benchnav.core.tables import NOTHING, Table
@@ -51,39 +52,7 @@ class Difficulty:
     soft_ground: float
     soft_spots: float
     straight: int
-    reference_times_s: np.ndarray
-
-
-def of_maps(maps: Maps, recipe: Recipe) -> Difficulty:
-    """Measures some maps.
-
-    Args:
-        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
-        recipe: class table, resolution and λ_stuck.
-    """
-    weights, means, stds = latent.truth(
-        maps["class_id"], maps["slope_deg"].astype(np.float64), recipe.classes
-    )
-    stuck = latent.expected_of((weights, means, stds)) <= recipe.stuck_threshold  # not where it is NaN
-    labelled = maps["class_id"] != UNLABELLED
-    weight = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])
-    spots = weight[np.where(labelled, maps["class_id"], 0)]
-    on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
-    times = maps["reference_time_s"].astype(np.float64)
-    return Difficulty(
-        maps=len(stuck),
-        stuck=_share(stuck, labelled),
-        soft_ground=_share(spots > 0, labelled),
-        soft_spots=_share(spots, labelled),
-        straight=int((~(stuck & on_line).any(axis=(1, 2))).sum()),
-        reference_times_s=times[np.isfinite(times)],
-    )
-
-
-def _share(values: np.ndarray, labelled: np.ndarray) -> float:
-    """Mean over each map's labelled cells, then over the maps."""
-    counts = np.maximum(1, labelled.sum(axis=(1, 2)))
-    return float(((values * labelled).sum(axis=(1, 2)) / counts).mean())
+    reference_times_s: ndarray
 
 
 def of_split(dataset: TerrainDataset, split: str) -> Difficulty:
@@ -92,10 +61,49 @@ def of_split(dataset: TerrainDataset, split: str) -> Difficulty:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    return _together(of_maps(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS))
+    return summarise(measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS))
 
 
-def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.ndarray:
+def measure(maps: Maps, recipe: Recipe) -> Maps:
+    """Measures some maps.
+
+    Args:
+        maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
+        recipe: class table, resolution and λ_stuck.
+
+    Returns:
+        The figures of each map, as `Difficulty` has them of all, each of shape [B].
+    """
+    slope = maps["slope_deg"].astype(np.float64)
+    expected = latent.expected_of(latent.truth(maps["class_id"], slope, recipe.classes))
+    stuck = expected <= recipe.stuck_threshold  # not where it is NaN
+    labelled = maps["class_id"] != UNLABELLED
+    weight = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])
+    spots = weight[np.where(labelled, maps["class_id"], 0)]
+    on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
+    counts = np.maximum(1, labelled.sum(axis=(1, 2)))
+    shares = {"stuck": stuck, "soft_ground": spots > 0, "soft_spots": spots}
+    return {
+        **{name: (values * labelled).sum(axis=(1, 2)) / counts for name, values in shares.items()},
+        "straight": ~(stuck & on_line).any(axis=(1, 2)),
+        "reference_times_s": maps["reference_time_s"].astype(np.float64),
+    }
+
+
+def summarise(pieces: Iterable[Maps]) -> Difficulty:
+    """Puts what `measure` gave of some maps after others together."""
+    parts = list(pieces)
+    maps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    times = maps["reference_times_s"]
+    return Difficulty(
+        maps=len(times),
+        straight=int(maps["straight"].sum()),
+        reference_times_s=times[np.isfinite(times)],
+        **{name: float(maps[name].mean()) for name in ("stuck", "soft_ground", "soft_spots")},
+    )
+
+
+def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     """The cells that the straight line between two positions runs through.
 
     A line along a border between cells lies in those beyond it, as positions do; a corner that is only
@@ -111,13 +119,11 @@ def crossed_cells(grid: Grid, start_m: np.ndarray, goal_m: np.ndarray) -> np.nda
     """
     start = start_m.astype(np.float64) / grid.resolution_m
     along = goal_m.astype(np.float64) / grid.resolution_m - start
-    # Where the line is cut by the grid's lines: as shares of its length, sorted.
-    cuts = [np.zeros((len(start), 1)), np.ones((len(start), 1))]
-    for axis, cells in enumerate((grid.width, grid.height)):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            cut = (np.arange(1, cells) - start[:, axis, None]) / along[:, axis, None]
-        cuts.append(np.where((cut > 0) & (cut < 1), cut, 0))
-    shares = np.sort(np.concatenate(cuts, axis=1), axis=1)
+    # Where the line is cut by the grid's lines: as shares of its length, sorted, its ends among them.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        cuts = (np.arange(1, max(grid.shape)) - start[..., None]) / along[..., None]
+    inside = np.where((cuts > 0) & (cuts < 1), cuts, 0).reshape(len(start), -1)
+    shares = np.sort(np.concatenate([inside, np.tile([0.0, 1.0], (len(start), 1))], axis=1), axis=1)
     middle = start[:, None] + (0.5 * (shares[:, 1:] + shares[:, :-1]))[..., None] * along[:, None]
     # Cuts of both kinds at a corner may differ in their last bits.
     member, piece = np.nonzero(np.diff(shares, axis=1) > 1e-12)
@@ -132,35 +138,17 @@ def table(dataset: TerrainDataset) -> Table:
     stuck = dataset.recipe.stuck_threshold
     rows = []
     for split in dataset.splits:
-        found = of_split(dataset, split)
-        shares = (f"{100 * share:.1f}" for share in (found.stuck, found.soft_ground, found.soft_spots))
-        times = found.reference_times_s
-        typical, spread = NOTHING, NOTHING
+        measured = of_split(dataset, split)
+        shares = (measured.stuck, measured.soft_ground, measured.soft_spots)
+        times, typical, spread = measured.reference_times_s, NOTHING, NOTHING
         if len(times):
             typical, spread = f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}"
-        rows.append((split, *shares, typical, spread, f"{found.straight}/{found.maps}"))
+        percent = (f"{100 * share:.1f}" for share in shares)
+        rows.append((split, *percent, typical, spread, f"{measured.straight}/{measured.maps}"))
     return Table(
         title=f"how hard the maps are: what stands in a robot's way (λ_stuck {stuck:g})",
         headings=_HEADINGS,
         numbers=True,
         rows=tuple(rows),
         notes=tuple(f"  {heading}: {sentence.format(stuck=stuck)}" for heading, sentence in _EXPLAINED),
-    )
-
-
-def _together(pieces: Iterable[Difficulty]) -> Difficulty:
-    """Of maps measured in pieces, the whole."""
-    parts = list(pieces)
-    counts = np.array([part.maps for part in parts])
-
-    def mean(name: str) -> float:
-        return float(np.average([getattr(part, name) for part in parts], weights=counts))
-
-    return Difficulty(
-        maps=int(counts.sum()),
-        stuck=mean("stuck"),
-        soft_ground=mean("soft_ground"),
-        soft_spots=mean("soft_spots"),
-        straight=sum(part.straight for part in parts),
-        reference_times_s=np.concatenate([part.reference_times_s for part in parts]),
     )

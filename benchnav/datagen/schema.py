@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 FORMAT = "benchnav-dataset"
 FORMAT_VERSION = (1, 3)  # the newest that is read
@@ -21,7 +22,7 @@ ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
 UNLABELLED = 255  # `class_id` of a cell whose class is not known, as on real ground
 
-Maps = dict[str, np.ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
+Maps = dict[str, ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ class Field:
         return tuple(sizes[n] if isinstance(n, str) else n for n in self.shape)
 
 
+Fields = Mapping[str, Field]  # by name, in the order of being stored
+
 # What every dataset has.
 FIELDS: dict[str, Field] = {
     "rgb": Field("|u1", (3, "H", "W"), "1", 0, 255, "top-down colour image, shaded"),
@@ -76,7 +79,7 @@ OPTIONAL: dict[str, Field] = {
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 
-def quantise(values: np.ndarray, bits: int) -> np.ndarray:
+def quantise(values: ndarray, bits: int) -> ndarray:
     """Rounds to multiples of 2^−bits, so that the last bits of a machine's arithmetic do not show."""
     steps = values * 2.0**bits
     np.rint(steps, out=steps)
@@ -84,12 +87,18 @@ def quantise(values: np.ndarray, bits: int) -> np.ndarray:
     return steps
 
 
-def fields_in(maps: Mapping[str, np.ndarray]) -> dict[str, Field]:
+def stored_arrays(fields: Fields, height: int, width: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Dtype and shape of a map's entry in each array that is stored of a split: its fields', and of their digests."""
+    arrays = {name: (field.dtype, field.entry_shape(height, width)) for name, field in fields.items()}
+    return {**arrays, ENTRY_DIGESTS: ("|u1", (len(fields), DIGEST_BYTES))}
+
+
+def fields_in(maps: Maps) -> dict[str, Field]:
     """The fields that maps have, in the order of being stored."""
     return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
 
 
-def entry_digests(maps: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -> np.ndarray:
+def entry_digests(maps: Maps, fields: Fields) -> ndarray:
     """Digests each map's entry of each field: the SHA-256 of its little-endian bytes.
 
     Args:
@@ -107,27 +116,22 @@ def entry_digests(maps: Mapping[str, np.ndarray], fields: Mapping[str, Field]) -
     return digests.reshape(-1, len(fields), DIGEST_BYTES)
 
 
-class SplitDigest:
-    """The digest of a split: SHA-256 over its field table and its entries' digests, map by map."""
+def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:
+    """The digest of a split: SHA-256 over its field table and its entries' digests, map by map.
 
-    def __init__(self, maps: int, height: int, width: int, fields: Mapping[str, Field]) -> None:
-        """Starts the digest of a split of `maps` maps of height × width cells with some fields."""
-        shapes = {name: [maps, *field.entry_shape(height, width)] for name, field in fields.items()}
-        table = [[name, field.dtype, shapes[name]] for name, field in fields.items()]
-        self._hash = hashlib.sha256(json.dumps(table, separators=(",", ":")).encode())
-
-    def update(self, digests: np.ndarray) -> None:
-        """Adds the next maps' `entry_digests`, shape [B, F, 32]."""
-        self._hash.update(digests.tobytes())
-
-    def hexdigest(self) -> str:
-        """The digest of the maps so far."""
-        return self._hash.hexdigest()
+    Args:
+        digests: of all maps' entries, from `entry_digests`, shape [N, F, 32].
+        height: rows of a map.
+        width: columns of a map.
+        fields: the F fields.
+    """
+    arrays = stored_arrays(fields, height, width)
+    table = [[name, arrays[name][0], [len(digests), *arrays[name][1]]] for name in fields]
+    text = json.dumps(table, separators=(",", ":")).encode()
+    return hashlib.sha256(text + digests.tobytes()).hexdigest()
 
 
-def version_of(
-    synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fields: Mapping[str, Field]
-) -> str:
+def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fields: Fields) -> str:
     """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
     if set(fields) - set(FIELDS):
         return "1.3"
@@ -141,7 +145,7 @@ def has_unlabelled(entry: Mapping[str, Any]) -> bool:
     return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
-def field_table(height: int, width: int, fields: Mapping[str, Field]) -> dict[str, Any]:
+def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
     """Describes fields for the manifest."""
     return {
         name: {
@@ -161,28 +165,25 @@ def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
         KeyError, TypeError, ValueError: one of `FIELDS` is not among them, or one is not as it should be.
     """
     height, width = table["class_id"]["shape"]
-    known = FIELDS | OPTIONAL
-    lacking = [name for name in FIELDS if name not in table]
-    if lacking:
-        raise ValueError(f"field {lacking[0]!r} is not listed")
+    for name in FIELDS:
+        if name not in table:
+            raise ValueError(f"field {name!r} is not listed")
     fields = {}
     for name, about in table.items():
-        shape = tuple(about["shape"])
-        if name in known:
-            field = known[name]
-        else:
-            cells = shape[-2:] == (height, width)
-            symbols = (*shape[:-2], "H", "W") if cells else shape
-            dtype = np.dtype(about["dtype"]).str
-            field = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
+        dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
+        symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
+        foreign = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
+        fields[name] = field = (FIELDS | OPTIONAL).get(name, foreign)
         if (about["dtype"], shape) != (field.dtype, field.entry_shape(height, width)):
             raise ValueError(f"field {name!r} is {about['dtype']} {list(shape)}, not {field.dtype}")
-        fields[name] = field
     return fields
 
 
-_KINDS = {"id": str, "generator": dict, "fields": dict, "splits": dict, "recipes": list}
-_ENTRY_KINDS = {"scenario": str, "maps": int, "digest": str, "parts": list}
+# What readers need: keys and the types of their values.
+_MANIFEST = {"id": str, "generator": dict, "fields": dict, "splits": dict, "recipes": list}
+_ENTRY = {"scenario": str, "maps": int, "digest": str, "parts": list}
+_GENERATED = {"maps": int, "recipe": int, "split": str, "first": int}
+_IMPORTED = {"maps": int, "source": dict}
 
 
 def check(manifest: Mapping[str, Any]) -> None:
@@ -191,28 +192,26 @@ def check(manifest: Mapping[str, Any]) -> None:
     Raises:
         KeyError, TypeError, ValueError: it does not.
     """
-    _check_kinds("the manifest", manifest, _KINDS)
+    _check_kinds("the manifest", manifest, _MANIFEST)
     _check_kinds("`generator`", manifest["generator"], {"package": str, "version": str})
     read_field_table(manifest["fields"])
     if not manifest["splits"] or not manifest["recipes"]:
         raise ValueError("it has no split or no recipe")
     for name, entry in manifest["splits"].items():
-        _check_kinds(f"split {name!r}", entry, _ENTRY_KINDS)
+        _check_kinds(f"split {name!r}", entry, _ENTRY)
         for part in entry["parts"]:
-            _check_kinds(f"a part of split {name!r}", part, {"maps": int})
+            _check_kinds(f"a part of split {name!r}", part, _IMPORTED if "source" in part else _GENERATED)
             if "source" in part:
                 _check_kinds(f"the source of split {name!r}", part["source"], {"file": str, "left_out": dict})
                 continue
-            _check_kinds(f"a part of split {name!r}", part, {"recipe": int, "split": str, "first": int})
             recipe = manifest["recipes"][part["recipe"]]
             _check_kinds("a recipe", recipe, {"id": str, "seed": int, "scenarios": dict})
             recipe["scenarios"][recipe["splits"][part["split"]]["scenario"]]
         shards = manifest["shards"][name] if "shards" in manifest else entry["parts"]
-        if entry["maps"] < 1 or any(
-            sum(own["maps"] for own in some) != entry["maps"] for some in (entry["parts"], shards)
-        ):
-            raise ValueError(f"the maps of split {name!r} are not as many as those of its parts")
-        if "shards" in manifest and any("/" in shard["file"] for shard in shards):
+        for parts in (entry["parts"], shards):
+            if not 0 < sum(part["maps"] for part in parts) == entry["maps"]:
+                raise ValueError(f"the maps of split {name!r} are not as many as those of its parts")
+        if any("/" in shard.get("file", "") for shard in shards):
             raise ValueError(f"a file of split {name!r} is not in the folder")
 
 

@@ -481,10 +481,10 @@ def test_an_interrupted_create_goes_on_and_says_what_was_there(
     asked = ("create", "tiny-v1", "--splits", "[test/std,valid]", "--out", "d.h5")
     make = create.make
 
-    def interrupted(recipe: Recipe, shard: ShardFile) -> bytes:
+    def interrupted(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
         if shard.split.startswith("test"):
             raise KeyboardInterrupt
-        return make(recipe, shard)
+        return make(recipe, shard, version)
 
     with monkeypatch.context() as patched:
         patched.setattr(create, "make", interrupted)

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from benchnav.core.errors import DatasetError
-from benchnav.core.store import building, real_place, replacing, restore, sole_writer
+from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.raster import load_rasterio
 from benchnav.datagen.dem.survey import Rasters, Survey, survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
-from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, named_errors, pack
+from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, foreign_in, held, pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
@@ -85,46 +85,37 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         ground = survey(stack, rasters, recipe, shares, stride_m)
-        with named_errors(out):
-            stack.enter_context(sole_writer(out, str(out)))
-            restore(out)
-            check_place(out, overwrite)
-            folder = stack.enter_context(building(out))
+        stack.enter_context(held(out, overwrite, foreign_in))
+        folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
         done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
         for run in ground.tiling.runs(most):
-            maps, numbers, lowest_m = _make(recipe, ground, run, parts[run.split].left_out)
-            with named_errors(out):
-                parts[run.split].add(maps, numbers, lowest_m)
+            parts[run.split].add(run)
             done += len(run.columns)
             yield done, ground.tiling.maps
-        _check_parts(rasters, parts)
-        with named_errors(out):
-            for part in parts.values():
-                part.flush()
-                if ground.tiling.overlaps:
-                    part.add_groups()
-            sizes = {name: replace(splits[name], maps=len(part.numbers)) for name, part in parts.items()}
-            contents = Contents(
-                id=dataset_id,
-                recipes=[replace(recipe, splits=sizes)],
-                splits={name: part.entry() for name, part in parts.items()},
-                files={name: part.files for name, part in parts.items()},
-                fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
-            )
-            check_place(out, overwrite)
-            assemble(contents, folder, out)
+        for part in parts.values():
+            part.finish()
+        sizes = {name: replace(splits[name], maps=len(part.kept)) for name, part in parts.items()}
+        contents = Contents(
+            id=dataset_id,
+            recipes=[replace(recipe, splits=sizes)],
+            splits={name: part.entry() for name, part in parts.items()},
+            files={name: part.files for name, part in parts.items()},
+            fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
+        )
+        check_place(out, overwrite)
+        assemble(contents, folder, out)
 
 
 @dataclass(kw_only=True)
 class _Part:
-    """What has become of the maps of one split: files of those kept, and counts of the others."""
+    """What has become of the maps of one split: files of those kept, with their numbers, and counts of the others."""
 
     name: str
     recipe: Recipe
     folder: Path
     ground: Survey
-    numbers: list[int] = field(default_factory=list)
+    kept: list[int] = field(default_factory=list)
     lowest_m: list[float] = field(default_factory=list)
     unlabelled: list[int] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
@@ -132,32 +123,87 @@ class _Part:
     pending: list[Maps] = field(default_factory=list)
     written: int = 0
 
-    def add(self, maps: Maps, numbers: np.ndarray, lowest_m: np.ndarray) -> None:
-        """Takes maps that are kept; writes a shard where there are enough."""
-        self.numbers += numbers.tolist()
-        self.lowest_m += lowest_m.tolist()
-        if len(numbers):
-            self.unlabelled += (maps["class_id"] == UNLABELLED).sum(axis=(1, 2)).tolist()
-        self.pending += [maps] if len(numbers) else []
-        if (len(self.numbers) - self.written) * self.recipe.height * self.recipe.width >= SHARD_CELLS:
-            self.flush()
-
-    def flush(self) -> None:
-        """Writes a shard of what is pending."""
-        shard = ShardFile(split=self.name, first=self.written, stop=len(self.numbers))
-        if not shard.maps:
+    def add(self, run: Run) -> None:
+        """Makes maps and counts those that are left out; writes a shard where enough are kept."""
+        recipe, tiling = self.recipe, self.ground.tiling
+        framed_m, given = self.ground.read(run)
+        kept = np.ones(len(run.columns), dtype=bool)
+        lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
+        if "class_id" in given:
+            lacks = np.isnan(given["class_id"])
+            if "rgb" in given:
+                # A measured λ is worth learning from without a class.
+                lacks = lacks & np.isnan(given.get("traversability", np.nan))
+                lacking["missing_classes"] = lacks.all(axis=(1, 2, 3))
+            else:  # a cell is painted in the colour of its class
+                lacking["missing_classes"] = lacks.any(axis=(1, 2, 3))
+        if "rgb" in given:
+            lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
+        for reason, which in lacking.items():
+            self.left_out[reason] += int((kept & which).sum())
+            kept &= ~which
+        numbers = (run.row * tiling.tiles[1] + np.array(run.columns))[kept]
+        if not len(numbers):
             return
+        framed_m = quantise(framed_m[kept], 13)
+        lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
+        class_id = class_map(recipe, self.name, numbers)
+        if "class_id" in given:
+            class_id = np.nan_to_num(given["class_id"][kept, 0], nan=UNLABELLED).astype(np.int64)
+        labelled = class_id != UNLABELLED
+        height_m = framed_m - lowest_m[:, None, None]
+        maps = complete(recipe, self.name, numbers, np.where(labelled, class_id, 0), height_m)
+        maps["class_id"] = class_id
+        maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
+        if "class_id" in given:
+            maps["environment"] = np.zeros(len(numbers))
+        if "rgb" in given:
+            maps["rgb"] = np.rint(given["rgb"][kept])
+        if "traversability" in given:
+            maps["traversability"] = quantise(given["traversability"][kept, 0], 16)
+        solvable = recipe.splits[self.name].solvable
+        times_s = reference_time_s(recipe, maps) if solvable else np.full(len(numbers), np.nan)
+        maps["reference_time_s"] = times_s
+        solved = np.isfinite(times_s) | (not solvable)
+        self.left_out["not_solvable"] += int((~solved).sum())
+        self.kept += numbers[solved].tolist()
+        self.lowest_m += lowest_m[solved].tolist()
+        self.unlabelled += (~labelled).sum(axis=(1, 2))[solved].tolist()
+        self.pending.append({name: maps[name][solved].astype(kind.dtype) for name, kind in FIELDS.items()})
+        if (len(self.kept) - self.written) * recipe.height * recipe.width >= SHARD_CELLS:
+            self._flush()
+
+    def finish(self) -> None:
+        """Writes what is pending, and groups where maps overlap.
+
+        Raises:
+            DatasetError: no map was kept.
+        """
+        if not self.kept:
+            reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
+            dem = self.ground.layers["elevation_m"].raster.name
+            raise DatasetError(
+                f"Expected split {self.name!r} to get at least one map, got none from {dem}: of "
+                f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "
+                "or a recipe of easier ground."
+            )
+        if self.written < len(self.kept):
+            self._flush()
+        if self.ground.tiling.overlaps:
+            self._add_groups()
+
+    def _flush(self) -> None:
+        shard = ShardFile(split=self.name, first=self.written, stop=len(self.kept))
         maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}
         self.files.append(self.folder / shard.name)
-        self._write(self.files[-1], maps, shard.first, shard.stop)
+        self._write(self.files[-1], maps, shard.first)
         self.pending, self.written = [], shard.stop
 
-    def _write(self, file: Path, maps: Maps, first: int, stop: int) -> None:
-        content = pack(self.recipe.id, self.recipe, self.name, self.entry(first, stop), maps)
-        with replacing(file) as unfinished:
-            unfinished.write_bytes(content)
+    def _write(self, file: Path, maps: Maps, first: int) -> None:
+        entry = self.entry(first, first + len(maps["environment"]))
+        file.write_bytes(pack(self.recipe, self.name, entry, maps))
 
-    def add_groups(self) -> None:
+    def _add_groups(self) -> None:
         """Writes the shards anew with each map's group, which is known only when all maps are.
 
         Of the ground and its least map the number is a digest, so that datasets can be merged: the same on the
@@ -165,92 +211,26 @@ class _Part:
         """
         source = self.ground.source
         about = [source[key] for key in ("file", "sha256", "crs", "origin_m", "stride_m")]
-        shape = self.ground.tiling.shape
-        groups = self.ground.tiling.groups(self.numbers).tolist()
-        numbers = {
-            first: int(hashlib.sha256(json.dumps([*about, *shape, first]).encode()).hexdigest()[:13], 16)
-            for first in set(groups)
-        }
+        about += self.ground.tiling.shape
+        firsts, group = np.unique(self.ground.tiling.groups(self.kept), return_inverse=True)
+        texts = [json.dumps([*about, first]).encode() for first in firsts.tolist()]
+        numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])[group]
         begin = 0
         for file in self.files:
             maps = TerrainDataset(file).read(self.name)
-            stop = begin + len(maps["environment"])
-            maps["group"] = np.array([numbers[first] for first in groups[begin:stop]])
-            self._write(file, maps, begin, stop)
-            begin = stop
+            maps["group"] = numbers[begin : begin + len(maps["environment"])]
+            self._write(file, maps, begin)
+            begin += len(maps["environment"])
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """The manifest's entry of the maps from one on, to the last or before another."""
-        kept = {
-            "kept": self.numbers[first:stop],
-            "lowest_m": self.lowest_m[first:stop],
-            "unlabelled": self.unlabelled[first:stop],
+        about: Mapping[str, list[Any]] = {
+            "kept": self.kept,
+            "lowest_m": self.lowest_m,
+            "unlabelled": self.unlabelled,
         }
+        kept = {name: values[first:stop] for name, values in about.items()}
         left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
         source = {**self.ground.source, "truth": "unknown", **kept, "left_out": left_out}
-        count = len(self.numbers[first:stop])
-        scenario = self.recipe.splits[self.name].scenario
+        count, scenario = len(kept["kept"]), self.recipe.splits[self.name].scenario
         return {"scenario": scenario, "maps": count, "parts": [{"maps": count, "source": source}]}
-
-
-def _make(
-    recipe: Recipe, ground: Survey, run: Run, left_out: Counter[str]
-) -> tuple[Maps, np.ndarray, np.ndarray]:
-    """Makes maps and counts those that are left out; gives the others, their numbers and lowest elevations."""
-    framed_m, given = ground.read(run)
-    kept = np.ones(len(run.columns), dtype=bool)
-    lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
-    if "class_id" in given:
-        unlabelled = np.isnan(given["class_id"])
-        if "rgb" in given:
-            # A measured λ is worth learning from without a class.
-            unmeasured = np.isnan(given.get("traversability", np.nan))
-            lacking["missing_classes"] = (unlabelled & unmeasured).all(axis=(1, 2, 3))
-        else:  # a cell is painted in the colour of its class
-            lacking["missing_classes"] = unlabelled.any(axis=(1, 2, 3))
-    if "rgb" in given:
-        lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
-    for reason, which in lacking.items():
-        left_out[reason] += int((kept & which).sum())
-        kept &= ~which
-    numbers = (run.row * ground.tiling.tiles[1] + np.array(run.columns))[kept]
-    if not len(numbers):
-        return {}, numbers, np.empty(0)
-    given = {name: values[kept] for name, values in given.items()}
-    framed_m = quantise(framed_m[kept], 13)
-    lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
-    class_id = class_map(recipe, run.split, numbers)
-    if "class_id" in given:
-        class_id = np.nan_to_num(given["class_id"][:, 0], nan=UNLABELLED).astype(np.int64)
-    labelled = class_id != UNLABELLED
-    spec = recipe.splits[run.split]
-    height_m = framed_m - lowest_m[:, None, None]
-    some_class = np.where(labelled, class_id, 0)
-    maps = complete(recipe, recipe.scenarios[spec.scenario], run.split, numbers, some_class, height_m)
-    maps["class_id"] = class_id
-    maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
-    if "class_id" in given:
-        maps["environment"] = np.zeros(len(numbers))
-    if "rgb" in given:
-        maps["rgb"] = np.rint(given["rgb"])
-    if "traversability" in given:
-        maps["traversability"] = quantise(given["traversability"][:, 0], 16)
-    maps["reference_time_s"] = np.full(len(numbers), np.nan)
-    solved = np.ones(len(numbers), dtype=bool)
-    if spec.solvable:
-        maps["reference_time_s"] = reference_time_s(recipe, maps)
-        solved = np.isfinite(maps["reference_time_s"])
-    left_out["not_solvable"] += int((~solved).sum())
-    stored = {name: maps[name][solved].astype(kind.dtype) for name, kind in FIELDS.items()}
-    return stored, numbers[solved], lowest_m[solved]
-
-
-def _check_parts(rasters: Rasters, parts: Mapping[str, _Part]) -> None:
-    for name, part in parts.items():
-        if not part.numbers:
-            reasons = [f"{count} {_REASONS[reason]}" for reason, count in part.left_out.items() if count]
-            raise DatasetError(
-                f"Expected split {name!r} to get at least one map, got none from {rasters.dem}: of "
-                f"{part.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "
-                "or a recipe of easier ground."
-            )

@@ -48,9 +48,9 @@ class Raster:
     file: Any
 
     @property
-    def says_what_is_missing(self) -> bool:
-        """Whether it declares a value, or a mask, for cells without one."""
-        return any(flag.name != "all_valid" for flags in self.file.mask_flag_enums for flag in flags)
+    def mask_kinds(self) -> set[str]:
+        """How it tells cells without a value, in GDAL's words; `all_valid` alone where it does not."""
+        return {flag.name for flags in self.file.mask_flag_enums for flag in flags}
 
     def place(self) -> tuple[Any, Any, tuple[float, float]]:
         """Where it lies: a CRS in metres, its bounds there, and the size of its cells northward and eastward.
@@ -73,7 +73,7 @@ class Raster:
             )
         for crs in (own, _utm_of(own, x[1, 1], y[1, 1]), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
-                places = zip(*_transformed(own, crs, x.ravel().tolist(), y.ravel().tolist()), strict=True)
+                places = _transformed(own, crs, x.ravel(), y.ravel()).T
                 if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:
                     with self.warped(crs) as warped:
                         return crs, warped.bounds, (warped.res[1], warped.res[0])
@@ -86,10 +86,9 @@ class Raster:
 
     def warped(self, crs: Any, **settings: Any) -> Any:
         """The raster in another CRS; where it has no values, that shows, if need be by one more band."""
-        kinds = {flag.name for flags in self.file.mask_flag_enums for flag in flags}
-        if kinds == {"all_valid"} and np.dtype(self.file.dtypes[0]).kind == "f":
+        if self.mask_kinds == {"all_valid"} and np.dtype(self.file.dtypes[0]).kind == "f":
             settings |= {"src_nodata": np.nan, "nodata": np.nan}
-        elif not kinds & {"nodata", "alpha"}:
+        elif not self.mask_kinds & {"nodata", "alpha"}:
             settings |= {"add_alpha": True}
         with _naming(self.argument, self.name):
             return load_rasterio().vrt.WarpedVRT(
@@ -110,15 +109,14 @@ class Raster:
             # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
             dtype="float64" if len(bands) == 1 else self.file.dtypes[0],
         ) as warped:
-            yield Layer(raster=self, lattice=lattice, bands=bands, warped=warped)
+            yield Layer(raster=self, bands=bands, warped=warped)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """A raster as resampled to a lattice that is framed by one cell."""
+    """The first bands of a raster as resampled to a lattice that is framed by one cell."""
 
     raster: Raster
-    lattice: Lattice
     bands: list[int]
     warped: Any
 
@@ -132,20 +130,20 @@ class Layer:
         Returns:
             Values, NaN where there are none, float64, shape [K, len(rows) + 2, len(columns) + 2].
         """
-        top = self.lattice.cells[0] - rows.stop
+        file, warped = self.raster.file, self.warped
+        top = warped.height - 2 - rows.stop
         window = ((top, top + len(rows) + 2), (columns.start, columns.stop + 2))
         with _naming(self.raster.argument, self.raster.name):
-            values = self.warped.read(self.bands, window=window).astype(np.float64)
-            if self.warped.count > self.raster.file.count:
-                missing = self.warped.read(self.warped.count, window=window) == 0
-            else:
-                missing = self.warped.dataset_mask(window=window) == 0
-        values[:, missing | ~np.isfinite(values).all(axis=0)] = np.nan
+            values = warped.read(self.bands, window=window).astype(np.float64)
+            has_alpha = warped.count > file.count
+            mask = (
+                warped.read(warped.count, window=window) if has_alpha else warped.dataset_mask(window=window)
+            )
+        values[:, (mask == 0) | ~np.isfinite(values).all(axis=0)] = np.nan
         scales, offsets = (
-            np.array(numbers) for numbers in (self.raster.file.scales, self.raster.file.offsets)
+            np.array(numbers)[: len(values), None, None] for numbers in (file.scales, file.offsets)
         )
-        which = np.array(self.bands) - 1
-        return (values * scales[which, None, None] + offsets[which, None, None])[:, ::-1]
+        return (values * scales + offsets)[:, ::-1]
 
 
 @contextmanager
@@ -192,8 +190,8 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
 
 def _utm_of(crs: Any, x: float, y: float) -> Any:
     """The CRS of the UTM zone (or polar cap) that a place lies in; None off the Earth."""
-    (longitude,), (latitude,) = _transformed(crs, "EPSG:4326", [x], [y])
-    if not (np.isfinite(longitude) and np.isfinite(latitude)):
+    longitude, latitude = _transformed(crs, "EPSG:4326", [x], [y])[:, 0]
+    if not np.isfinite(longitude + latitude):
         return None
     zone = 61 if latitude > 84 or latitude < -80 else min(int((longitude + 180) // 6) + 1, 60)
     return type(crs).from_epsg((326 if latitude >= 0 else 327) * 100 + zone)
@@ -212,26 +210,26 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
         base = base.get("base_crs") or base["source_crs"]
     if base["type"] not in ("GeographicCRS", "GeodeticCRS"):
         return None
-    (longitude,), (latitude,) = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])
-    if not (np.isfinite(longitude) and np.isfinite(latitude)):
+    longitude, latitude = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
+    if not np.isfinite(longitude + latitude):
         return None
-    angle, length = {"unit": "degree"}, {"unit": "metre"}
-    origin = [
-        {"name": "Latitude of natural origin", "value": latitude, **angle},
-        {"name": "Longitude of natural origin", "value": longitude, **angle},
-        {"name": "Scale factor at natural origin", "value": 1, "unit": "unity"},
-        {"name": "False easting", "value": 0, **length},
-        {"name": "False northing", "value": 0, **length},
-    ]
+    origin = (
+        ("Latitude of natural origin", latitude, "degree"),
+        ("Longitude of natural origin", longitude, "degree"),
+        ("Scale factor at natural origin", 1, "unity"),
+        ("False easting", 0, "metre"),
+        ("False northing", 0, "metre"),
+    )
+    parameters = [{"name": name, "value": value, "unit": unit} for name, value, unit in origin]
     axes = [
-        {"name": "Easting", "abbreviation": "E", "direction": "east", **length},
-        {"name": "Northing", "abbreviation": "N", "direction": "north", **length},
+        {"name": name, "abbreviation": name[0], "direction": direction, "unit": "metre"}
+        for name, direction in (("Easting", "east"), ("Northing", "north"))
     ]
     local = {
         "type": "ProjectedCRS",
         "name": f"Transverse Mercator at {latitude:.6f}, {longitude:.6f}",
         "base_crs": base,
-        "conversion": {"name": "local", "method": {"name": "Transverse Mercator"}, "parameters": origin},
+        "conversion": {"name": "local", "method": {"name": "Transverse Mercator"}, "parameters": parameters},
         "coordinate_system": {"subtype": "Cartesian", "axis": axes},
     }
     return type(crs).from_user_input(json.dumps(local))
@@ -247,20 +245,19 @@ def stretch(crs: Any, x: float, y: float) -> float:
     if local is None:
         return np.inf
     steps = _PROBE_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    moved = np.transpose(_transformed(crs, local, *(np.array([x, y]) + steps).T.tolist()))
+    moved = _transformed(crs, local, *(np.array([x, y]) + steps).T).T
     if not np.isfinite(moved).all():
         return np.inf
     scales = np.linalg.svd(moved[::2] - moved[1::2], compute_uv=False) / (2 * _PROBE_M)
     return float(np.abs(scales - 1).max())
 
 
-def _transformed(crs: Any, to: Any, x: list[float], y: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Moves places from one CRS to another; not finite where there is no way, as from another planet."""
+def _transformed(crs: Any, to: Any, x: Any, y: Any) -> np.ndarray:
+    """Moves N places from one CRS to another, shape [2, N]; not finite where no way leads, as from another planet."""
     try:
-        moved = load_rasterio().warp.transform(crs, to, x, y)
+        return np.array(load_rasterio().warp.transform(crs, to, list(x), list(y)))
     except Exception:  # rasterio gives PROJ's failures no public class
-        moved = np.full((2, len(x)), np.nan)
-    return np.asarray(moved[0]), np.asarray(moved[1])
+        return np.full((2, len(x)), np.nan)
 
 
 def _horizontal(crs: Any) -> Any:

@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
-from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.datagen.dem.raster import Lattice, Layer, Raster, opened
+from benchnav.core.errors import DatasetError, expect
+from benchnav.datagen.dem.raster import Lattice, Layer, opened
 from benchnav.datagen.dem.tiling import Run, Tiling, cut
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
@@ -53,17 +54,16 @@ class Rasters:
 
     def __post_init__(self) -> None:
         """Refuses what does not go together."""
-        if self.class_ids is not None and not self.classes:
-            raise ConfigError(
-                "Expected `classes` with `class_ids`, got none. Pass the raster they belong to."
-            )
-        if self.classes and self.random_classes:
-            raise ConfigError("Expected either `classes` or `random_classes`, got both.")
-        real = [name for name in ("photo", "traversability") if getattr(self, name)]
-        if real and not self.classes and not self.random_classes:
-            raise ConfigError(
-                f"Expected `classes` with `{real[0]}`, got none: what is real would be joined to classes laid out "
-                "at random. Pass --classes RASTER, or --random-classes if that is what you want."
+        expect(
+            self.classes or self.class_ids is None,
+            "`classes` with `class_ids`, got none. Pass the raster they belong to.",
+        )
+        expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
+        for name in ("photo", "traversability"):
+            expect(
+                not getattr(self, name) or self.classes or self.random_classes,
+                f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
+                "Pass --classes RASTER, or --random-classes if that is what you want.",
             )
 
 
@@ -82,12 +82,12 @@ class Survey:
 
     tiling: Tiling
     layers: Mapping[str, Layer]
-    known: Sequence[np.ndarray]
+    known: Sequence[ndarray]
     indices: Mapping[int, float]
     cliff_m: float
     source: Mapping[str, Any]
 
-    def read(self, run: Run) -> tuple[np.ndarray, Maps]:
+    def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Reads some maps.
 
         Returns:
@@ -110,10 +110,10 @@ class Survey:
                 expected = "elevations of `dem` without a gap next to 0"
                 other = "Where 0 is a height, declare a value that does not occur, such as -9999."
                 raise self._out_of_range("elevation_m", expected, low, high, 0, other)
-        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        ground[:, ~self.known[0][run.row * north :][: height + 2]] = np.nan
-        for place, column in enumerate(run.columns):
-            ground[place][:, ~self.known[1][column * east :][: width + 2]] = np.nan
+        (north, east), (rows, columns) = self.tiling.stride, self.known
+        ground[:, ~rows[run.row * north :][: ground.shape[1]]] = np.nan
+        for map_m, column in zip(ground, run.columns, strict=True):
+            map_m[:, ~columns[column * east :][: ground.shape[2]]] = np.nan
         if "traversability" in framed:
             low, high = self._range("traversability", framed)
             if low < 0 or high > 1:
@@ -124,13 +124,12 @@ class Survey:
             given["class_id"] = self._classes(given["class_id"])
         return ground, given
 
-    def _cut(self, layer: Layer, run: Run) -> np.ndarray:
+    def _cut(self, layer: Layer, run: Run) -> ndarray:
         """Cuts maps out of a layer, each framed by a cell, shape [B, K, H + 2, W + 2]."""
         (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        south, west = run.row * north, run.columns.start * east
-        stop = west + (len(run.columns) - 1) * east + width
-        strip = layer.read(range(south, south + height), range(west, stop))
-        return np.stack([strip[:, :, i * east : i * east + width + 2] for i in range(len(run.columns))])
+        south, wests = run.row * north, [column * east for column in run.columns]
+        strip = layer.read(range(south, south + height), range(wests[0], wests[-1] + width))
+        return np.stack([strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests])
 
     def _range(self, name: str, maps: Maps) -> tuple[float, float]:
         """The least and the greatest value, of what is averaged too."""
@@ -147,13 +146,13 @@ class Survey:
             f"declare it: rio edit-info --nodata {odd:.9g} {raster}{other and f'. {other}'}"
         )
 
-    def _classes(self, values: np.ndarray) -> np.ndarray:
-        indices, unknown = np.full_like(values, np.nan), ~np.isnan(values)
+    def _classes(self, values: ndarray) -> ndarray:
+        indices = np.full_like(values, np.nan)
         for value, index in self.indices.items():
             indices[values == value] = index
-            unknown &= values != value
-        if unknown.any():
-            name, strange = self.layers["class_id"].raster.name, np.unique(values[unknown])
+        strange = np.setdiff1d(values[~np.isnan(values)], list(self.indices))
+        if len(strange):
+            name = self.layers["class_id"].raster.name
             few = ", ".join(f"{value:g}" for value in strange[:10]) + (", …" if len(strange) > 10 else "")
             raise DatasetError(
                 f"Expected values of `classes` in {sorted(self.indices)}, got [{few}] too in {name}. Name each by "
@@ -182,8 +181,7 @@ def survey(
     names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
     named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
     unknown = sorted({name for name in named.values() if name is not None} - set(names))
-    if unknown:
-        raise ConfigError(f"Expected `class_ids` to name classes of the recipe, {names}, got {unknown}.")
+    expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
     dem = stack.enter_context(opened("dem", rasters.dem))
     unit = dem.file.units[0] or "m"
     if unit.lower() not in _METRES:
@@ -205,29 +203,34 @@ def survey(
             f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem.name} of "
             f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
         )
-    tiling = cut((rows, columns), recipe.grid.shape, _stride(recipe, stride_m), shares)
+    stride = recipe.grid.shape
+    if stride_m is not None:
+        cells = stride_m / step
+        expect(
+            cells > 0.5 and abs(cells - round(cells)) < 1e-6,
+            f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
+        )
+        stride = round(cells), round(cells)
+    tiling = cut((rows, columns), recipe.grid.shape, stride, shares)
     # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
     offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
     south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
     lattice = Lattice(crs=crs, west_m=west_m, south_m=south_m, cells=tiling.cells, resolution_m=step)
+    sources = [("elevation_m", dem, how)]
+    for field, argument, kinds, how in (
+        ("class_id", "classes", (), "mode"),
+        ("rgb", "photo", ("uint8",) * 3, "average"),
+        ("traversability", "traversability", (), "average"),
+    ):
+        if name := getattr(rasters, argument):
+            sources.append((field, stack.enter_context(opened(argument, name, kinds)), how))
     layers: dict[str, Layer] = {}
-
-    def lay(field: str, raster: Raster, how: str, bands: Sequence[int] = (1,)) -> None:
-        layers[field] = stack.enter_context(raster.laid(lattice, list(bands), how))
-        if how in ("average", "cubic") and field != "rgb":
-            for end in ("min", "max"):
-                layers[f"{field} {end}"] = stack.enter_context(raster.laid(lattice, list(bands), end))
-
-    lay("elevation_m", dem, how)
-    if rasters.classes:
-        lay("class_id", stack.enter_context(opened("classes", rasters.classes)), "mode")
-    if rasters.photo:
-        photo = stack.enter_context(opened("photo", rasters.photo, ("uint8",) * 3))
-        lay("rgb", photo, "average", (1, 2, 3))
-    if rasters.traversability:
-        measured = stack.enter_context(opened("traversability", rasters.traversability))
-        lay("traversability", measured, "average")
-    origins = {name: provenance(layer.raster.name) for name, layer in layers.items() if " " not in name}
+    for field, raster, how in sources:
+        bands = [1, 2, 3] if field == "rgb" else [1]
+        ends = ("min", "max") if how in ("average", "cubic") and field != "rgb" else ()
+        for layer, way in ((field, how), *((f"{field} {end}", end) for end in ends)):
+            layers[layer] = stack.enter_context(raster.laid(lattice, bands, way))
+    origins = {field: provenance(raster.name) for field, raster, _ in sources}
     ids = {str(value): name for value, name in sorted(named.items())}
     source = {
         "kind": "dem",
@@ -241,28 +244,13 @@ def survey(
         "photo": origins.get("rgb"),
         "traversability": origins.get("traversability"),
     }
-    edges_m = [
-        offset + step * np.arange(-1, count + 2) for offset, count in zip(offset_m, tiling.cells, strict=True)
-    ]
-    known = [
-        (edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step)
-        for edges, size in zip(edges_m, size_m, strict=True)
-    ]
+    known = []
+    for offset, count, size in zip(offset_m, tiling.cells, size_m, strict=True):
+        edges = offset + step * np.arange(-1, count + 2)
+        known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
     indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
-    cliff_m = np.inf if dem.says_what_is_missing else _CLIFF * max(*cell_m, step)
+    cliff_m = _CLIFF * max(*cell_m, step) if dem.mask_kinds == {"all_valid"} else np.inf
     return Survey(tiling=tiling, layers=layers, known=known, indices=indices, cliff_m=cliff_m, source=source)
-
-
-def _stride(recipe: Recipe, stride_m: float | None) -> tuple[int, int]:
-    """Cells from one map to the next, northward and eastward."""
-    if stride_m is None:
-        return recipe.grid.shape
-    cells = stride_m / recipe.resolution_m
-    if not (cells > 0.5 and abs(cells - round(cells)) < 1e-6):
-        raise ConfigError(
-            f"Expected `stride` as a multiple of the maps' resolution, {recipe.resolution_m:g} m, got {stride_m:g}."
-        )
-    return round(cells), round(cells)
 
 
 def provenance(name: str) -> dict[str, str | None]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import DatasetError, expect
 
 
 class Run(NamedTuple):
@@ -69,15 +69,14 @@ class Tiling:
         """
         # A map is drawn on every second place of a lattice as a block that reaches to the last map that it overlaps.
         # So blocks share a place just where maps overlap, and never touch where they do not.
-        reach = [2 * (-(-size // step) - 1) for size, step in zip(self.shape, self.stride, strict=True)]
+        reach = 2 * np.ceil(np.divide(self.shape, self.stride)).astype(int) - 2
         own = np.asarray(numbers, dtype=np.int64)
         corners = tuple(2 * place for place in np.divmod(own, self.tiles[1]))
-        drawn = np.zeros(
-            [2 * tiles + most for tiles, most in zip(self.tiles, reach, strict=True)], dtype=np.uint8
-        )
+        drawn = np.zeros(2 * np.array(self.tiles) + reach, dtype=np.uint8)
         drawn[corners] = 1
-        for axis, most in enumerate(reach):
-            drawn = ndimage.maximum_filter1d(drawn, most + 1, axis, origin=most // 2, mode="constant")
+        drawn = ndimage.maximum_filter(
+            drawn, (reach + 1).tolist(), origin=(reach // 2).tolist(), mode="constant"
+        )
         parts = ndimage.label(drawn)[0][corners]
         _, firsts, inverse = np.unique(parts, return_index=True, return_inverse=True)
         return own[firsts][inverse]
@@ -144,14 +143,12 @@ def read_shares(text: str) -> dict[str, float]:
             value = float(share or 1)
         except ValueError:
             value = math.nan
-        if not name or name in shares or not 0 < value <= 1:
-            raise ConfigError(
-                "Expected `splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and each share above "
-                f"0, got {part.strip()!r} in {text!r}."
-            )
-        shares[name] = value
-    if not math.isclose(sum(shares.values()), 1, abs_tol=1e-6):
-        raise ConfigError(
-            f"Expected the shares of `splits` to sum to 1, got {sum(shares.values()):g} in {text!r}."
+        expect(
+            name and name not in shares and 0 < value <= 1,
+            "`splits` such as train:0.7,valid:0.1,test/site:0.2, each name once and each share above 0, "
+            f"got {part.strip()!r} in {text!r}.",
         )
+        shares[name] = value
+    total = sum(shares.values())
+    expect(abs(total - 1) < 1e-6, f"the shares of `splits` to sum to 1, got {total:g} in {text!r}.")
     return shares

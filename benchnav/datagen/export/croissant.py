@@ -6,21 +6,22 @@ Source: Croissant Format Specification 1.0, http://mlcommons.org/croissant/1.0.
 import datetime
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from benchnav.core.errors import ConfigError
-from benchnav.datagen.export.parquet import FOLDER, MAP
+from benchnav.core.errors import ConfigError, expect
+from benchnav.datagen.export.parquet import FOLDER, MAP, columns_of
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict, shipped_recipes
+from benchnav.datagen.recipe.recipe import load_recipe, recipe_from_dict, shipped_recipes
 
 METADATA = "croissant.json"
 CARD = "README.md"
 AUTHORS = "The BenchNav authors"
+_URL = re.compile(r"https?://\S+")
 
 PAPER = """@misc{endo2024benchnav,
   title = {{BenchNav}: Simulation Platform for Benchmarking Off-road Navigation Algorithms with Probabilistic
@@ -61,7 +62,7 @@ class Publication:
         license: name in the SPDX list, such as CC-BY-4.0, or a URL.
         creator: who made it.
         url: where it is to be found; empty where it is nowhere yet.
-        date: of publication, YYYY-MM-DD.
+        date: of publication, YYYY-MM-DD; that of today when empty.
     """
 
     license: str = "MIT"
@@ -71,12 +72,10 @@ class Publication:
 
     def __post_init__(self) -> None:
         """Checks what programs read."""
-        if not re.fullmatch(r"https?://\S+", self.license):
+        if not _URL.fullmatch(self.license):
             _check_licence(self.license)
-        if not self.creator.strip():
-            raise ConfigError("Expected `creator` to be a name, got an empty one.")
-        if self.url and not re.fullmatch(r"https?://\S+", self.url):
-            raise ConfigError(f"Expected `url` to begin with https://, got {self.url!r}.")
+        expect(self.creator.strip(), "`creator` to be a name, got an empty one.")
+        expect(_URL.fullmatch(self.url) or not self.url, f"`url` to begin with https://, got {self.url!r}.")
         try:
             datetime.date.fromisoformat(self.date or "2024-05-21")
         except ValueError as error:
@@ -97,33 +96,30 @@ def _check_licence(name: str) -> None:
         listed = str(canonicalize_license_expression(name))
     except InvalidLicenseExpression:
         listed = ""
-    if listed != name or not re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", name):
-        near = f" Did you mean {listed!r}?" if listed not in ("", name) else ""
-        raise ConfigError(
-            f"Expected `license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {name!r}.{near}"
-        )
+    near = f" Did you mean {listed!r}?" if listed not in ("", name) else ""
+    expect(
+        listed == name and re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", name),
+        f"`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {name!r}.{near}",
+    )
 
 
-def is_ours(dataset: TerrainDataset, splits: Sequence[str]) -> bool:
-    """Whether all maps of some splits were made by shipped recipes as they are."""
-    parts = [part for split in splits for part in dataset.splits[split]["parts"]]
-    if not all("recipe" in part for part in parts):
+def is_ours(dataset: TerrainDataset, splits: Iterable[str]) -> bool:
+    """Whether all maps of some splits were made by shipped recipes as they are, but for their seed and splits."""
+    used = {part.get("recipe") for split in splits for part in dataset.splits[split]["parts"]}
+    if None in used:  # some were imported
         return False
-    made = {part["recipe"] for part in parts}
-    recipes = [recipe_from_dict(dataset.manifest["recipes"][number], f"in {dataset.path}") for number in made]
-    return all(_is_shipped(recipe) for recipe in recipes)
+    for number in used:
+        recipe = recipe_from_dict(dataset.manifest["recipes"][number], f"in {dataset.path}")
+        shipped_id = recipe.id.removesuffix(f"-seed{recipe.seed}")
+        if shipped_id not in shipped_recipes():
+            return False
+        shipped = load_recipe(shipped_id)
+        if replace(recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits) != shipped:
+            return False
+    return True
 
 
-def _is_shipped(recipe: Recipe) -> bool:
-    """Whether a recipe is a shipped one but for its seed and its splits, for which `create` has options."""
-    shipped_id = recipe.id.removesuffix(f"-seed{recipe.seed}")
-    if shipped_id not in shipped_recipes():
-        return False
-    shipped = load_recipe(shipped_id)
-    return replace(recipe, id=shipped.id, seed=shipped.seed, splits=shipped.splits) == shipped
-
-
-def describe(dataset: TerrainDataset, splits: Sequence[str]) -> str:
+def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
     """One sentence or two on what the maps are and where they come from."""
     grid, maps = dataset.grid, sum(dataset.map_count(split) for split in splits)
     generator = dataset.manifest["generator"]
@@ -162,14 +158,14 @@ def metadata(
         "@type": "sc:Dataset",
         "conformsTo": "http://mlcommons.org/croissant/1.0",
         "name": dataset.id,
-        "description": describe(dataset, list(names)),
+        "description": describe(dataset, names),
         "license": publication.license_url,
         "creator": {"@type": "sc:Organization", "name": publication.creator},
         "url": publication.url or f"urn:sha256:{content.hexdigest()}",
-        "datePublished": publication.date,
+        "datePublished": publication.date or datetime.datetime.now(datetime.UTC).date().isoformat(),
         **({"version": f"{found[1]}.0.0"} if found else {}),
         "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
-        **({"citeAs": PAPER} if is_ours(dataset, list(names)) else {}),
+        **({"citeAs": PAPER} if is_ours(dataset, names) else {}),
         "distribution": [item for name, own in files.items() for item in _distribution(name, own, folder)],
         "recordSet": [
             _classes(dataset),
@@ -202,22 +198,20 @@ def _distribution(name: str, files: Sequence[Path], folder: Path) -> Iterator[di
 
 def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]) -> dict[str, Any]:
     """The rows of a split, and what its columns are."""
-
-    def column(of: str, kind: str, description: str, **more: Any) -> dict[str, Any]:
-        source = {"fileSet": {"@id": f"{name}-files"}, "extract": {"column": of}}
-        about = {"description": description, "dataType": kind, **more, "source": source}
-        return _node("Field", f"{name}/{of}", **about)
-
-    columns = [column(MAP, "sc:Integer", "number of the map in its split")]
-    for of in fields:
-        field = dataset.fields[of]
+    columns = []
+    for of, field in columns_of(dataset, fields).items():
         shape = field.entry_shape(*dataset.grid.shape)
         words = [field.meaning] + ([f"in {field.unit}"] if field.unit != "1" else [])
         words += [f"nested lists of shape {list(shape)}"] if shape else []
-        kind = "sc:Float" if "f" in field.dtype else "sc:Integer"
-        columns.append(column(of, kind, "; ".join(words), **({"repeated": True} if shape else {})))
-    about = dataset.splits[split]
-    description = f"Split {split}: {about['maps']} maps of scenario {about['scenario']}."
+        about = {
+            "description": "; ".join(words),
+            "dataType": "sc:Float" if "f" in field.dtype else "sc:Integer",
+            **({"repeated": True} if shape else {}),
+            "source": {"fileSet": {"@id": f"{name}-files"}, "extract": {"column": of}},
+        }
+        columns.append(_node("Field", f"{name}/{of}", **about))
+    entry = dataset.splits[split]
+    description = f"Split {split}: {entry['maps']} maps of scenario {entry['scenario']}."
     key = {"@id": f"{name}/{MAP}"}
     return _node("RecordSet", name, description=description, key=key, field=columns)
 
@@ -226,11 +220,10 @@ def _classes(dataset: TerrainDataset) -> dict[str, Any]:
     """The class table, whose numbers give the latent traversability of a cell."""
     rows: list[dict[str, Any]] = []
     for number, item in enumerate(dataset.recipe.classes):
-        colour = "#" + "".join(f"{value:02x}" for value in item.colour)
-        row = {"id": number, "name": item.name, "colour": colour}
+        row: dict[str, Any] = {"id": number, "name": item.name, "colour": item.hex_colour}
         row |= {key: getattr(item, key) for key in ("scale", "exponent", "offset", "noise")}
         for key in ("weight", "mean", "std"):
-            row[f"soft_{key}"] = getattr(item.soft, key) if item.soft else 0.0
+            row[f"soft_{key}"] = getattr(item.soft, key, 0.0)
         rows.append({f"classes/{key}": value for key, value in row.items()})
     kinds = {"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"}
     fields = [_node("Field", key, dataType=kinds.get(key.rpartition("/")[2], "sc:Float")) for key in rows[0]]
@@ -252,7 +245,7 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
         publication: licence, creator, place and date.
     """
     is_url = publication.license.startswith("http")
-    ours = is_ours(dataset, list(names))
+    ours = is_ours(dataset, names)
     title = f"BenchNav {dataset.id}" if ours else dataset.id
     files = [{"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"} for name in names.values()]
     head = {
@@ -270,7 +263,7 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
         [
             f"---\n{yaml.safe_dump(head, sort_keys=False, allow_unicode=True)}---\n",
             f"# {title}\n",
-            f"{describe(dataset, list(names))}\n",
+            f"{describe(dataset, names)}\n",
             f"A row is a map; arrays are nested lists. `{METADATA}` describes the columns and holds the SHA-256 of",
             "each file. The metadata of each Parquet file holds the recipes that make the maps again.\n",
             "| split here | split of the dataset | maps | digest of the dataset's maps |\n|---|---|---|---|",

@@ -1,16 +1,14 @@
 """Exports a dataset to a folder of Parquet files with Croissant metadata, whole or not at all."""
 
-import datetime
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
-from benchnav.core.errors import DatasetError
-from benchnav.core.store import building, refuse_taken, restore, sole_writer, take_place
+from benchnav.core.errors import expect
+from benchnav.core.store import building, take_place
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
-from benchnav.datagen.files.hdf5 import named_errors
+from benchnav.datagen.files.hdf5 import held
 from benchnav.datagen.files.reader import TerrainDataset
 
 
@@ -35,33 +33,25 @@ def export(
         overwrite: replace an exported dataset that is there.
 
     Raises:
-        DatasetError: no such split or field, the dataset is damaged, or `out` cannot be written.
-        ConfigError: `out` is taken.
+        DatasetError: the dataset is damaged, or `out` cannot be written.
+        ConfigError: no such split or field, or `out` is taken.
     """
     names = split_names(_chosen("splits", splits, list(dataset.splits)))
     columns = _chosen("fields", fields, list(dataset.fields))
-    if maps_a_file < 0:
-        raise DatasetError(f"Expected `maps_per_file` ≥ 0, got {maps_a_file}.")
-    if not publication.date:
-        today = datetime.datetime.now(datetime.UTC).date()
-        publication = replace(publication, date=today.isoformat())
-    refuse_taken(out, overwrite, _foreign)
+    expect(maps_a_file >= 0, f"`maps_per_file` ≥ 0, got {maps_a_file}.")
     out = out.resolve()
     done, total = 0, sum(dataset.map_count(split) for split in names)
-    with named_errors(out), sole_writer(out, str(out)):
-        restore(out)
-        refuse_taken(out, overwrite, _foreign)  # it may have come while another run held it
-        with building(out) as folder:
-            (folder / FOLDER).mkdir()
-            yield done, total
-            for split, name in names.items():
-                for maps in write_split(folder / FOLDER, name, dataset, split, columns, maps_a_file):
-                    done += maps
-                    yield done, total
-            about = metadata(dataset, names, columns, publication, folder)
-            (folder / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
-            (folder / CARD).write_text(card(dataset, names, publication))
-            take_place(folder, out)
+    with held(out, overwrite, _foreign), building(out) as folder:
+        (folder / FOLDER).mkdir()
+        yield done, total
+        for split, name in names.items():
+            for maps in write_split(folder / FOLDER, name, dataset, split, columns, maps_a_file):
+                done += maps
+                yield done, total
+        about = metadata(dataset, names, columns, publication, folder)
+        (folder / METADATA).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n")
+        (folder / CARD).write_text(card(dataset, names, publication))
+        take_place(folder, out)
 
 
 def _foreign(out: Path) -> str:
@@ -69,9 +59,7 @@ def _foreign(out: Path) -> str:
 
 
 def _chosen(what: str, asked: Sequence[str] | None, known: list[str]) -> list[str]:
-    if asked is None:
-        return known
+    asked = known if asked is None else asked
     unknown = [name for name in asked if name not in known]
-    if unknown or not asked:
-        raise DatasetError(f"Expected `{what}` among {known}, got {unknown or 'none'}.")
+    expect(asked and not unknown, f"`{what}` among {known}, got {unknown or 'none'}.")
     return [name for name in known if name in asked]

@@ -7,7 +7,6 @@ null. The first column, `map`, is the number of the map in its split. Letters in
 import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,7 +17,6 @@ import pyarrow.parquet as pq
 from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.datagen.schema import Maps
 
 MAP = "map"
 FOLDER = "data"
@@ -43,6 +41,12 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
     return names
 
 
+def columns_of(dataset: TerrainDataset, fields: Iterable[str]) -> dict[str, schema.Field]:
+    """The columns of a split: the number of the map, and some of the dataset's fields."""
+    number = schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")
+    return {MAP: number, **{name: dataset.fields[name] for name in fields}}
+
+
 def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> pa.Schema:
     """The columns of a split, with shape, unit and meaning of each, and the dataset's recipes, as metadata.
 
@@ -51,27 +55,26 @@ def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> 
         split: its name there.
         fields: which fields, in the order of the columns.
     """
-    manifest = dataset.manifest
+    manifest, entry = dataset.manifest, dataset.splits[split]
     about = {
         "format": schema.FORMAT,
         "id": dataset.id,
         "generator": manifest["generator"],
         "grid": asdict(dataset.grid),
         "split": split,
-        "scenario": dataset.splits[split]["scenario"],
-        "maps": dataset.map_count(split),
-        "digest": dataset.splits[split]["digest"],
+        **{key: entry[key] for key in ("scenario", "maps", "digest")},
         "truth": dataset.truth_of(split),
-        "parts": dataset.splits[split]["parts"],
+        "parts": entry["parts"],
         "recipes": manifest["recipes"],
     }
-    number = _column(MAP, pa.int64(), [], "1", "number of the map in its split")
     columns = []
-    for name in fields:
-        field = dataset.fields[name]
-        shape = field.entry_shape(*dataset.grid.shape)
-        columns.append(_column(name, _nested_type(field.dtype, shape), shape, field.unit, field.meaning))
-    return pa.schema([number, *columns], {"benchnav": json.dumps(about)})
+    for name, field in columns_of(dataset, fields).items():
+        kind, shape = pa.from_numpy_dtype(np.dtype(field.dtype)), field.entry_shape(*dataset.grid.shape)
+        for size in reversed(shape):
+            kind = pa.list_(pa.field("element", kind, False), size)
+        words = {"shape": json.dumps(list(shape)), "unit": field.unit, "meaning": field.meaning}
+        columns.append(pa.field(name, kind, False, words))
+    return pa.schema(columns, {"benchnav": json.dumps(about)})
 
 
 def write_split(
@@ -90,54 +93,25 @@ def write_split(
     Yields:
         How many maps were written in each step.
     """
-    count, (height, width) = dataset.map_count(split), dataset.grid.shape
-    most = maps_a_file or max(1, CELLS_A_FILE // (height * width))
-    files = -(-count // most)
-    columns = table_schema(dataset, split, fields)
-    with ExitStack() as opened:
-        for indices, maps in dataset.chunks(split, fields, _CELLS_A_ROW_GROUP):
-            for first in _cut(indices, most):
-                rows = range(first, min(indices.stop, (first // most + 1) * most))
-                if first % most == 0:
-                    opened.close()
-                    path = folder / f"{name}-{first // most:05d}-of-{files:05d}.parquet"
-                    writer = opened.enter_context(pq.ParquetWriter(path, columns, compression="zstd"))
-                within = slice(rows.start - indices.start, rows.stop - indices.start)
-                part = {field: values[within] for field, values in maps.items()}
-                writer.write_batch(_batch(rows, part, columns))
+    cells = dataset.grid.height * dataset.grid.width
+    most, step = maps_a_file or max(1, CELLS_A_FILE // cells), max(1, _CELLS_A_ROW_GROUP // cells)
+    every, columns = range(dataset.map_count(split)), table_schema(dataset, split, fields)
+    files = -(-len(every) // most)
+    for number in range(files):
+        own = every[number * most :][:most]
+        path = folder / f"{name}-{number:05d}-of-{files:05d}.parquet"
+        with pq.ParquetWriter(path, columns, compression="zstd") as writer:
+            for place in range(0, len(own), step):
+                rows = own[place : place + step]
+                maps = {MAP: np.array(rows), **dataset.read(split, rows, fields)}
+                arrays = [_nested_array(maps[column.name], column.type) for column in columns]
+                writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=columns))
                 yield len(rows)
-
-
-def _cut(indices: range, most: int) -> Iterator[int]:
-    """Where rows of some maps begin that go to one file each."""
-    yield indices.start
-    yield from range((indices.start // most + 1) * most, indices.stop, most)
-
-
-def _column(name: str, kind: pa.DataType, shape: Sequence[int], unit: str, meaning: str) -> pa.Field:
-    return pa.field(name, kind, False, {"shape": json.dumps(list(shape)), "unit": unit, "meaning": meaning})
-
-
-def _nested_type(dtype: str, shape: Sequence[int]) -> pa.DataType:
-    kind = pa.from_numpy_dtype(np.dtype(dtype))
-    for size in reversed(shape):
-        kind = pa.list_(pa.field("element", kind, False), size)
-    return kind
-
-
-def _batch(rows: range, maps: Maps, columns: pa.Schema) -> pa.RecordBatch:
-    arrays = [pa.array(np.arange(rows.start, rows.stop))]
-    for column in list(columns)[1:]:
-        arrays.append(_nested_array(maps[column.name], column.type))
-    return pa.RecordBatch.from_arrays(arrays, schema=columns)
 
 
 def _nested_array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
     """Lists within lists, of values of shape [B, *entry shape]."""
-    kinds = [kind]
-    while pa.types.is_fixed_size_list(kinds[-1]):
-        kinds.append(kinds[-1].value_type)
-    array = pa.array(np.ascontiguousarray(values).reshape(-1))
-    for nested in reversed(kinds[:-1]):
-        array = pa.FixedSizeListArray.from_arrays(array, type=nested)
-    return array
+    if not pa.types.is_fixed_size_list(kind):
+        return pa.array(np.ascontiguousarray(values))
+    inner = _nested_array(values.reshape(-1, *values.shape[2:]), kind.value_type)
+    return pa.FixedSizeListArray.from_arrays(inner, type=kind)

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import h5py
@@ -11,6 +13,8 @@ import numpy as np
 from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import CHUNK_CELLS, READ_ERRORS, TerrainDataset, open_file
+
+_MISSING = "is missing or cannot be opened"
 
 
 @dataclass(frozen=True, order=True)
@@ -33,28 +37,26 @@ class Fault:
 
     def __str__(self) -> str:
         """One line."""
-        place = f"map {self.map}" if self.map >= 0 else ""
-        return _line(self, place)
+        return self.line(f"map {self.map}" if self.map >= 0 else "")
+
+    def line(self, place: str) -> str:
+        """The fault of maps in words."""
+        problem = f"field {self.field!r} {self.problem}" if self.field else self.problem
+        where = f" ({self.file})" if self.file else ""
+        return ": ".join(word for word in (self.split, place, problem) if word) + where
 
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
     """Writes a line a fault, consecutive maps with the same fault in one."""
-    kinds: dict[tuple[str, str, str, str], list[Fault]] = {}
-    for fault in sorted(faults):
-        kinds.setdefault((fault.split, fault.field, fault.problem, fault.file), []).append(fault)
-    for alike in kinds.values():
-        maps = np.array([fault.map for fault in alike])
-        for run in np.split(maps, np.flatnonzero(np.diff(maps) != 1) + 1):
-            if len(run) > 1:
-                yield _line(alike[0], f"maps {run[0]}–{run[-1]}")
-            else:
-                yield str(replace(alike[0], map=int(run[0])))
 
+    def run_of(item: tuple[int, Fault]) -> Fault:
+        place, fault = item
+        return replace(fault, map=fault.map - place)
 
-def _line(fault: Fault, place: str) -> str:
-    words = [fault.split, place, f"field {fault.field!r} {fault.problem}" if fault.field else fault.problem]
-    where = f" ({fault.file})" if fault.file else ""
-    return ": ".join(word for word in words if word) + where
+    order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
+    for _, items in groupby(enumerate(order), run_of):
+        run = [fault for _, fault in items]
+        yield run[0].line(f"maps {run[0].map}–{run[-1].map}") if len(run) > 1 else str(run[0])
 
 
 def find_faults(path: str | Path) -> list[Fault]:
@@ -70,108 +72,80 @@ def find_faults(path: str | Path) -> list[Fault]:
         DatasetError: the file or its manifest cannot be read at all.
     """
     dataset = TerrainDataset(path)
-    return [fault for split in dataset.splits for fault in _split_faults(dataset, split)]
+    return [Fault(split, *about) for split in dataset.splits for about in _split_faults(dataset, split)]
 
 
-def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[Fault]:
-    own = dataset.fields
-    digest = schema.SplitDigest(dataset.map_count(split), *dataset.grid.shape, own)
-    unlike: list[Fault] = []  # maps that do not match the digests beside them
-    readable = True
+def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, str, str, str]]:
+    """The faults of a split: map, field, problem and file of each."""
+    fields, count = list(dataset.fields), dataset.map_count(split)
+    stored = np.zeros((count, len(fields), schema.DIGEST_BYTES), np.uint8)
+    computed = np.zeros_like(stored)
+    is_read = {name: np.zeros(count, dtype=bool) for name in (*fields, schema.ENTRY_DIGESTS)}
+    files: list[str] = []  # of each map
     for piece in dataset.pieces(split):
-        name = piece.path.name if piece.path != dataset.path else ""
+        own = piece.path.name if piece.path != dataset.path else ""
+        files += [own] * piece.maps
         try:
             file = open_file(piece.path)
         except DatasetError:
-            yield Fault(split, -1, "", "is missing or cannot be opened", name)
-            readable = False
+            yield -1, "", _MISSING, own
             continue
         with file:
-            sound, faults = _arrays(file, split, piece.maps, dataset)
-            yield from (replace(fault, file=name) for fault in faults)
-            readable = readable and set(own) <= set(sound)
-            for start, maps in _read_some(sound, piece.maps):
-                first = piece.first + start
-                yield from (
-                    Fault(split, first, field, "is damaged", name) for field in sound if field not in maps
-                )
-                fields = {name: field for name, field in own.items() if name in maps}
-                classes = len(dataset.recipe.classes)
-                unlabelled = schema.has_unlabelled(dataset.splits[split])
-                for field in fields:
-                    faulty = _out_of_range(field, fields[field], maps[field], classes, unlabelled)
-                    yield from (Fault(split, first + i, field, "is out of range", name) for i in faulty)
-                readable = readable and len(fields) == len(own)
-                if not fields:
+            for name in is_read:
+                try:
+                    array = dataset.stored_array(file, split, name, piece.maps)
+                except (*READ_ERRORS, TypeError, AttributeError) as error:
+                    is_other = type(error) is ValueError
+                    yield -1, name, str(error).removeprefix("it ") if is_other else _MISSING, own
                     continue
-                digests = schema.entry_digests(maps, fields)
-                if readable:
-                    digest.update(digests)
-                if schema.ENTRY_DIGESTS in maps:
-                    columns = [list(own).index(field) for field in fields]
-                    differ = (digests != maps[schema.ENTRY_DIGESTS][:, columns]).any(axis=2)
-                    unlike += [
-                        Fault(split, first + index, list(fields)[column], "does not match its digest", name)
-                        for index, column in np.argwhere(differ).tolist()
-                    ]
-    if readable and digest.hexdigest() == dataset.splits[split]["digest"]:
+                for place, values in _read_some(array):
+                    first = piece.first + place
+                    if values is None:
+                        yield first, name, "is damaged", own
+                        continue
+                    maps = slice(first, first + len(values))
+                    is_read[name][maps] = True
+                    if name == schema.ENTRY_DIGESTS:
+                        stored[maps] = values
+                        continue
+                    for index in _out_of_range(dataset, split, name, values):
+                        yield first + index, name, "is out of range", own
+                    digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
+                    computed[maps, fields.index(name)] = digests[:, 0]
+    readable = np.stack([is_read[name] for name in fields], axis=1)
+    unlike = (computed != stored).any(axis=2) & readable & is_read[schema.ENTRY_DIGESTS][:, None]
+    digest = schema.split_digest(computed, *dataset.grid.shape, dataset.fields)
+    if readable.all() and digest == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
-        told = {fault.map: fault for fault in unlike}
-        for index in sorted(told):
-            yield replace(told[index], field=schema.ENTRY_DIGESTS, problem="does not match the map")
+        for index in np.flatnonzero(unlike.any(axis=1)).tolist():
+            yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
-    yield from unlike
-    if readable and not unlike:
-        yield Fault(split, -1, "", "the maps do not match the digest in the manifest")
+    for index, column in np.argwhere(unlike).tolist():
+        yield index, fields[column], "does not match its digest", files[index]
+    if readable.all() and not unlike.any():
+        yield -1, "", "the maps do not match the digest in the manifest", ""
 
 
-def _arrays(
-    file: h5py.File, split: str, maps: int, dataset: TerrainDataset
-) -> tuple[dict[str, h5py.Dataset], list[Fault]]:
-    """The arrays of a split in a file that are as they should be, and what is wrong with the others."""
-    shapes = {name: field.entry_shape(*dataset.grid.shape) for name, field in dataset.fields.items()}
-    wanted = {name: (field.dtype, shapes[name]) for name, field in dataset.fields.items()}
-    wanted[schema.ENTRY_DIGESTS] = ("|u1", (len(dataset.fields), schema.DIGEST_BYTES))
-    sound, faults = {}, []
-    for name, (dtype, entry) in wanted.items():
+def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
+    """Reads some maps at a time, from the first given on; each one, or None, of those that cannot be read together."""
+    step = max(1, CHUNK_CELLS * len(array) // max(1, array.size))
+    for start in range(0, len(array), step):
         try:
-            array = file[f"{split}/{name}"]
-            found = (array.dtype.str, array.shape)
-        except (*READ_ERRORS, TypeError, AttributeError):
-            faults.append(Fault(split, -1, name, "is missing or cannot be opened"))
-            continue
-        if found == (dtype, (maps, *entry)):
-            sound[name] = array
-        else:
-            problem = f"is {found[0]} {list(found[1])}, not {dtype} {[maps, *entry]}"
-            faults.append(Fault(split, -1, name, problem))
-    return sound, faults
-
-
-def _read_some(arrays: dict[str, h5py.Dataset], maps: int) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Reads some maps at a time; of those that cannot be read together each one, with the arrays that can be read."""
-    cells = max((int(np.prod(array.shape[1:])) for array in arrays.values()), default=1)
-    step = max(1, CHUNK_CELLS // max(1, cells))
-    for start in range(0, maps, step):
-        stop = min(start + step, maps)
-        try:
-            yield start, {name: array[start:stop] for name, array in arrays.items()}
+            yield start, array[start : start + step]
         except READ_ERRORS:
-            for index in range(start, stop):
-                readable = {}
-                for name, array in arrays.items():
-                    with suppress(*READ_ERRORS):
-                        readable[name] = array[index : index + 1]
-                yield index, readable
+            for index in range(start, min(start + step, len(array))):
+                values = None
+                with suppress(*READ_ERRORS):
+                    values = array[index : index + 1]
+                yield index, values
 
 
-def _out_of_range(
-    name: str, field: schema.Field, values: np.ndarray, classes: int, unlabelled: bool
-) -> list[int]:
+def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.ndarray) -> list[int]:
     """Which maps have a value that may not be."""
-    most = classes - 1 if name == "class_id" else field.most
+    field = dataset.fields[name]
+    most = len(dataset.recipe.classes) - 1 if name == "class_id" else field.most
     allowed = (values >= field.least) & (values <= most)
-    if name == "class_id" and unlabelled:
+    if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
         allowed |= values == schema.UNLABELLED
     # Not asked for; not observed; what a field that is not ours means by it, it may mean.
     if name in ("reference_time_s", "traversability") or name not in schema.FIELDS | schema.OPTIONAL:

@@ -9,7 +9,7 @@ it replaces a finished one it is made in such a folder too.
 import platform
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import benchnav
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import ConfigError, DatasetError, expect
 from benchnav.core.store import Shard, real_place, replacing, restore, sole_writer
 from benchnav.core.workers import run_calls
 from benchnav.datagen.files.hdf5 import (
@@ -29,7 +29,7 @@ from benchnav.datagen.files.hdf5 import (
     recipe_entry,
     whole,
 )
-from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset
+from benchnav.datagen.files.reader import FOLDER_MANIFEST, read_manifest
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
 
@@ -89,8 +89,9 @@ def create(
         BenchnavError: another run is writing it, a worker was killed, or the cluster was lost.
     """
     path = real_place(path)
-    if shard is not None and is_one_file(path):
-        raise ConfigError(f"Expected `out` to be a folder, since a shard is made, got {path}.")
+    expect(
+        shard is None or not is_one_file(path), f"`out` to be a folder, since a shard is made, got {path}."
+    )
     shards = cut(recipe, shard_cells)
     own = shards if shard is None else shards[shard.index - 1 :: shard.of]
     with named_errors(path), _held(path, shard):
@@ -98,26 +99,24 @@ def create(
         folder = _workplace(path, shards, shard, overwrite)
         folder.mkdir(parents=True, exist_ok=True)
         missing = _missing(folder, recipe, shards, own, may_replace=overwrite or folder != path)
-        if (folder / FOLDER_MANIFEST).exists():
-            if not missing:
-                check_place(path, overwrite)
-            (folder / FOLDER_MANIFEST).unlink(missing_ok=True)  # until what was lost is there again
+        manifest = folder / FOLDER_MANIFEST
+        if manifest.exists() and not missing:
+            check_place(path, overwrite)
+        manifest.unlink(missing_ok=True)  # until what was lost is there again
         total = sum(shard.maps for shard in own)
         begun = done = total - sum(shard.maps for shard in missing)
         yield done, total
         try:
-            calls = [partial(_make, recipe, file, benchnav.__version__) for file in missing]
+            calls = [partial(make, recipe, file, benchnav.__version__) for file in missing]
             for file, content in run_calls(calls, jobs, scheduler):
                 with replacing(folder / file.name) as unfinished:
                     unfinished.write_bytes(content)
                 done += file.maps
                 yield done, total
         except ConfigError:
-            if folder != path and done > begun:  # the recipe cannot be met: there is nothing to go on to
+            # Where this run made maps the recipe cannot be met, and there is nothing to go on to.
+            if folder != path and (done > begun or not any(folder.iterdir())):
                 shutil.rmtree(folder, ignore_errors=True)
-            elif folder != path:
-                with suppress(OSError):  # it holds what an earlier run has made
-                    folder.rmdir()
             raise
         if shard is None or not _missing(folder, recipe, shards, (), may_replace=overwrite):
             files = {
@@ -129,7 +128,7 @@ def create(
                 shutil.rmtree(folder)
 
 
-def cut(recipe: Recipe, cells: int = SHARD_CELLS) -> list[ShardFile]:
+def cut(recipe: Recipe, cells: int) -> list[ShardFile]:
     """Cuts a recipe into shards of about so many cells, in the order of splits and maps."""
     size = max(1, cells // (recipe.height * recipe.width))
     return [
@@ -139,33 +138,35 @@ def cut(recipe: Recipe, cells: int = SHARD_CELLS) -> list[ShardFile]:
     ]
 
 
-def make(recipe: Recipe, shard: ShardFile) -> bytes:
-    """Makes a shard.
+def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
+    """Makes a shard, perhaps in a process on another machine.
 
     Returns:
-        What its file holds.
+        The shard, and what its file holds.
 
     Raises:
+        DatasetError: another version of this package is installed there.
         ConfigError: the recipe cannot be met.
     """
+    if benchnav.__version__ != version:
+        raise DatasetError(
+            f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
+        )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
     entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
-    return pack(recipe.id, recipe, shard.split, entry, maps)
+    return shard, pack(recipe, shard.split, entry, maps)
 
 
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
     """Tells whether a file is this shard of this recipe, made by this version."""
     try:
-        manifest = TerrainDataset(path).manifest
+        manifest = read_manifest(path)
     except DatasetError:
         return False
-    entry = {
-        name: value for name, value in manifest["splits"].get(shard.split, {}).items() if name != "digest"
-    }
-    return (manifest["recipes"], manifest["generator"]["version"], entry) == (
-        [recipe.to_dict()],
-        benchnav.__version__,
-        recipe_entry(recipe, shard.split, shard.first, shard.stop),
+    entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
+    made_by = manifest["recipes"], manifest["generator"]["version"]
+    return made_by == ([recipe.to_dict()], benchnav.__version__) and (
+        entry.items() <= manifest["splits"].get(shard.split, {}).items()
     )
 
 
@@ -189,12 +190,9 @@ def _workplace(path: Path, shards: Sequence[ShardFile], shard: Shard | None, ove
     beside = path.with_name(f".{path.name}.partial")
     # Of a folder, shards of this recipe are gone on with.
     check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
-    if is_one_file(path):
-        return beside
-    if not overwrite or not (path / FOLDER_MANIFEST).exists():
+    if not is_one_file(path) and not (overwrite and (path / FOLDER_MANIFEST).exists()):
         return path
-    if shard is not None:
-        raise ConfigError(f"Expected no finished dataset to replace by a shard, got {path}. Remove it first.")
+    expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
     return beside
 
 
@@ -217,10 +215,11 @@ def _missing(
     every = sorted(folder.glob("*.h5"))
     there = {file.name for file in every if file.name in known and is_there(file, recipe, known[file.name])}
     foreign = [file for file in every if file.name not in there]
-    if foreign and not may_replace:
-        raise ConfigError(
-            f"Expected `out` to be new or to hold shards of one recipe and version, but {foreign[0]} is of another. "
-            "Choose another `out`, or pass --overwrite with the recipe, settings and version of the others."
+    for file in foreign:
+        expect(
+            may_replace,
+            f"`out` to be new or to hold shards of one recipe and version, but {file} is of another. "
+            "Choose another `out`, or pass --overwrite with the recipe, settings and version of the others.",
         )
     # Those of other shards are for these to replace; what is half-written of these is of a killed run.
     mine = {shard.name for shard in own}
@@ -228,17 +227,3 @@ def _missing(
     for file in [file for file in foreign if own and (file.name in mine or file.name not in known)] + half:
         file.unlink(missing_ok=True)
     return [shard for shard in own or shards if shard.name not in there]
-
-
-def _make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
-    """Makes a shard, perhaps in a process on another machine.
-
-    Raises:
-        DatasetError: another version of this package is installed there.
-        ConfigError: the recipe cannot be met.
-    """
-    if benchnav.__version__ != version:
-        raise DatasetError(
-            f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
-        )
-    return shard, make(recipe, shard)

@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.filesize import decimal
 
+from benchnav.core.settings import plain
 from benchnav.core.tables import Table
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, open_file
@@ -18,32 +19,26 @@ _DIGESTS = {
 
 def describe(dataset: TerrainDataset) -> dict[str, Any]:
     """Gathers what `show` shows, ready for JSON."""
-    manifest, recipe = dataset.manifest, dataset.recipe
-    stored = {split: _stored_bytes(dataset, split) for split in dataset.splits}
-    files = {piece.path for split in dataset.splits for piece in dataset.pieces(split)}
+    manifest, about = dataset.manifest, plain(dataset.recipe)
+    made_by = ("environments", "stuck_threshold", "synthesis", "places", "correlation_m", "classes")
     return {
         "path": str(dataset.path),
-        "bytes": sum(path.stat().st_size for path in files),
-        "files": len(files),
+        "bytes": sum(path.stat().st_size for path in dataset.files),
+        "files": len(dataset.files),
         "id": dataset.id,
         "format_version": manifest["format_version"],
         "generator": manifest["generator"],
         "grid": asdict(dataset.grid),
-        "environments": recipe.environments,
-        "stuck_threshold": recipe.stuck_threshold,
-        "synthesis": recipe.synthesis,
-        "places": None if recipe.places is None else asdict(recipe.places),
-        "correlation_m": recipe.correlation_m,
+        **{name: about[name] for name in made_by},
         "splits": {
             name: {
                 **entry,
-                "stored_bytes": stored[name],
+                "stored_bytes": _stored_bytes(dataset, name),
                 "truth": dataset.truth_of(name),
                 "recorded_digest": dataset.split_digest(name),
             }
             for name, entry in dataset.splits.items()
         },
-        "classes": [asdict(item) for item in recipe.classes],
         "fields": manifest["fields"],
         "recipes": manifest["recipes"],
     }
@@ -73,7 +68,15 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
         f"maps of {grid['height']} × {grid['width']} cells of {grid['resolution_m']:g} m, "
         f"{described['environments']} environments, λ_stuck {described['stuck_threshold']:g}"
     )
-    yield _making(described)
+    making, places = f"synthesis {described['synthesis']}", described["places"]
+    if places:
+        making += (
+            f", start and goal drawn a map, at least {places['least_distance_m']:g} m apart and "
+            f"{places['margin_m']:g} m from the edges"
+        )
+    if described["correlation_m"]:
+        making += f", λ correlated over {described['correlation_m']:g} m"
+    yield making
     yield Table(
         title="splits",
         headings=("split", "scenario", "maps", "MB", "truth of λ", "made from"),
@@ -95,34 +98,16 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
     for key, title in _DIGESTS.items():
         yield title
         yield from (f"  {name:12} {entry[key]}" for name, entry in described["splits"].items())
-    soft = any(item["soft"] for item in described["classes"])
-    rows = []
+    headings, rows = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots"], []
     for number, item in enumerate(described["classes"]):
-        colour = "#" + "".join(f"{value:02x}" for value in item["colour"])
+        colour = f"#{bytes(item['colour']).hex()}"
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
-        rows.append((str(number), item["name"], colour, *numbers, *[_soft_spots(item["soft"])] * soft))
-    yield Table(
-        title="classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)",
-        headings=("id", "class", "colour", "a", "b", "o", "σ", *["soft spots"] * soft),
-        rows=tuple(rows),
-    )
-
-
-def _making(described: dict[str, Any]) -> str:
-    """One line on how the maps were made."""
-    words, places = [f"synthesis {described['synthesis']}"], described["places"]
-    if places:
-        words.append(
-            f"start and goal drawn a map, at least {places['least_distance_m']:g} m apart and "
-            f"{places['margin_m']:g} m from the edges"
-        )
-    if described["correlation_m"]:
-        words.append(f"λ correlated over {described['correlation_m']:g} m")
-    return ", ".join(words)
-
-
-def _soft_spots(spots: dict[str, float] | None) -> str:
-    return f"{spots['weight']:.0%} N({spots['mean']:g}, {spots['std']:g})" if spots else ""
+        soft = "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"]) if item["soft"] else ""
+        rows.append((str(number), item["name"], colour, *numbers, soft))
+    if not any(row[-1] for row in rows):
+        headings, rows = headings[:-1], [row[:-1] for row in rows]
+    title = "classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)"
+    yield Table(title=title, headings=tuple(headings), rows=tuple(rows))
 
 
 def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
@@ -134,8 +119,7 @@ def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
 
 def say_written(dataset: TerrainDataset) -> None:
     """Prints where a new dataset is, its size, its splits and their digests."""
-    files = {piece.path for split in dataset.splits for piece in dataset.pieces(split)}
-    size = decimal(sum(path.stat().st_size for path in files))
-    print(f"wrote {dataset.path} ({size}{f' in {len(files)} files' if len(files) > 1 else ''})")
+    size, files = decimal(sum(path.stat().st_size for path in dataset.files)), len(dataset.files)
+    print(f"wrote {dataset.path} ({size}{f' in {files} files' if files > 1 else ''})")
     for name, split in dataset.splits.items():
         print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")

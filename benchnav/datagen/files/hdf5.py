@@ -6,18 +6,20 @@ HDF5's own filters compress and checksum: byte shuffle, deflate, Fletcher-32. Le
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from numpy import ndarray
 
 import benchnav
 from benchnav.core.errors import DatasetError
-from benchnav.core.store import refuse_taken, replacing, seal, take_place, write_text
+from benchnav.core.store import refuse_taken, replacing, restore, seal, sole_writer, take_place, write_text
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file, read_manifest
 from benchnav.datagen.recipe.recipe import Recipe
@@ -35,7 +37,7 @@ _SPARE_BYTES_A_MAP = 1024
 _SHARD = re.compile(r".+-\d{8}-\d{8}\.h5")
 _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 
-Splits = Mapping[str, Mapping[str, Any]]
+Source = Mapping[str, Any]  # stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,29 +54,22 @@ class Contents:
 
     id: str
     recipes: Sequence[Recipe]
-    splits: Splits
+    splits: Mapping[str, Mapping[str, Any]]
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
     fields: Mapping[str, schema.Field] = field(default_factory=lambda: schema.FIELDS)
 
-    def new_digests(self) -> dict[str, schema.SplitDigest]:
-        """The digests of the splits, of no maps yet."""
-        shape = self.recipes[0].grid.shape
-        return {
-            name: schema.SplitDigest(entry["maps"], *shape, self.fields)
-            for name, entry in self.splits.items()
-        }
-
-    def manifest(self, digests: Mapping[str, schema.SplitDigest]) -> dict[str, Any]:
-        """The manifest, of digests of all maps."""
-        synthesis = [recipe.synthesis for recipe in self.recipes]
+    def manifest(self, entry_digests: Mapping[str, ndarray]) -> dict[str, Any]:
+        """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of each split."""
+        synthesis, shape = [recipe.synthesis for recipe in self.recipes], self.recipes[0].grid.shape
         return {
             "format": schema.FORMAT,
             "format_version": schema.version_of(synthesis, self.splits.values(), self.fields),
             "id": self.id,
             "generator": {"package": "benchnav", "version": benchnav.__version__},
-            "fields": schema.field_table(*self.recipes[0].grid.shape, self.fields),
+            "fields": schema.field_table(*shape, self.fields),
             "splits": {
-                name: {**entry, "digest": digests[name].hexdigest()} for name, entry in self.splits.items()
+                name: {**entry, "digest": schema.split_digest(entry_digests[name], *shape, self.fields)}
+                for name, entry in self.splits.items()
             },
             "recipes": [recipe.to_dict() for recipe in self.recipes],
         }
@@ -92,75 +87,38 @@ def recipe_entry(recipe: Recipe, split: str, first: int, stop: int) -> dict[str,
     return {"scenario": recipe.splits[split].scenario, "maps": stop - first, "parts": [part]}
 
 
-class Writer:
-    """Fills an open file with a dataset, each split's maps in their order.
-
-    Args:
-        file: empty.
-        contents: what the dataset is to hold.
-    """
-
-    def __init__(self, file: h5py.File, contents: Contents) -> None:
-        """Makes the empty arrays."""
-        self._file, self._contents = file, contents
-        # Kept until all is written: HDF5 writes an array out when it is let go.
-        self._arrays = {
-            name: _new_arrays(file.create_group(name), entry["maps"], contents)
-            for name, entry in contents.splits.items()
-        }
-        self._digests = contents.new_digests()
-        self._written = dict.fromkeys(contents.splits, 0)
-
-    def add(self, split: str, maps: Mapping[str, np.ndarray]) -> None:
-        """Writes the next maps of a split, every field of shape [B, *entry shape]."""
-        for name in self._contents.fields:
-            self._put(split, name, maps[name])
-        self._finish(split, schema.entry_digests(maps, self._contents.fields))
-
-    def copy(self, split: str, stored: h5py.Group) -> None:
-        """Writes all maps of a stored split as the next ones; what is packed alike is not unpacked."""
-        for name, kind in self._contents.fields.items():
-            target = self._arrays[split][name]
-            if "H" in kind.shape and _packing(stored[name]) == _packing(target):
-                _copy_chunks(stored[name], target, self._written[split])
-            else:
-                self._put(split, name, stored[name][:])
-        self._finish(split, stored[schema.ENTRY_DIGESTS][:])
-
-    def close(self) -> None:
-        """Writes the manifest."""
-        assert self._written == {name: entry["maps"] for name, entry in self._contents.splits.items()}
-        text = seal(self._contents.manifest(self._digests)).encode()
-        self._file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
-        self._file.flush()
-
-    def _put(self, split: str, name: str, values: np.ndarray) -> None:
-        first = self._written[split]
-        self._arrays[split][name][first : first + len(values)] = values
-
-    def _finish(self, split: str, digests: np.ndarray) -> None:
-        self._put(split, schema.ENTRY_DIGESTS, digests)
-        self._digests[split].update(digests)
-        self._written[split] += len(digests)
+def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[Source]]) -> None:
+    """Fills an empty file with a dataset: with all arrays of each split's sources, end to end."""
+    # Made at first and kept until all is written: HDF5 writes an array out when it is let go.
+    arrays = {
+        split: _new_arrays(file.create_group(split), entry["maps"], contents)
+        for split, entry in contents.splits.items()
+    }
+    for split, several in sources.items():
+        first = 0
+        for source in several:
+            for name, target in arrays[split].items():
+                _put(source[name], target, first)
+            first += len(source[schema.ENTRY_DIGESTS])
+    digests = {split: own[schema.ENTRY_DIGESTS][:] for split, own in arrays.items()}
+    text = seal(contents.manifest(digests)).encode()
+    file.create_dataset(schema.MANIFEST, data=text, dtype=h5py.string_dtype("utf-8", len(text)))
+    file.flush()
 
 
-def pack(
-    dataset_id: str, recipe: Recipe, split: str, entry: Mapping[str, Any], maps: Mapping[str, np.ndarray]
-) -> bytes:
+def pack(recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps) -> bytes:
     """Makes what a file of a few maps of one split holds, in memory.
 
     Args:
-        dataset_id: name and version of the dataset.
-        recipe: by which they were made.
+        recipe: by which they were made, with the dataset's id.
         split: name of the split.
         entry: the manifest's entry of the split without its digest.
         maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
     """
-    contents = Contents(id=dataset_id, recipes=[recipe], splits={split: entry}, fields=schema.fields_in(maps))
+    contents = Contents(id=recipe.id, recipes=[recipe], splits={split: entry}, fields=schema.fields_in(maps))
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
-        writer = Writer(file, contents)
-        writer.add(split, maps)
-        writer.close()
+        digests = schema.entry_digests(maps, contents.fields)
+        _fill(file, contents, {split: [{**maps, schema.ENTRY_DIGESTS: digests}]})
         return file.id.get_file_image()
 
 
@@ -180,28 +138,26 @@ def check_place(path: Path, overwrite: bool, names: Collection[str] = ()) -> Non
     Raises:
         ConfigError: it is.
     """
-    refuse_taken(path, overwrite, lambda path: _foreign(path, names))
+    refuse_taken(path, overwrite, partial(foreign_in, names=names))
 
 
-def _foreign(path: Path, names: Collection[str]) -> str:
+def foreign_in(path: Path, names: Collection[str] = ()) -> str:
     """Says what of another kind a place holds; a folder may hold shards and their manifest alone."""
     if is_one_file(path) or not path.is_dir():
         return "" if is_one_file(path) == path.is_file() else f"is a {'folder' if path.is_dir() else 'file'}"
-    files = sorted(path.iterdir())
-    try:
+    ours = set(names)
+    with suppress(DatasetError):  # a damaged manifest is one where shards lie beside it
         shards = read_manifest(path).get("shards", {})
-        known = {shard["file"] for several in shards.values() for shard in several}
-        ours = bool(known)
-    except DatasetError:  # a damaged manifest is one where shards lie beside it
-        known, ours = set(), any(_SHARD.fullmatch(file.name) for file in files)
-    known |= {FOLDER_MANIFEST, *names} if ours else {*names}
-    for file in files:
-        if file.name not in known and not _is_ours(file):
-            return f"holds {file.name}"
+        ours |= {shard["file"] for several in shards.values() for shard in several}
+    files = sorted(file.name for file in path.iterdir())
+    ours |= {name for name in files if name not in ours and _is_shard(path / name)}
+    for name in files:
+        if name not in ours and not (name == FOLDER_MANIFEST and ours & set(files)):
+            return f"holds {name}"
     return ""
 
 
-def _is_ours(file: Path) -> bool:
+def _is_shard(file: Path) -> bool:
     """Tells whether a file is a shard, of whatever dataset, or what is half-written of one."""
     try:
         return bool(_HALF.fullmatch(file.name) or (_SHARD.fullmatch(file.name) and read_manifest(file)))
@@ -223,14 +179,14 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
     if is_one_file(out):
         _join(out, contents)
         return
-    digests = contents.new_digests()
-    shards: dict[str, list[dict[str, Any]]] = {name: [] for name in contents.splits}
-    for name, files in contents.files.items():
-        for path in files:
-            with open_file(path) as file:
-                entries = file[name][schema.ENTRY_DIGESTS][:]
-            digests[name].update(entries)
-            shards[name].append({"file": path.name, "maps": len(entries)})
+    digests: dict[str, ndarray] = {}
+    shards: dict[str, list[dict[str, Any]]] = {}
+    for split, files in contents.files.items():
+        entries = [source[schema.ENTRY_DIGESTS][:] for source in _opened(split, files)]
+        digests[split] = np.concatenate(entries)
+        shards[split] = [
+            {"file": path.name, "maps": len(own)} for path, own in zip(files, entries, strict=True)
+        ]
     manifest = contents.manifest(digests)
     version = max(manifest["format_version"], FOLDER_FORMAT_VERSION)
     write_text(folder / FOLDER_MANIFEST, seal(manifest | {"format_version": version, "shards": shards}))
@@ -239,19 +195,25 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
         take_place(folder, out)
 
 
+def _opened(split: str, files: Iterable[Path]) -> Iterator[h5py.Group]:
+    """What files hold of a split, each open while it is used."""
+    for path in files:
+        with open_file(path) as file:
+            yield file[split]
+
+
 def _join(path: Path, contents: Contents) -> None:
     """Writes one file of many."""
-    stored = [file.stat().st_size for files in contents.files.values() for file in files]
+    stored = sum(file.stat().st_size for files in contents.files.values() for file in files)
     maps = sum(entry["maps"] for entry in contents.splits.values())
     with replacing(path) as unfinished:
         with h5py.File(unfinished, "w", libver=_LIBRARY) as file:
-            _reserve(unfinished, sum(stored) + _SPARE_BYTES + _SPARE_BYTES_A_MAP * maps)
-            writer = Writer(file, contents)
-            for split, files in contents.files.items():
-                for source in files:
-                    with open_file(source) as part:
-                        writer.copy(split, part[split])
-            writer.close()
+            # HDF5 crashes if it meets a full disk, so room is taken ahead of it.
+            if hasattr(os, "posix_fallocate"):
+                with open(unfinished, "rb+") as raw:
+                    os.posix_fallocate(raw.fileno(), 0, stored + _SPARE_BYTES + _SPARE_BYTES_A_MAP * maps)
+            sources = {split: _opened(split, files) for split, files in contents.files.items()}
+            _fill(file, contents, sources)
             size = file.id.get_filesize()
         os.truncate(unfinished, size)
         if path.exists():
@@ -275,12 +237,19 @@ def named_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def held(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> Iterator[None]:
+    """Holds the place of what is made whole, for one process; see `refuse_taken` and `named_errors`."""
+    with named_errors(out), sole_writer(out, str(out)):
+        restore(out)
+        refuse_taken(out, overwrite, foreign)
+        yield
+
+
 def _new_arrays(group: h5py.Group, maps: int, contents: Contents) -> dict[str, h5py.Dataset]:
     """The empty arrays of a split, those of cells with a map a chunk."""
-    fields, (height, width) = contents.fields, contents.recipes[0].grid.shape
-    kinds = {name: (kind.dtype, kind.entry_shape(height, width)) for name, kind in fields.items()}
-    kinds[schema.ENTRY_DIGESTS] = ("|u1", (len(fields), schema.DIGEST_BYTES))
-    arrays = {}
+    fields, arrays = contents.fields, {}
+    kinds = schema.stored_arrays(fields, *contents.recipes[0].grid.shape)
     for name, (dtype, entry) in kinds.items():
         chunk = 1 if name in fields and "H" in fields[name].shape else max(1, min(maps, _VALUES_A_CHUNK))
         arrays[name] = group.create_dataset(
@@ -293,24 +262,17 @@ def _new_arrays(group: h5py.Group, maps: int, contents: Contents) -> dict[str, h
     return arrays
 
 
-def _packing(array: h5py.Dataset) -> tuple[object, ...]:
-    """What has to be alike for a chunk of one array to be one of another; the level of deflate need not be."""
-    return array.dtype.str, array.chunks, array.shuffle, array.compression, array.fletcher32
-
-
-def _copy_chunks(source: h5py.Dataset, target: h5py.Dataset, first: int) -> None:
+def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:
+    """Writes maps as those from one on; stored ones that are packed alike, a map a chunk, are not unpacked."""
+    if target.chunks[0] > 1 or isinstance(source, ndarray) or _packing(source) != _packing(target):
+        target[first : first + len(source)] = source[:]
+        return
     within = (0,) * (source.ndim - 1)
     for index in range(len(source)):
         mask, chunk = source.id.read_direct_chunk((index, *within))
         target.id.write_direct_chunk((first + index, *within), chunk, mask)
 
 
-def _reserve(path: Path, size: int) -> None:
-    """Takes room on the disk ahead of HDF5, which crashes if it meets a full one.
-
-    Raises:
-        OSError: there is no such room.
-    """
-    if hasattr(os, "posix_fallocate"):
-        with open(path, "rb+") as raw:
-            os.posix_fallocate(raw.fileno(), 0, size)
+def _packing(array: h5py.Dataset) -> tuple[object, ...]:
+    """What has to be alike for a chunk of one array to be one of another; the level of deflate need not be."""
+    return array.dtype.str, array.chunks, array.shuffle, array.compression, array.fletcher32

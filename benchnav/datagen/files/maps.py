@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -62,7 +63,8 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         index = int(index) % len(self)
         if self._memory is not None:
             return {name: values[index].clone() for name, values in self._memory.items()}
-        return {name: values[0] for name, values in self.read([index]).items()}
+        maps = self.dataset.read_run(self.split, index, 1, self.fields)
+        return {name: torch.from_numpy(np.asarray(values[0])) for name, values in maps.items()}
 
     def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
         """Reads maps by their indices ≥ 0, in any order; tensors by field, each of shape [B, *entry shape]."""

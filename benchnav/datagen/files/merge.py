@@ -6,19 +6,21 @@ What is merged is packed already: files are copied into a folder, or their chunk
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, is_dataclass, replace
-from itertools import combinations
+from dataclasses import replace
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.core.store import building, real_place, restore, sole_writer
+from benchnav.core.settings import plain
+from benchnav.core.store import building, real_place
 from benchnav.datagen import schema
-from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, is_one_file, named_errors, whole
+from benchnav.datagen.files.hdf5 import Contents, assemble, foreign_in, held, is_one_file, whole
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
+from benchnav.datagen.schema import Maps
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
@@ -49,13 +51,12 @@ def merge(
     name = dataset_id or (out.stem if is_one_file(out) else out.name)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
-    with named_errors(out), sole_writer(out, str(out)):
-        restore(out)
-        check_place(out, overwrite)
+    with held(out, overwrite, foreign_in):
         for split, files in contents.files.items():
-            for path in files:
-                for count in _check(TerrainDataset(path), split):
-                    done += count
+            for dataset in map(TerrainDataset, files):
+                for indices, maps in dataset.chunks(split):
+                    _check(dataset, split, indices, maps)
+                    done += len(indices)
                     yield done, total
         if is_one_file(out):
             assemble(contents, out.parent, out)
@@ -67,10 +68,10 @@ def merge(
 def _copies(contents: Contents, folder: Path) -> dict[str, list[Path]]:
     """Copies each file into a folder, under its own name where that is free; gives the copies by split."""
     copies: dict[Path, Path] = {}
-    for path in (path for files in contents.files.values() for path in files):
-        if path not in copies:
-            name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
-            copies[path] = Path(shutil.copy2(path, folder / name))
+    for path in dict.fromkeys(chain(*contents.files.values())):
+        name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
+        copies[path] = folder / name
+        shutil.copy2(path, copies[path])
     return {split: [copies[path] for path in files] for split, files in contents.files.items()}
 
 
@@ -85,13 +86,20 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
         reasons.append(str(error).rstrip("."))
     if reasons:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
-    recipes, splits = _table_of_contents(datasets)
-    files = {
-        split: [
-            piece.path for dataset in datasets if split in dataset.splits for piece in dataset.pieces(split)
-        ]
-        for split in splits
-    }
+    # The recipes, each once, and of each split the parts that refer to them and the files.
+    recipes: list[Recipe] = []
+    splits: dict[str, dict[str, Any]] = {}
+    files: dict[str, list[Path]] = {}
+    for dataset in datasets:
+        own = [recipe_from_dict(data, f"in {dataset.path}") for data in dataset.manifest["recipes"]]
+        recipes += [recipe for recipe in own if recipe not in recipes]
+        for name, entry in dataset.splits.items():
+            files.setdefault(name, []).extend(piece.path for piece in dataset.pieces(name))
+            gathered = splits.setdefault(name, {"scenario": entry["scenario"], "maps": 0, "parts": []})
+            gathered["maps"] += entry["maps"]
+            for part in entry["parts"]:
+                number = {"recipe": recipes.index(own[part["recipe"]])} if "recipe" in part else {}
+                gathered["parts"].append({**part, **number})
     return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files, fields=datasets[0].fields)
 
 
@@ -106,26 +114,23 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
         raise DatasetError(
             f"Expected datasets or shards of one, got {', '.join(map(str, folders))} without any."
         )
-    first = shards[0].manifest
-    for shard in shards:
-        for name in ("recipes", "generator"):
-            if shard.manifest[name] != first[name]:
-                raise DatasetError(
-                    f"Expected shards of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
-                )
-    recipe = recipe_from_dict(first["recipes"][0], f"in {shards[0].path}")
+    for shard, name in product(shards, ("recipes", "generator")):
+        if shard.manifest[name] != shards[0].manifest[name]:
+            raise DatasetError(
+                f"Expected shards of one dataset, got {shards[0].path} and {shard.path} with unlike {name}."
+            )
+    recipe = shards[0].recipe
     files: dict[str, list[Path]] = {}
     lacking = []
     for name, spec in recipe.splits.items():
         own = {shard.splits[name]["parts"][0]["first"]: shard for shard in shards if name in shard.splits}
         place, files[name] = 0, []
-        for begin in sorted(own):
+        for begin in (*sorted(own), spec.maps):
             if begin != place:
                 lacking.append(f"maps {place}–{begin - 1} of {name}")
-            files[name].append(own[begin].path)
-            place = begin + own[begin].splits[name]["maps"]
-        if place != spec.maps:
-            lacking.append(f"maps {place}–{spec.maps - 1} of {name}")
+            if begin in own:
+                files[name].append(own[begin].path)
+                place = begin + own[begin].splits[name]["maps"]
     if lacking:
         raise DatasetError(f"Expected all shards of {recipe.id}, got none with {'; '.join(lacking)}.")
     return whole(recipe, files)
@@ -133,11 +138,10 @@ def _of_shards(folders: Sequence[Path]) -> Contents:
 
 def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
     """Gives every reason why datasets cannot be one: a sentence a pair of them, which names both once."""
-    prints = [_fingerprints(dataset) for dataset in datasets]
-    for one, other in combinations(range(len(datasets)), 2):
-        first, second = datasets[one], datasets[other]
+    prints = [(dataset, _fingerprints(dataset)) for dataset in datasets]
+    for (first, ours), (second, theirs) in combinations(prints, 2):
         reasons = list(_differences(first, second))
-        common = np.intersect1d(prints[one], prints[other])
+        common = np.intersect1d(ours, theirs)
         if len(common):
             reasons.append(f"{len(common)} map(s) in common")
         if reasons:
@@ -149,73 +153,43 @@ def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]
         extra = sorted(set(first.fields) ^ set(second.fields)) or ["fields"]
         hint = ": import both with overlap or both without, by --stride" if extra == ["group"] else ""
         yield f"unlike fields ({', '.join(extra)} of one alone{hint})"
+    ours, theirs = plain(first.recipe), plain(second.recipe)
     for name in _SHARED:
-        ours, theirs = getattr(first.recipe, name), getattr(second.recipe, name)
-        if ours != theirs:
-            yield f"unlike {name}" + (
-                "" if name == "classes" else f" ({_in_words(ours)} / {_in_words(theirs)})"
-            )
+        if ours[name] != theirs[name]:
+            yield f"unlike {name}" + ("" if name == "classes" else f" ({ours[name]} / {theirs[name]})")
     for split in sorted(set(first.splits) & set(second.splits)):
-        if not _kinds(first, split) | _kinds(second, split) <= _kinds(first, split) & _kinds(second, split):
+        if len(_kinds(first, split) | _kinds(second, split)) > 1:
             yield f"unlike scenarios or `solvable` in split {split!r}"
-
-
-def _in_words(value: Any) -> str:
-    """A value of a recipe as its YAML file has it."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return ", ".join(f"{name} {item}" for name, item in asdict(value).items())
-    return "none" if value is None else str(value)
 
 
 def _kinds(dataset: TerrainDataset, split: str) -> set[str]:
     """What the maps of a split are by their recipes: scenario, and whether all can be solved."""
     kinds = set()
     for part in dataset.splits[split]["parts"]:
-        if "recipe" not in part:
-            kinds.add("imported")
-            continue
-        recipe = dataset.manifest["recipes"][part["recipe"]]
-        spec = recipe["splits"][part["split"]]
-        scenario = recipe["scenarios"][spec["scenario"]]
-        kinds.add(json.dumps([spec["scenario"], scenario, spec["solvable"]], sort_keys=True))
+        kind: Any = "imported"
+        if "recipe" in part:
+            recipe = dataset.manifest["recipes"][part["recipe"]]
+            spec = recipe["splits"][part["split"]]
+            kind = [spec["scenario"], recipe["scenarios"][spec["scenario"]], spec["solvable"]]
+        kinds.add(json.dumps(kind, sort_keys=True))
     return kinds
 
 
 def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
     """The digests of all elevation maps, shape [N]."""
     column = dataset.field_names.index("elevation_m")
-    digests = [dataset.entry_digests(split)[:, column] for split in dataset.splits]
-    return np.ascontiguousarray(np.concatenate(digests)).view(f"S{schema.DIGEST_BYTES}").ravel()
+    digests = np.concatenate([dataset.entry_digests(split) for split in dataset.splits])
+    return np.ascontiguousarray(digests[:, column]).view(f"S{schema.DIGEST_BYTES}").ravel()
 
 
-def _table_of_contents(datasets: Sequence[TerrainDataset]) -> tuple[list[Recipe], dict[str, dict[str, Any]]]:
-    """Gathers the recipes, each once, and the parts of each split that refer to them."""
-    recipes: list[Recipe] = []
-    splits: dict[str, dict[str, Any]] = {}
-    for dataset in datasets:
-        own = [recipe_from_dict(data, f"in {dataset.path}") for data in dataset.manifest["recipes"]]
-        recipes += [recipe for recipe in own if recipe not in recipes]
-        for name, entry in dataset.splits.items():
-            gathered = splits.setdefault(name, {"scenario": entry["scenario"], "maps": 0, "parts": []})
-            gathered["maps"] += entry["maps"]
-            for part in entry["parts"]:
-                number = {"recipe": recipes.index(own[part["recipe"]])} if "recipe" in part else {}
-                gathered["parts"].append({**part, **number})
-    return recipes, splits
-
-
-def _check(dataset: TerrainDataset, split: str) -> Iterator[int]:
-    """Holds maps against their digests, yielding how many.
+def _check(dataset: TerrainDataset, split: str, indices: Sequence[int], maps: Maps) -> None:
+    """Holds maps against their digests.
 
     Raises:
         DatasetError: one does not match.
     """
-    for indices, maps in dataset.chunks(split):
-        if not np.array_equal(
-            dataset.entry_digests(split, indices), schema.entry_digests(maps, dataset.fields)
-        ):
-            raise DatasetError(
-                f"Maps of split {split!r} in {dataset.path} do not match their digests. "
-                "Run `benchnav-datagen validate` on it, which says how to make it anew."
-            )
-        yield len(indices)
+    if not np.array_equal(dataset.entry_digests(split, indices), schema.entry_digests(maps, dataset.fields)):
+        raise DatasetError(
+            f"Maps of split {split!r} in {dataset.path} do not match their digests. "
+            "Run `benchnav-datagen validate` on it, which says how to make it anew."
+        )

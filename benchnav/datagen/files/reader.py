@@ -8,10 +8,11 @@ import hashlib
 import json
 import os
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import accumulate
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,6 +21,7 @@ import numpy as np
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
+from benchnav.core.settings import plain
 from benchnav.core.shipped import shipped_folder
 from benchnav.core.store import unseal
 from benchnav.datagen import schema
@@ -35,6 +37,8 @@ READ_ERRORS = (OSError, KeyError, RuntimeError, ValueError)
 CHUNK_CELLS = 2**17
 _MOST_OPEN = 100  # files that a process keeps open; far fewer than systems allow
 FOLDER_MANIFEST = "manifest.json"
+
+Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,12 +78,11 @@ class TerrainDataset:
         """Reads and checks the manifest."""
         self.path, self.keep_open = Path(path), keep_open
         self.manifest: dict[str, Any] = read_manifest(self.path)
-        self._opened: tuple[int, dict[Path, tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]]] = (0, {})
-        self._pieces: dict[str, list[Piece]] = {}
+        self._opened: dict[tuple[int, Path], Opened] = {}  # by process, since one's files are not for another
 
     def __getstate__(self) -> dict[str, Any]:
         """Leaves out the open files, so that it may be sent to other processes."""
-        return self.__dict__ | {"_opened": (0, {})}
+        return self.__dict__ | {"_opened": {}}
 
     @property
     def id(self) -> str:
@@ -122,7 +125,11 @@ class TerrainDataset:
             DatasetError: there is no such split.
         """
         self.map_count(split)
-        known = all(_truth(part) == "generated" for part in self.splits[split]["parts"])
+        # Files before 1.3 do not say it of what they import.
+        known = all(
+            "recipe" in part or part["source"].get("truth") == "generated"
+            for part in self.splits[split]["parts"]
+        )
         return "generated" if known else "unknown"
 
     def about_digest(self, split: str) -> str:
@@ -131,13 +138,10 @@ class TerrainDataset:
         Raises:
             DatasetError: there is no such split.
         """
-        about = {
-            "classes": [asdict(item) for item in self.recipe.classes],
-            "stuck_threshold": self.recipe.stuck_threshold,
-            "resolution_m": self.recipe.resolution_m,
-            "truth": self.truth_of(split),
-        }
-        return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+        recipe = plain(self.recipe)
+        about = {name: recipe[name] for name in ("classes", "stuck_threshold", "resolution_m")}
+        text = json.dumps(about | {"truth": self.truth_of(split)}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
 
     def split_digest(self, split: str) -> str:
         """SHA-256 of a split's maps and of what they mean, which models and results record: `about_digest` too.
@@ -154,7 +158,7 @@ class TerrainDataset:
         return ",".join(f"{name}:{self.split_digest(name)}" for name in self.splits)
 
     def read(
-        self, split: str, indices: Sequence[int] | None = None, fields: Iterable[str] | None = None
+        self, split: str, indices: Sequence[int] | None = None, fields: Collection[str] | None = None
     ) -> Maps:
         """Reads stored arrays.
 
@@ -170,9 +174,9 @@ class TerrainDataset:
             DatasetError: no such split or map, or a stored chunk is damaged.
         """
         size = self.map_count(split)
-        names = self.field_names if fields is None else self.check_fields(tuple(fields))
+        names = self.field_names if fields is None else self.check_fields(fields)
         chosen = range(size) if indices is None else np.asarray(indices).tolist()
-        if indices is not None and not all(type(i) is int and 0 <= i < size for i in chosen):
+        if not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
         return self._read(split, names, chosen)
 
@@ -182,12 +186,11 @@ class TerrainDataset:
         Raises:
             DatasetError: no such split, or a stored chunk is damaged.
         """
-        every = range(self.map_count(split))
-        chosen = every if indices is None else indices
+        chosen = range(self.map_count(split)) if indices is None else indices
         return self._read(split, (schema.ENTRY_DIGESTS,), chosen)[schema.ENTRY_DIGESTS]
 
     def chunks(
-        self, split: str, fields: Iterable[str] | None = None, cells: int = CHUNK_CELLS
+        self, split: str, fields: Collection[str] | None = None, cells: int = CHUNK_CELLS
     ) -> Iterator[tuple[range, Maps]]:
         """Reads a split from its first map to its last, some maps at a time.
 
@@ -199,21 +202,20 @@ class TerrainDataset:
         Yields:
             Which maps, and what `read` gives of them.
         """
-        names = None if fields is None else tuple(fields)
         size = max(1, cells // (self.grid.height * self.grid.width))
         count = self.map_count(split)
         for first in range(0, count, size):
             indices = range(first, min(first + size, count))
-            yield indices, self.read(split, indices, names)
+            yield indices, self.read(split, indices, fields)
 
-    def terrain_chunks(self, split: str, cells: int = CHUNK_CELLS) -> "Iterator[Terrain]":
+    def terrain_chunks(self, split: str) -> "Iterator[Terrain]":
         """Reads a split as Terrain, some maps at a time, as `chunks` does."""
         from benchnav.datagen.files.terrain import terrain_of
 
-        for _, maps in self.chunks(split, schema.MAP_FIELDS, cells):
+        for _, maps in self.chunks(split, schema.MAP_FIELDS):
             yield terrain_of(maps, self.recipe)
 
-    def check_fields(self, names: tuple[str, ...]) -> tuple[str, ...]:
+    def check_fields(self, names: Collection[str]) -> Collection[str]:
         """Gives names of fields back.
 
         Raises:
@@ -226,44 +228,59 @@ class TerrainDataset:
 
     def pieces(self, split: str) -> list[Piece]:
         """The files that hold a split's maps, in their order."""
-        count = self.map_count(split)
-        if split not in self._pieces:
-            files = [
-                (shard["file"], shard["maps"]) for shard in self.manifest.get("shards", {}).get(split, ())
-            ]
-            firsts = accumulate((maps for _, maps in files), initial=0)
-            self._pieces[split] = [
-                Piece(path=self.path / name, first=first, maps=maps)
-                for (name, maps), first in zip(files, firsts, strict=False)
-            ] or [Piece(path=self.path, first=0, maps=count)]
+        self.map_count(split)
         return self._pieces[split]
 
-    def _read(self, split: str, names: Sequence[str], indices: Sequence[int]) -> Maps:
-        """Reads maps run by run: those that follow one another in a file together."""
-        pieces, runs, place = self.pieces(split), list[Maps](), 0
-        while place < len(indices):
-            index, start = indices[place], place
-            piece = pieces[bisect_right(pieces, index, key=_first) - 1]
-            end = min(len(indices), place + piece.first + piece.maps - index)
-            while place < end and indices[place] == index + place - start:
-                place += 1
-            first = index - piece.first
-            runs.append(self._read_run(split, piece, names, slice(first, first + place - start)))
-        if len(runs) == 1:
-            return runs[0]
-        empty = [{name: np.empty((0, *self._shapes[name][1]), self._shapes[name][0]) for name in names}]
-        return {name: np.concatenate([run[name] for run in runs or empty]) for name in names}
+    @cached_property
+    def _pieces(self) -> dict[str, list[Piece]]:
+        pieces: dict[str, list[Piece]] = {split: [] for split in self.splits}
+        for split, own in pieces.items():
+            one = [{"file": "", "maps": self.splits[split]["maps"]}]
+            first = 0
+            for shard in self.manifest.get("shards", {}).get(split, one):
+                own.append(Piece(path=self.path / shard["file"], first=first, maps=shard["maps"]))
+                first += shard["maps"]
+        return pieces
 
-    def _read_run(self, split: str, piece: Piece, names: Sequence[str], which: slice) -> Maps:
+    @cached_property
+    def files(self) -> set[Path]:
+        """The files that hold maps."""
+        return {piece.path for pieces in self._pieces.values() for piece in pieces}
+
+    def _read(self, split: str, names: Collection[str], indices: Sequence[int]) -> Maps:
+        """Reads maps run by run: those that follow one another in a file together."""
+
+        def run_of(item: tuple[int, int]) -> tuple[Path, int]:
+            place, index = item
+            return self._piece_of(split, index).path, index - place
+
+        runs = []
+        for _, items in groupby(enumerate(indices), run_of):
+            run = [index for _, index in items]
+            runs.append(self.read_run(split, run[0], len(run), names))
+        if not runs:
+            return self.read_run(split, 0, 0, names)
+        return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
+
+    def _piece_of(self, split: str, index: int) -> Piece:
+        pieces = self._pieces[split]
+        return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1]
+
+    def read_run(self, split: str, first: int, count: int, names: Collection[str]) -> Maps:
+        """Reads maps that follow one another in a file, as `read` does; what is asked for has to be there."""
+        piece = self._piece_of(split, first)
         file, arrays = self._open(piece.path)
-        read: Maps = {}
+        read, most = Maps(), len(self.recipe.classes) - 1
+        which = slice(first - piece.first, first - piece.first + count)
         try:
             for name in names:
                 if (split, name) not in arrays:
-                    arrays[split, name] = self._array(file, split, name, piece.maps)
-                read[name] = _values(arrays[split, name], which)
-                if name == "class_id":
-                    self._check_classes(read[name])
+                    arrays[split, name] = self.stored_array(file, split, name, piece.maps)
+                read[name] = values = _values(arrays[split, name], which)
+                # The greatest is looked at first, since that is quicker than to compare each.
+                is_beyond = name == "class_id" and values.max(initial=0) > most
+                if is_beyond and ((values > most) & (values != schema.UNLABELLED)).any():
+                    raise ValueError(f"it has classes beyond {most}")
         except READ_ERRORS as error:
             raise damage(piece.path, split, name, error) from error
         finally:
@@ -271,39 +288,24 @@ class TerrainDataset:
                 file.close()
         return read
 
-    def _open(self, path: Path) -> tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]:
+    def _open(self, path: Path) -> Opened:
         """A file, and those of its arrays that were read before, by split and name."""
         if not self.keep_open:
             return open_file(path), {}
-        if self._opened[0] != os.getpid():  # another process's files are not for this one
-            self._opened = os.getpid(), {}
-        opened = self._opened[1]
-        if path not in opened:
-            if len(opened) == _MOST_OPEN:
-                opened.pop(next(iter(opened)))[0].close()
-            opened[path] = open_file(path), {}
-        return opened[path]
+        place = os.getpid(), path
+        if place not in self._opened:
+            if len(self._opened) == _MOST_OPEN:
+                self._opened.pop(next(iter(self._opened)))[0].close()
+            self._opened[place] = open_file(path), {}
+        return self._opened[place]
 
-    @cached_property
-    def _shapes(self) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """Dtype and shape of a map's entry in each stored array."""
-        shapes = {
-            name: (field.dtype, field.entry_shape(*self.grid.shape)) for name, field in self.fields.items()
-        }
-        return {**shapes, schema.ENTRY_DIGESTS: ("|u1", (len(self.fields), schema.DIGEST_BYTES))}
-
-    def _array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
-        """A stored array; refuses, by a ValueError, one that is not what the manifest says."""
-        array, (kind, entry) = file[split][name], self._shapes[name]
+    def stored_array(self, file: h5py.File, split: str, name: str, maps: int) -> h5py.Dataset:
+        """An array of so many maps in a file; refuses, by a ValueError, one that is not what the manifest says."""
+        array = file[split][name]
+        kind, entry = schema.stored_arrays(self.fields, *self.grid.shape)[name]
         if (array.dtype.str, array.shape) != (kind, (maps, *entry)):
             raise ValueError(f"it is {array.dtype.str} {list(array.shape)}, not {kind} {[maps, *entry]}")
         return array
-
-    def _check_classes(self, found: np.ndarray) -> None:
-        """Refuses, by a ValueError, classes that the table lacks."""
-        most = len(self.recipe.classes) - 1
-        if found.max() > most and ((found > most) & (found != schema.UNLABELLED)).any():
-            raise ValueError(f"it has classes beyond {most}")
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
@@ -400,15 +402,6 @@ def _manifest_text(path: Path) -> str | bytes:
         return file[schema.MANIFEST][()]
 
 
-def _truth(part: dict[str, Any]) -> str:
-    """Whether the truth of a part is known; files before 1.3 do not say it of what they import."""
-    return "generated" if "recipe" in part else part["source"].get("truth", "unknown")
-
-
-def _first(piece: Piece) -> int:
-    return piece.first
-
-
 def dataset_folders() -> list[Path]:
     """Where datasets are looked for by id: `datasets/` here, and the shipped ones."""
     here, shipped = Path("datasets"), shipped_folder("datasets")
@@ -432,11 +425,6 @@ def find_dataset(source: str | Path) -> Path:
         for name in (f"{source}.h5", f"{source}", f"{source}-test.h5"):
             if is_dataset(folder / name):
                 return folder / name
-    if Path(source).suffix == ".h5":
-        raise DatasetError(
-            f"Expected a dataset, got {str(source)!r}, which is not there. "
-            "Make one with `benchnav-datagen create`."
-        )
     raise DatasetError(
         f"Expected the path or id of a dataset, got {str(source)!r}, which is neither a file nor in "
         f"{' or '.join(map(str, dataset_folders()))}. Make one with `benchnav-datagen create`."

@@ -10,7 +10,7 @@ from benchnav.core.terrain import Terrain
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import Maps
+from benchnav.datagen.schema import MAP_FIELDS, Maps
 
 
 def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
@@ -22,13 +22,10 @@ def terrain_of(maps: Maps, recipe: Recipe) -> Terrain:
     """
     slope = maps["slope_deg"].astype(np.float64)
     alike = max(len(own) for own in look_alike_classes(recipe.classes)) > 1
+    layers = {name: torch.from_numpy(maps[name]) for name in MAP_FIELDS}
     return Terrain(
-        rgb=torch.from_numpy(maps["rgb"]),
-        class_id=torch.from_numpy(maps["class_id"].astype(np.int64)),
-        elevation_m=torch.from_numpy(maps["elevation_m"]),
-        slope_deg=torch.from_numpy(maps["slope_deg"]),
+        **layers | {"class_id": layers["class_id"].long()},
         truth=_mixture(latent.truth(maps["class_id"], slope, recipe.classes), recipe.classes),
-        traversability=torch.from_numpy(maps["traversability"]),
         grid=recipe.grid,
         look_alikes=partial(_look_alikes, recipe.classes) if alike and recipe.synthesis > 1 else None,
     )
@@ -39,7 +36,6 @@ def _look_alikes(
 ) -> TraversabilityMixture:
     slope = slope_deg.cpu().numpy().astype(np.float64)
     parameters = latent.look_alikes(class_id.cpu().numpy(), slope, classes)
-    assert parameters is not None, "asked of a table in which no two classes look alike"
     return _mixture(parameters, classes).to(class_id.device)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +27,11 @@ class SoftSpots:
 
     def __post_init__(self) -> None:
         """Refuses values that make no distribution."""
-        if not (0 < self.weight < 1 and 0 <= self.mean <= 1 and 0 < self.std <= 1):
-            raise ConfigError(
-                "Expected soft spots of `weight` in (0, 1), `mean` in [0, 1] and `std` in (0, 1], "
-                f"got {self.weight}, {self.mean} and {self.std}."
-            )
+        expect(
+            0 < self.weight < 1 and 0 <= self.mean <= 1 and 0 < self.std <= 1,
+            "soft spots of `weight` in (0, 1), `mean` in [0, 1] and `std` in (0, 1], "
+            f"got {self.weight}, {self.mean} and {self.std}.",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,14 +58,19 @@ class TerrainClass:
 
     def __post_init__(self) -> None:
         """Refuses values that make no LT function or no colour."""
-        if not all(0 <= value <= 255 for value in self.colour):
-            raise ConfigError(f"Expected `colour` of class {self.name!r} in 0–255, got {self.colour}.")
-        numbers = (self.scale, self.exponent, self.offset, self.noise)
-        if not all(np.isfinite(numbers)) or self.scale < 0 or self.exponent <= 0 or self.noise <= 0:
-            raise ConfigError(
-                f"Expected `scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
-                f"got {self.scale}, {self.exponent} and {self.noise}."
-            )
+        is_colour = all(0 <= value <= 255 for value in self.colour)
+        expect(is_colour, f"`colour` of class {self.name!r} in 0–255, got {self.colour}.")
+        is_finite = np.isfinite([self.scale, self.exponent, self.offset, self.noise]).all()
+        expect(
+            is_finite and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
+            f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
+            f"got {self.scale}, {self.exponent} and {self.noise}.",
+        )
+
+    @property
+    def hex_colour(self) -> str:
+        """Its colour as #rrggbb."""
+        return f"#{bytes(self.colour).hex()}"
 
 
 def look_alike_classes(classes: tuple[TerrainClass, ...]) -> list[tuple[int, ...]]:

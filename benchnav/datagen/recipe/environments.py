@@ -4,15 +4,13 @@ Classes are dealt by units: a class, or all classes that share a colour. These a
 at all, since the other colours would tell which one it must be.
 """
 
-from functools import lru_cache
-
 import numpy as np
 
 AlikeClasses = tuple[int, ...]
 
 
-def deal_classes(count: int, shown: int, environment: int) -> np.ndarray:
-    """The classes of one environment, each its own unit: consecutive deals from one pack.
+def deal_classes(count: int, shown: int, environments: int) -> np.ndarray:
+    """The classes of all environments, each its own unit: consecutive deals from one pack.
 
     The pack is the class table taken with a stride, so that an environment shows classes of some
     distance in colour; each time the deals come full circle the stride changes.
@@ -20,18 +18,17 @@ def deal_classes(count: int, shown: int, environment: int) -> np.ndarray:
     Args:
         count: number of classes.
         shown: how many of them an environment shows, M.
-        environment: which environment.
+        environments: how many environments, E. More of them leave the first as they are.
 
     Returns:
-        Class indices, distinct, shape [M].
+        Class indices, distinct in each row, shape [E, M].
     """
-    steps = strides(count)
-    first = environment * shown
+    first = shown * np.arange(environments)[:, None]
+    steps = np.array(strides(count))
     stride = steps[first // int(np.lcm(shown, count)) % len(steps)]
-    return stride * np.arange(first, first + shown) % count
+    return stride * (first + np.arange(shown)) % count
 
 
-@lru_cache(maxsize=32)
 def deal_units(units: tuple[AlikeClasses, ...], shown: int, environments: int) -> np.ndarray:
     """The classes of all environments, dealt by units so that all are shown about equally often.
 
@@ -40,14 +37,13 @@ def deal_units(units: tuple[AlikeClasses, ...], shown: int, environments: int) -
     next that fits.
 
     Args:
-        units: classes that are shown together.
+        units: classes that are shown together, none of them in `never_shown`.
         shown: how many classes an environment shows, M.
         environments: how many environments, E. More of them leave the first as they are.
 
     Returns:
-        Class indices, distinct in each row, shape [E, M]; the array is shared: do not write to it.
+        Class indices, distinct in each row, shape [E, M].
     """
-    assert not never_shown(units, shown)
     steps, times = list(dict.fromkeys(strides(len(units)))), np.zeros(len(units), dtype=np.int64)
     place = np.empty((len(steps), len(units)), dtype=np.int64)
     for row, stride in enumerate(steps):
@@ -58,18 +54,17 @@ def deal_units(units: tuple[AlikeClasses, ...], shown: int, environments: int) -
         dealt = _fill([int(unit) for unit in order], units, shown)
         times[dealt] += 1
         table[environment] = [member for unit in dealt for member in units[unit]]
-    table.setflags(write=False)
     return table
 
 
 def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasses]:
     """The units that no choice of others fills an environment of `shown` classes with."""
-    lost = []
-    for number, unit in enumerate(units):
-        others = [len(other) for place, other in enumerate(units) if place != number]
-        if shown - len(unit) not in _sums(others):
-            lost.append(unit)
-    return lost
+    sizes = [len(unit) for unit in units]
+    return [
+        unit
+        for number, unit in enumerate(units)
+        if shown - len(unit) not in _sums(sizes[:number] + sizes[number + 1 :])
+    ]
 
 
 def strides(count: int) -> list[int]:

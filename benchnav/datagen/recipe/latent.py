@@ -8,16 +8,17 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 """
 
 import numpy as np
+from numpy import ndarray
 
-from benchnav.datagen.recipe.classes import SoftSpots, TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
 
-Parameters = tuple[np.ndarray, np.ndarray, np.ndarray]
+Parameters = tuple[ndarray, ndarray, ndarray]
 
 
-def latent_mean(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]) -> np.ndarray:
+def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:
     """f_c(ψ) of each cell, in [0, 1], shape of `class_id`."""
     scale, exponent, offset = (
         np.array([getattr(c, name) for c in classes]) for name in ("scale", "exponent", "offset")
@@ -28,12 +29,12 @@ def latent_mean(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[Terr
     return np.minimum(np.maximum(1 - loss, 0), 1)
 
 
-def latent_std(class_id: np.ndarray, classes: tuple[TerrainClass, ...]) -> np.ndarray:
+def latent_std(class_id: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:
     """σ_c of each cell, shape of `class_id`."""
     return np.take(np.array([c.noise for c in classes]), class_id)
 
 
-def truth(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+def truth(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
     """The true distribution of λ in each cell, as a Gaussian mixture before clipping.
 
     Args:
@@ -45,55 +46,47 @@ def truth(class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainCla
         Weights, means and standard deviations, each of shape [B, K, H, W]: K = 1, or 2 where the table has
         soft spots; a class without them has them at weight 0. Where the class is not known, means are NaN.
     """
-    unlabelled = class_id == UNLABELLED
-    if unlabelled.any():
-        share, mean, std = truth(np.where(unlabelled, 0, class_id), slope_deg, classes)
-        return share, np.where(unlabelled[:, None], np.nan, mean), std
-    firm = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
-    if not any(c.soft for c in classes):
-        return np.ones((len(firm[0]), 1, *firm[0].shape[1:])), firm[0][:, None], firm[1][:, None]
-    none = SoftSpots(weight=0.5, mean=0.0, std=1.0)
-    spots = [c.soft or none for c in classes]
-    weight = np.take([c.soft.weight if c.soft else 0.0 for c in classes], class_id)
-    soft = np.take([s.mean for s in spots], class_id), np.take([s.std for s in spots], class_id)
-    weights, means, stds = ((1 - weight, weight), (firm[0], soft[0]), (firm[1], soft[1]))
-    return np.stack(weights, 1), np.stack(means, 1), np.stack(stds, 1)
+    labelled = class_id != UNLABELLED
+    class_id = np.where(labelled, class_id, 0)
+    mean, std = latent_mean(class_id, slope_deg, classes), latent_std(class_id, classes)
+    components: list[tuple[ndarray, ...]] = [(np.ones(mean.shape), mean, std)]
+    if any(c.soft for c in classes):
+        spots = [(c.soft.weight, c.soft.mean, c.soft.std) if c.soft else (0.0, 0.0, 1.0) for c in classes]
+        soft = tuple(np.take(values, class_id) for values in zip(*spots, strict=True))
+        components = [(1 - soft[0], mean, std), soft]
+    weights, means, stds = (np.stack(values, axis=1) for values in zip(*components, strict=True))
+    return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
-def look_alikes(
-    class_id: np.ndarray, slope_deg: np.ndarray, classes: tuple[TerrainClass, ...]
-) -> Parameters | None:
+def look_alikes(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
     """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
 
     They are shown together, and which of them takes which ground is drawn anew in each map, so that each
     weighs the same.
 
     Returns:
-        As `truth`, with a component for each of the most classes that look alike; None where no two do.
+        As `truth`, with a component for each of the most classes that look alike.
     """
     alike = look_alike_classes(classes)
-    most = max(len(own) for own in alike)
-    if most == 1:
-        return None
-    unlabelled = class_id == UNLABELLED
-    class_id = np.where(unlabelled, 0, class_id)
+    labelled = class_id != UNLABELLED
+    class_id = np.where(labelled, class_id, 0)
     pieces = []
-    for place in range(most):
+    for place in range(max(len(own) for own in alike)):
         other = np.take([own[place % len(own)] for own in alike], class_id)
         share = np.take([1 / len(own) if place < len(own) else 0.0 for own in alike], class_id)
-        weights, means, stds = truth(other, slope_deg, classes)
-        pieces.append((weights * share[:, None], np.where(unlabelled[:, None], np.nan, means), stds))
+        weights, means, stds = truth(np.where(labelled, other, UNLABELLED), slope_deg, classes)
+        pieces.append((weights * share[:, None], means, stds))
     weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
     return weights, means, stds
 
 
-def expected_of(parameters: Parameters) -> np.ndarray:
+def expected_of(parameters: Parameters) -> ndarray:
     """E[λ] of the clipped mixture, shape [B, H, W], from parameters of shape [B, K, H, W]."""
     weights, means, stds = parameters
     return (weights * expected_traversability(means, stds)).sum(1)
 
 
-def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+def expected_traversability(mean: ndarray, std: ndarray) -> ndarray:
     """E[λ] of the clipped Gaussian N(mean, std), shape of `mean`.
 
     The integral of 1 − Φ from 0 to 1; `TraversabilityMixture.mean` says the same for mixtures of tensors.
@@ -103,7 +96,7 @@ def expected_traversability(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
     return 1 - std * (integral[0] - integral[1]).reshape(mean.shape)
 
 
-def quantile_of(parameters: Parameters, normal: np.ndarray) -> np.ndarray:
+def quantile_of(parameters: Parameters, normal: ndarray) -> ndarray:
     """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1), F the mixture's CDF.
 
     In closed form where one component has all the weight, else by bisection to within 2⁻²⁵;
@@ -127,11 +120,11 @@ def quantile_of(parameters: Parameters, normal: np.ndarray) -> np.ndarray:
     return value
 
 
-def _bisected_quantile(parameters: tuple[np.ndarray, ...], rank: np.ndarray) -> np.ndarray:
+def _bisected_quantile(parameters: tuple[ndarray, ...], rank: ndarray) -> ndarray:
     """clip(F⁻¹(rank), 0, 1) from parameters of shape [K, N], shape [N]."""
     weights, means, stds = parameters
 
-    def below(value: np.ndarray | float) -> np.ndarray:
+    def below(value: ndarray | float) -> ndarray:
         return (weights * _probability((value - means) / stds)).sum(axis=0)
 
     low, width = np.zeros_like(rank), 1.0
@@ -141,7 +134,7 @@ def _bisected_quantile(parameters: tuple[np.ndarray, ...], rank: np.ndarray) -> 
     return np.where(below(0.0) >= rank, 0.0, np.where(below(1.0) <= rank, 1.0, low + width / 2))
 
 
-def _probability(z: np.ndarray) -> np.ndarray:
+def _probability(z: ndarray) -> ndarray:
     """Φ(z)."""
     from scipy.special import ndtr  # imported here: a dataset is listed and shown without
 

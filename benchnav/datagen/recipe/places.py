@@ -7,9 +7,10 @@ B maps.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 
 _STEPS_A_M = 1024
@@ -30,11 +31,11 @@ class PlacesRule:
 
     def __post_init__(self) -> None:
         """Refuses what is no distance."""
-        if not (0 < self.least_distance_m < np.inf and 0 <= self.margin_m < np.inf):
-            raise ConfigError(
-                "Expected `places` of finite `least_distance_m` > 0 and `margin_m` ≥ 0, "
-                f"got {self.least_distance_m} and {self.margin_m}."
-            )
+        expect(
+            0 < self.least_distance_m < np.inf and 0 <= self.margin_m < np.inf,
+            "`places` of finite `least_distance_m` > 0 and `margin_m` ≥ 0, "
+            f"got {self.least_distance_m} and {self.margin_m}.",
+        )
 
 
 def check_places(places: PlacesRule, grid: Grid) -> None:
@@ -44,28 +45,26 @@ def check_places(places: PlacesRule, grid: Grid) -> None:
         ConfigError: with the largest distance that there is room for.
     """
     _, count = _inside(places, grid)
-    if (count < 1).any():
-        raise ConfigError(
-            f"Expected `margin_m` of `places` under {min(grid.extent_m) / 2:g} m, half of the map's shorter "
-            f"side, got {places.margin_m:g}."
-        )
+    expect(
+        (count >= 1).all(),
+        f"`margin_m` of `places` under {min(grid.extent_m) / 2:g} m, half of the map's shorter side, "
+        f"got {places.margin_m:g}.",
+    )
     largest = float(np.hypot(*(count - 1))) / _STEPS_A_M
-    if places.least_distance_m > largest:
-        raise ConfigError(
-            f"Expected `least_distance_m` of `places` of at most {np.floor(100 * largest) / 100:g} m, the largest "
-            f"distance inside the margin of {places.margin_m:g} m, got {places.least_distance_m:g}."
-        )
+    expect(
+        places.least_distance_m <= largest,
+        f"`least_distance_m` of `places` of at most {np.floor(100 * largest) / 100:g} m, the largest distance "
+        f"inside the margin of {places.margin_m:g} m, got {places.least_distance_m:g}.",
+    )
     diagonal = np.sqrt(2) * grid.resolution_m
-    if places.least_distance_m < diagonal:
-        raise ConfigError(
-            f"Expected `least_distance_m` of `places` of at least a cell's diagonal, {diagonal:.3g} m, so that "
-            f"start and goal are in two cells, got {places.least_distance_m:g}."
-        )
+    expect(
+        places.least_distance_m >= diagonal,
+        f"`least_distance_m` of `places` of at least a cell's diagonal, {diagonal:.3g} m, so that start and goal "
+        f"are in two cells, got {places.least_distance_m:g}.",
+    )
 
 
-def draw_places(
-    places: PlacesRule, grid: Grid, key: int, indices: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def draw_places(places: PlacesRule, grid: Grid, key: int, indices: ndarray) -> tuple[ndarray, ndarray]:
     """Draws start and goal of some maps: of a map's candidate pairs the first that is far enough apart.
 
     Where none is, as may be when hardly any two places are so far apart, opposite corners are taken.
@@ -89,7 +88,7 @@ def draw_places(
     return chosen[:, 0], chosen[:, 1]
 
 
-def _inside(places: PlacesRule, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _inside(places: PlacesRule, grid: Grid) -> tuple[ndarray, ndarray]:
     """The first step inside the margin along x and y, and the number of steps inside, each of shape [2]."""
     extent = np.asarray(grid.extent_m)
     first = np.ceil(places.margin_m * _STEPS_A_M)

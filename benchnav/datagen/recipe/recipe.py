@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy import ndarray
 
 from benchnav.core.copula import LONGEST_CORRELATION
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.settings import changed, load_yaml, plain, read, read_yaml
 from benchnav.datagen.recipe import latent
@@ -46,10 +47,7 @@ class Split:
 
     def __post_init__(self) -> None:
         """Refuses empty splits."""
-        if self.maps < 1:
-            raise ConfigError(
-                f"Expected `maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead."
-            )
+        expect(self.maps >= 1, f"`maps` ≥ 1 in every split, got {self.maps}. Leave the split out instead.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,14 +96,37 @@ class Recipe:
 
     def __post_init__(self) -> None:
         """Refuses recipes that contradict themselves."""
-        _check_recipe(self)
+        expect(self.synthesis in (1, 2), f"`synthesis` 1 or 2, got {self.synthesis}.")
+        expect(0 <= self.seed < 2**63, f"`seed` in 0–2^63 − 1, got {self.seed}.")
+        expect(0 <= self.stuck_threshold < 1, f"`stuck_threshold` in [0, 1), got {self.stuck_threshold}.")
+        check_name("id", self.id)
+        _check_ends(self)
+        _check_scenarios(self)
+        _check_environments(self)
+        _check_splits(self)
+        if self.synthesis == 1:
+            soft = any(item.soft for item in self.classes)
+            asked = {"soft": soft, "places": self.places, "correlation_m": self.correlation_m}
+            for name, value in asked.items():
+                expect(
+                    not value,
+                    f"`synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 did. "
+                    "Set `synthesis: 2` in the recipe.",
+                )
+            return
+        _check_look_alikes(self)
+        most_m = LONGEST_CORRELATION * min(self.grid.extent_m)
+        expect(
+            0 <= self.correlation_m <= most_m,
+            f"`correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, got {self.correlation_m:g}.",
+        )
 
     @property
     def grid(self) -> Grid:
         """Size and resolution of every map."""
         return Grid(self.height, self.width, self.resolution_m)
 
-    def cells_of(self, positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
         """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
         column, row = (
             np.floor(positions_m.astype(np.float32) / np.float32(self.resolution_m)).astype(np.int64).T
@@ -119,16 +140,13 @@ class Recipe:
             return tuple((number,) for number in range(len(self.classes)))
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
-    def environment_classes(self, environment: int) -> np.ndarray:
-        """The classes an environment shows.
-
-        Returns:
-            Class indices, distinct, shape [len(occupancy)].
-        """
+    @cached_property
+    def environment_classes(self) -> ndarray:
+        """The classes that each environment shows: indices, distinct in a row, shape [E, len(occupancy)]."""
+        shown = len(self.occupancy)
         if self.synthesis == 1:
-            return deal_classes(len(self.classes), len(self.occupancy), environment)
-        dealt = deal_units(self.units, len(self.occupancy), max(self.environments, environment + 1))
-        return dealt[environment].copy()
+            return deal_classes(len(self.classes), shown, self.environments)
+        return deal_units(self.units, shown, self.environments)
 
     def craters(self, scenario: Scenario) -> tuple[int, int]:
         """Fewest and most craters of a map; in synthesis 2 a scenario's counts are for 32 m × 32 m."""
@@ -140,16 +158,13 @@ class Recipe:
     def to_dict(self) -> dict[str, Any]:
         """Gives the recipe as plain data for JSON, fully resolved."""
         data: dict[str, Any] = plain(self)
-        unused = ("places",) if self.places is None else ("start_m", "goal_m")
-        for name in unused:
-            data.pop(name)
+        unused = ["places"] if self.places is None else ["start_m", "goal_m"]
         if self.synthesis == 1:
             # As version 0.1 wrote it, so that its files and readers stay as they are.
-            for name in ("synthesis", "correlation_m"):
-                data.pop(name)
+            unused += ["synthesis", "correlation_m"]
             for item in data["classes"]:
                 item.pop("soft")
-        return data
+        return {name: value for name, value in data.items() if name not in unused}
 
 
 def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
@@ -167,29 +182,28 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
     path = RECIPES / f"{source}.yaml"
     if not path.exists():
         path = Path(source)
-    if not path.is_file():
-        raise ConfigError(
-            f"Expected a shipped recipe ({', '.join(shipped_recipes())}) or the path of a YAML file, "
-            f"got {str(source)!r}."
-        )
+    shipped = shipped_recipes()
+    expect(
+        path.is_file(),
+        f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got {str(source)!r}.",
+    )
     data = read_yaml(path)
     own = _with_class_table(data) if overrides else data
     for text in overrides:
         name, equals, value = text.partition("=")
-        if not equals or not all(name.split(".")):
-            raise ConfigError(f"Expected an override such as splits.train.maps=50, got {text!r}.")
+        expect(equals and all(name.split(".")), f"an override such as splits.train.maps=50, got {text!r}.")
         own = changed(own, name.split("."), load_yaml(value))
     recipe = recipe_from_dict(own, str(source))
-    if overrides and recipe.id == data.get("id"):
-        raise ConfigError(
-            f"Expected `id=NAME` among the overrides, since {recipe.id!r} names the maps of the recipe as it is."
-        )
+    expect(
+        not overrides or recipe.id != data.get("id"),
+        f"`id=NAME` among the overrides, since {recipe.id!r} names the maps of the recipe as it is.",
+    )
     as_shipped = path == RECIPES / f"{recipe.id}.yaml" and not overrides
-    if not as_shipped and recipe.id in shipped_recipes() and recipe != load_recipe(recipe.id):
-        raise ConfigError(
-            f"Expected an `id` of its own in {source}, got {recipe.id!r}, which names other maps: "
-            "a recipe shipped with the package."
-        )
+    expect(
+        as_shipped or recipe.id not in shipped or recipe == load_recipe(recipe.id),
+        f"an `id` of its own in {source}, got {recipe.id!r}, which names other maps: "
+        "a recipe shipped with the package.",
+    )
     return recipe
 
 
@@ -221,8 +235,7 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
     Raises:
         ConfigError: a key is unknown or missing, or a value is of the wrong type or out of range.
     """
-    if not isinstance(data, dict):
-        raise ConfigError(f"Expected a mapping in recipe {origin}, got {type(data).__name__}.")
+    expect(isinstance(data, dict), f"a mapping in recipe {origin}, got {type(data).__name__}.")
     data = _with_class_table(data)
     _, presets = load_presets(data.get("synthesis"))
     scenarios = data.get("scenarios", {name: {"preset": name} for name in presets})
@@ -234,152 +247,99 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
         raise ConfigError(f"Recipe {origin}: {error}") from error
 
 
-def _check_recipe(recipe: Recipe) -> None:
-    """Refuses a recipe that contradicts itself, in one line that names the key."""
-    if recipe.synthesis not in (1, 2):
-        raise ConfigError(f"Expected `synthesis` 1 or 2, got {recipe.synthesis}.")
-    if not 0 <= recipe.seed < 2**63:
-        raise ConfigError(f"Expected `seed` in 0–2^63 − 1, got {recipe.seed}.")
-    if not 0 <= recipe.stuck_threshold < 1:
-        raise ConfigError(f"Expected `stuck_threshold` in [0, 1), got {recipe.stuck_threshold}.")
-    _check_places(recipe)
-    _check_scenarios(recipe)
-    _check_environments(recipe)
-    check_name("id", recipe.id)
-    _check_splits(recipe)
-    if recipe.synthesis == 1:
-        _check_first_synthesis(recipe)
-    else:
-        _check_look_alikes(recipe)
-        _check_correlation(recipe)
-
-
 def check_name(kind: str, name: str) -> None:
     """Refuses names that would not do as a file's or a group's.
 
     Raises:
         ConfigError: with `kind` in its message.
     """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) or name == "manifest":
-        raise ConfigError(f"Expected {kind} of letters, digits, '.', '_' and '-', got {name!r}.")
+    fits = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest"
+    expect(fits, f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.")
 
 
-def _check_places(recipe: Recipe) -> None:
+def _check_ends(recipe: Recipe) -> None:
     given = [name for name in ("start_m", "goal_m", "places") if getattr(recipe, name) is not None]
-    if given not in (["start_m", "goal_m"], ["places"]):
-        raise ConfigError(
-            f"Expected either `start_m` and `goal_m`, or `places`, got {' and '.join(given) or 'neither'}."
-        )
+    expect(
+        given in (["start_m", "goal_m"], ["places"]),
+        f"either `start_m` and `goal_m`, or `places`, got {' and '.join(given) or 'neither'}.",
+    )
     if recipe.places is not None:
         return check_places(recipe.places, recipe.grid)
     extent_x, extent_y = recipe.grid.extent_m
-    for name in ("start_m", "goal_m"):
-        x, y = getattr(recipe, name)
-        if not (0 <= x < extent_x and 0 <= y < extent_y):
-            raise ConfigError(
-                f"Expected `{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y})."
-            )
     ends = np.array([recipe.start_m, recipe.goal_m])
-    if len(np.unique(np.stack(recipe.cells_of(ends), axis=1), axis=0)) == 1:
-        raise ConfigError(
-            f"Expected `goal_m` in another cell than `start_m`, got both in that of {recipe.goal_m}."
+    for name, (x, y) in zip(given, ends.tolist(), strict=True):
+        expect(
+            0 <= x < extent_x and 0 <= y < extent_y,
+            f"`{name}` on the map of {extent_x:g} m × {extent_y:g} m, got ({x}, {y}).",
         )
+    start, goal = np.transpose(recipe.cells_of(ends)).tolist()
+    expect(start != goal, f"`goal_m` in another cell than `start_m`, got both in that of {recipe.goal_m}.")
 
 
 def _check_scenarios(recipe: Recipe) -> None:
     extent_x, extent_y = recipe.grid.extent_m
     for name, scenario in recipe.scenarios.items():
         most = scenario.crater_count[1] if recipe.synthesis == 1 else recipe.craters(scenario)[1]
-        if most > 0 and 2 * scenario.crater_radius_m[1] > min(extent_x, extent_y):
-            raise ConfigError(
-                f"Expected `crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
-                f"got {scenario.crater_radius_m}."
-            )
+        expect(
+            most == 0 or 2 * scenario.crater_radius_m[1] <= min(extent_x, extent_y),
+            f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
+            f"got {scenario.crater_radius_m}.",
+        )
         covered = most * scenario.mean_crater_area_m2 / (extent_x * extent_y)
-        if covered > _MOST_CRATERED:
-            raise ConfigError(
-                f"Expected the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} of a map, "
-                f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` or `crater_radius_m`."
-            )
+        expect(
+            covered <= _MOST_CRATERED,
+            f"the craters of scenario {name!r} to cover at most {_MOST_CRATERED:.0%} of a map, "
+            f"so that they fit side by side, got {covered:.0%}. Lower `crater_count` or `crater_radius_m`.",
+        )
 
 
 def _check_environments(recipe: Recipe) -> None:
-    shares, classes = recipe.occupancy, recipe.classes
-    if not classes:
-        raise ConfigError("Expected at least one class in `classes`, got none.")
-    if not np.isclose(sum(shares), 1, atol=1e-6) or not all(0 < share <= 1 for share in shares):
-        raise ConfigError(f"Expected `occupancy` as shares > 0 summing to 1, got {list(shares)}.")
-    if len(shares) > len(classes):
-        raise ConfigError(
-            f"Expected at most {len(classes)} shares in `occupancy`, one a class, got {len(shares)}."
-        )
+    shares, classes, periods = recipe.occupancy, recipe.classes, recipe.class_periods_m
+    expect(1 <= len(classes) <= UNLABELLED, f"1–{UNLABELLED} classes in `classes`, got {len(classes)}.")
+    expect(
+        np.isclose(sum(shares), 1, atol=1e-6) and all(0 < share <= 1 for share in shares),
+        f"`occupancy` as shares > 0 summing to 1, got {list(shares)}.",
+    )
+    expect(
+        len(shares) <= len(classes),
+        f"at most {len(classes)} shares in `occupancy`, one a class, got {len(shares)}.",
+    )
     most = FIELDS["environment"].most
-    if not 1 <= recipe.environments <= most:
-        raise ConfigError(f"Expected `environments` in 1–{most}, got {recipe.environments}.")
-    periods = recipe.class_periods_m
-    if not periods or not all(recipe.resolution_m <= period < np.inf for period in periods):
-        raise ConfigError(
-            f"Expected `class_periods_m` of at least a cell, {recipe.resolution_m} m, got {list(periods)}."
-        )
-    if len(classes) > UNLABELLED:
-        raise ConfigError(f"Expected at most {UNLABELLED} classes, got {len(classes)}.")
+    expect(1 <= recipe.environments <= most, f"`environments` in 1–{most}, got {recipe.environments}.")
+    expect(
+        periods and all(recipe.resolution_m <= period < np.inf for period in periods),
+        f"`class_periods_m` of at least a cell, {recipe.resolution_m} m, got {list(periods)}.",
+    )
 
 
 def _check_splits(recipe: Recipe) -> None:
-    for split_name in recipe.splits:
-        for part in split_name.split("/"):
-            check_name("split name", part)
-        if any(other.startswith(f"{split_name}/") for other in recipe.splits):
-            raise ConfigError(f"Expected splits side by side, got one inside {split_name!r}.")
-    if not recipe.splits:
-        raise ConfigError("Expected at least one split in `splits`, got none.")
+    expect(recipe.splits, "at least one split in `splits`, got none.")
     for name, split in recipe.splits.items():
-        if split.scenario not in recipe.scenarios:
-            raise ConfigError(
-                f"Expected `scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, "
-                f"got {split.scenario!r}."
-            )
-
-
-def _check_first_synthesis(recipe: Recipe) -> None:
-    asked = {
-        "soft": any(item.soft for item in recipe.classes),
-        "places": recipe.places is not None,
-        "correlation_m": recipe.correlation_m != 0,
-    }
-    for name, given in asked.items():
-        if given:
-            raise ConfigError(
-                f"Expected `synthesis: 2` with `{name}`, got 1, which makes maps as version 0.1 did. "
-                "Set `synthesis: 2` in the recipe."
-            )
-
-
-def _check_look_alikes(recipe: Recipe) -> None:
-    names, groups = [item.name for item in recipe.classes], recipe.units
-    flat = np.zeros((len(names), 1, 1))
-    order = np.arange(len(names)).reshape(flat.shape)
-    expected = latent.expected_of(latent.truth(order, flat, recipe.classes)).ravel()
-    for first, second in (pair for group in groups for pair in combinations(group, 2)):
-        if abs(expected[first] - expected[second]) < _LEAST_GAP:
-            raise ConfigError(
-                f"Expected classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on flat ground, "
-                f"got {expected[first]:.3f} for {names[first]!r} and {expected[second]:.3f} for {names[second]!r}. "
-                "Change an `offset` or a `colour`."
-            )
-    lost = never_shown(groups, len(recipe.occupancy))
-    if lost:
-        raise ConfigError(
-            f"Expected classes that can be shown {len(recipe.occupancy)} at a time, one for each share in "
-            f"`occupancy`, those of one colour together; got no choice of others that goes with "
-            f"{', '.join(names[member] for member in lost[0])}. Change `occupancy` or a `colour`."
+        for part in name.split("/"):
+            check_name("split name", part)
+        inside = any(other.startswith(f"{name}/") for other in recipe.splits)
+        expect(not inside, f"splits side by side, got one inside {name!r}.")
+        expect(
+            split.scenario in recipe.scenarios,
+            f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, got {split.scenario!r}.",
         )
 
 
-def _check_correlation(recipe: Recipe) -> None:
-    most_m = LONGEST_CORRELATION * min(recipe.grid.extent_m)
-    if not 0 <= recipe.correlation_m <= most_m:
+def _check_look_alikes(recipe: Recipe) -> None:
+    names, groups, shown = [item.name for item in recipe.classes], recipe.units, len(recipe.occupancy)
+    flat = np.zeros((len(names), 1, 1))
+    order = np.arange(len(names)).reshape(flat.shape)
+    means = latent.expected_of(latent.truth(order, flat, recipe.classes)).ravel()
+    for first, second in (pair for group in groups for pair in combinations(group, 2)):
+        expect(
+            abs(means[first] - means[second]) >= _LEAST_GAP,
+            f"classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on flat ground, "
+            f"got {means[first]:.3f} for {names[first]!r} and {means[second]:.3f} for {names[second]!r}. "
+            "Change an `offset` or a `colour`.",
+        )
+    for unit in never_shown(groups, shown):
         raise ConfigError(
-            f"Expected `correlation_m` in 0–{most_m:g} m, a quarter of the map's shorter side, "
-            f"got {recipe.correlation_m:g}."
+            f"Expected classes that can be shown {shown} at a time, one for each share in `occupancy`, those of one "
+            "colour together; got no choice of others that goes with "
+            f"{', '.join(names[member] for member in unit)}. Change `occupancy` or a `colour`."
         )

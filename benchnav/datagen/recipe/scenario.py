@@ -6,14 +6,14 @@ scenario's `severity` s moves every number of it from `std` (s = 0) to the prese
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.core.settings import of, plain, read
 
 RECIPES = Path(__file__).parent
@@ -61,10 +61,10 @@ class Scenario:
         for name, (least, most) in limits.items():
             value = getattr(self, name)
             low, high = value if isinstance(value, tuple) else (value, value)
-            if not (np.isfinite(low) and np.isfinite(high) and least <= low <= high <= most):
-                raise ConfigError(
-                    f"Expected scenario `{name}` finite, ordered and within [{least:g}, {most:g}], got {value}."
-                )
+            expect(
+                least <= low <= high <= most,
+                f"scenario `{name}` finite, ordered and within [{least:g}, {most:g}], got {value}.",
+            )
 
     @property
     def mean_crater_area_m2(self) -> float:
@@ -79,13 +79,10 @@ def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
     """Moves every number of a scenario from `base` (severity 0) to `full` (severity 1)."""
 
     def between(low: Any, high: Any) -> Any:
-        if isinstance(low, tuple):
-            return tuple(between(a, b) for a, b in zip(low, high, strict=True))
-        return low + severity * (high - low)
+        return tuple(map(between, low, high)) if isinstance(low, tuple) else low + severity * (high - low)
 
-    return replace(
-        base, **{f.name: between(getattr(base, f.name), getattr(full, f.name)) for f in fields(base)}
-    )
+    goals = asdict(full)
+    return Scenario(**{name: between(value, goals[name]) for name, value in asdict(base).items()})
 
 
 def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:
@@ -109,14 +106,14 @@ def resolve(entry: Any, presets: Mapping[str, Any], name: str) -> Any:
     if not isinstance(entry, dict) or "preset" not in entry:
         return entry
     preset, severity = entry["preset"], entry.get("severity", 1.0)
-    if not isinstance(preset, str) or preset not in presets:
-        raise ConfigError(
-            f"Expected `preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}."
-        )
-    if not isinstance(severity, int | float) or not np.isfinite(severity):
-        raise ConfigError(
-            f"Expected `severity` of scenario {name!r} to be a finite number, got {severity!r}."
-        )
+    expect(
+        isinstance(preset, str) and preset in presets,
+        f"`preset` of scenario {name!r} to be one of {sorted(presets)}, got {preset!r}.",
+    )
+    expect(
+        isinstance(severity, int | float) and np.isfinite(severity),
+        f"`severity` of scenario {name!r} to be a finite number, got {severity!r}.",
+    )
     base, full = (read(Scenario, presets[key], of(f"preset {key!r}")) for key in ("std", preset))
     changes = {key: value for key, value in entry.items() if key not in ("preset", "severity")}
     return {**plain(blend(base, full, severity)), **changes}
@@ -145,10 +142,9 @@ def find_series(splits: Iterable[str]) -> SeriesOfShifts:
             severity = int(hundredths) / 100 if hundredths else float(named["severity"])
             all_series.setdefault(named["scenario"], []).append((severity, split))
     for scenario, pairs in all_series.items():
-        folder, slash, _ = scenario.rpartition("/")
-        if f"{folder}{slash}std" in splits and all(severity > 0 for severity, _ in pairs):
-            pairs.append((0.0, f"{folder}{slash}std"))
-        if scenario in splits and all(severity != 1 for severity, _ in pairs):
-            pairs.append((1.0, scenario))
+        std = f"{scenario[: scenario.rfind('/') + 1]}std"
+        for severity, split in ((0.0, std), (1.0, scenario)):
+            if split in splits and severity not in dict(pairs):
+                pairs.append((severity, split))
         pairs.sort()
     return {scenario: pairs for scenario, pairs in all_series.items() if len(pairs) > 1}

@@ -5,11 +5,12 @@ cells, M classes that a map shows.
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.datagen.synth.slope import horn_gradient
 
 
-def class_bands(noise: np.ndarray, occupancy: np.ndarray) -> np.ndarray:
+def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
     """Cuts noise at the quantiles that give each band its share of the cells.
 
     Args:
@@ -28,7 +29,7 @@ def class_bands(noise: np.ndarray, occupancy: np.ndarray) -> np.ndarray:
     return bands.reshape(noise.shape)
 
 
-def light_direction(azimuth_rad: np.ndarray, height: np.ndarray) -> np.ndarray:
+def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
     """Unit vectors toward the light.
 
     Args:
@@ -42,7 +43,7 @@ def light_direction(azimuth_rad: np.ndarray, height: np.ndarray) -> np.ndarray:
     return np.stack([across * np.cos(azimuth_rad), across * np.sin(azimuth_rad), height], axis=-1)
 
 
-def shade(elevation_m: np.ndarray, resolution_m: float, light: np.ndarray, ambient: float) -> np.ndarray:
+def shade(elevation_m: ndarray, resolution_m: float, light: ndarray, ambient: float) -> ndarray:
     """Brightness of the ground: ambient + (1 − ambient)·max(0, n·l).
 
     Args:
@@ -57,7 +58,7 @@ def shade(elevation_m: np.ndarray, resolution_m: float, light: np.ndarray, ambie
     return lambert(*horn_gradient(elevation_m, resolution_m), light, ambient)
 
 
-def lambert(along_x: np.ndarray, along_y: np.ndarray, light: np.ndarray, ambient: float) -> np.ndarray:
+def lambert(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) -> ndarray:
     """Brightness of ground of the given ∂z/∂x and ∂z/∂y; see `shade`, shape [B, H, W]."""
     x, y, z = (light[:, k, None, None] for k in range(3))
     cosine = z - x * along_x - y * along_y
@@ -68,7 +69,7 @@ def lambert(along_x: np.ndarray, along_y: np.ndarray, light: np.ndarray, ambient
     return cosine
 
 
-def paint(class_id: np.ndarray, colours: np.ndarray, brightness: np.ndarray) -> np.ndarray:
+def paint(class_id: ndarray, colours: ndarray, brightness: ndarray) -> ndarray:
     """Colours each cell by its class under the given brightness.
 
     Args:

@@ -7,11 +7,12 @@ Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) f
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
 
 
-def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: float) -> np.ndarray:
+def fractal(key: int, indices: ndarray, shape: tuple[int, int], roughness: float) -> ndarray:
     """Synthesises fractal surfaces from a power-law spectrum.
 
     Args:
@@ -23,22 +24,20 @@ def fractal(key: int, indices: np.ndarray, shape: tuple[int, int], roughness: fl
     Returns:
         Surfaces scaled to a relief (highest minus lowest) of 1, float64, shape [B, H, W].
     """
-    height, width = shape
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    frequency = _frequencies(shape)
     frequency[0, 0] = np.inf
-    spectrum = np.fft.rfft2(rng.normal(key, indices, shape)) * frequency ** -(roughness + 1)
-    surface = np.fft.irfft2(spectrum, s=shape)
+    surface = _filtered(rng.normal(key, indices, shape), frequency ** -(roughness + 1))
     low = surface.min(axis=(1, 2), keepdims=True)
     return (surface - low) / (surface.max(axis=(1, 2), keepdims=True) - low)
 
 
 def open_fractal(
     key: int,
-    indices: np.ndarray,
+    indices: ndarray,
     shape: tuple[int, int],
     roughness: float,
     reference_cells: int,
-) -> np.ndarray:
+) -> ndarray:
     """Synthesises pieces of fractal ground that goes on beyond the map.
 
     The spectrum is `fractal`'s for wavelengths under the reference side and levels off above it (von
@@ -60,25 +59,33 @@ def open_fractal(
     """
     tiles_y, tiles_x = (-(-cells // reference_cells) for cells in shape)
     covered = tiles_y * reference_cells, tiles_x * reference_cells
-    height, width = 2 * covered[0], 2 * covered[1]
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
-    amplitude = np.hypot(frequency, 1 / reference_cells) ** -(roughness + 1)
-    spectrum = np.fft.rfft2(rng.normal(key, indices, (height, width))) * amplitude
-    surface = np.fft.irfft2(spectrum, s=(height, width))[:, : covered[0], : covered[1]]
+    twice = 2 * covered[0], 2 * covered[1]
+    amplitude = np.hypot(_frequencies(twice), 1 / reference_cells) ** -(roughness + 1)
+    surface = _filtered(rng.normal(key, indices, twice), amplitude)[:, : covered[0], : covered[1]]
     tiles = surface.reshape(len(surface), tiles_y, reference_cells, tiles_x, reference_cells)
     relief = (tiles.max(axis=(2, 4)) - tiles.min(axis=(2, 4))).mean(axis=(1, 2))
     low = surface.min(axis=(1, 2))
     return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
 
 
+def _frequencies(shape: tuple[int, int]) -> ndarray:
+    """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
+    return np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
+
+
+def _filtered(white: ndarray, amplitude: ndarray) -> ndarray:
+    """Noise of a spectrum, shape of `white`, [B, H, W]."""
+    return np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=white.shape[1:])
+
+
 def place_craters(
     key: int,
-    indices: np.ndarray,
+    indices: ndarray,
     extent_m: tuple[float, float],
-    count: np.ndarray,
+    count: ndarray,
     radius_m: tuple[float, float],
     most: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[ndarray, ndarray]:
     """Draws centres and radii of craters whose rims do not overlap, by sequential rejection.
 
     Args:
@@ -112,12 +119,12 @@ def place_craters(
 
 
 def crater_elevation(
-    centres_m: np.ndarray,
-    radii_m: np.ndarray,
+    centres_m: ndarray,
+    radii_m: ndarray,
     shape: tuple[int, int],
     resolution_m: float,
     depth_ratio: float,
-) -> np.ndarray:
+) -> ndarray:
     """Raises rims and sinks parabolic bowls.
 
     Args:
@@ -133,10 +140,9 @@ def crater_elevation(
     """
     y, x = ((np.arange(n) + 0.5) * resolution_m for n in shape)
     added = np.zeros((len(radii_m), *shape))
-    for i in range(radii_m.shape[1]):
-        radius = radii_m[:, i, None, None]
-        centre_x, centre_y = (centres_m[:, i, k, None, None] for k in (0, 1))
-        distance = np.hypot(x[None, None, :] - centre_x, y[None, :, None] - centre_y)
+    for radius, centre_x, centre_y in zip(radii_m.T, *centres_m.T, strict=True):
+        radius = radius[:, None, None]
+        distance = np.hypot(x - centre_x[:, None, None], y[:, None] - centre_y[:, None, None])
         ratio = distance / np.where(radius > 0, radius, 1)
         depth = 2 * radius * depth_ratio
         bowl = depth * (ratio**2 - 0.8)

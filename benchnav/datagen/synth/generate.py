@@ -5,13 +5,13 @@ float64. Letters in shapes: B maps, H×W cells.
 """
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import copula, gridgraph, rng
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
-from benchnav.datagen.recipe.scenario import Scenario
 from benchnav.datagen.schema import FIELDS, Maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.noise import fractal_perlin
@@ -22,7 +22,7 @@ _PIECE = 16  # maps at a time, so that what is worked on stays in the processor'
 _PIECE_CELLS = 2**20
 
 
-def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
+def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     """Makes some maps of a split.
 
     Args:
@@ -47,15 +47,12 @@ def generate(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
     }
 
 
-def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
-    if not recipe.splits[split].solvable:
-        maps = _attempt(recipe, split, indices, 0)
-        maps["reference_time_s"] = np.full(len(indices), np.nan)
-        return maps
-    pending = np.arange(len(indices))
-    maps = {}
+def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
+    maps, pending = Maps(), np.arange(len(indices))
     for attempt in range(MOST_ATTEMPTS):
-        drawn = _attempt(recipe, split, indices[pending], attempt)
+        drawn = _draw(recipe, split, indices[pending], attempt)
+        if not recipe.splits[split].solvable:
+            return {**drawn, "reference_time_s": np.full(len(indices), np.nan)}
         drawn["reference_time_s"] = reference_time_s(recipe, drawn)
         for name, values in drawn.items():
             maps.setdefault(name, np.empty((len(indices), *values.shape[1:]), values.dtype))[pending] = values
@@ -68,7 +65,7 @@ def _generate_piece(recipe: Recipe, split: str, indices: np.ndarray) -> Maps:
     )
 
 
-def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
+def reference_time_s(recipe: Recipe, maps: Maps) -> ndarray:
     """Grid reference time: least time from start to goal over truly free cells at a commanded 1 m/s.
 
     A reference, not a bound: the grid has eight headings, and noise is at its mean.
@@ -85,8 +82,8 @@ def reference_time_s(recipe: Recipe, maps: Maps) -> np.ndarray:
     return cost[(every, *recipe.cells_of(maps["start_m"]))]
 
 
-def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0) -> np.ndarray:
-    """Lays out the classes of each map's environment, `environment_of(recipe, indices)`.
+def class_map(recipe: Recipe, split: str, indices: ndarray, attempt: int = 0) -> ndarray:
+    """Lays out the classes of each map's environment; maps show the environments in turns.
 
     Returns:
         Class indices, shape [B, H, W].
@@ -96,32 +93,25 @@ def class_map(recipe: Recipe, split: str, indices: np.ndarray, attempt: int = 0)
     # Which class takes which band differs from map to map, so no two classes are neighbours always.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
-    table = np.stack([recipe.environment_classes(e) for e in range(recipe.environments)])
-    shown = np.take_along_axis(table[environment_of(recipe, indices)], order, axis=1)
+    table = recipe.environment_classes[indices % recipe.environments]
+    shown = np.take_along_axis(table, order, axis=1)
     bands = appearance.class_bands(noise, np.asarray(recipe.occupancy))
     return np.take_along_axis(shown, bands.reshape(len(indices), -1), axis=1).reshape(bands.shape)
 
 
-def environment_of(recipe: Recipe, indices: np.ndarray) -> np.ndarray:
-    """The environment that each map shows: they take turns. Shape of `indices`."""
-    return indices % recipe.environments
-
-
 def complete(
     recipe: Recipe,
-    scenario: Scenario,
     split: str,
-    indices: np.ndarray,
-    class_id: np.ndarray,
-    framed_m: np.ndarray,
+    indices: ndarray,
+    class_id: ndarray,
+    framed_m: ndarray,
     attempt: int = 0,
 ) -> Maps:
     """Derives all else from classes and elevation: slope, colour under a random light, λ.
 
     Args:
         recipe: class table, seed, start and goal.
-        scenario: its light.
-        split: name of the maps' split, for their random streams.
+        split: name of the maps' split, for their scenario's light and their random streams.
         indices: which maps of the split, shape [B].
         class_id: shape [B, H, W].
         framed_m: elevation, with one cell of the ground beyond, NaN where that is not known, shape
@@ -135,83 +125,65 @@ def complete(
     def key(purpose: str) -> int:
         return rng.stream_key(recipe.seed, split, purpose, attempt)
 
+    scenario = recipe.scenarios[recipe.splits[split].scenario]
     ground = quantise(framed_m, 13)
     gradient = framed_gradient(ground, recipe.resolution_m)
     slope = quantise(inclination_deg(*gradient), 10)
-    direction = rng.uniform(key("light"), indices, (2,))
-    light = appearance.light_direction(
-        2 * np.pi * direction[:, 0], _within(scenario.light_height, direction[:, 1])
-    )
+    azimuth, lift = rng.uniform(key("light"), indices, (2,)).T
+    light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
+    noise_key, shape = key("traversability"), recipe.grid.shape
+    if recipe.synthesis == 1:
+        noise = rng.normal(noise_key, indices, shape) * latent.latent_std(class_id, recipe.classes)
+        realised = np.clip(latent.latent_mean(class_id, slope, recipe.classes) + noise, 0, 1)
+    else:
+        cells = recipe.correlation_m / recipe.resolution_m
+        noise = copula.correlated_normal(noise_key, indices, shape, cells)
+        realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
     brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
-    start_m, goal_m = _places(recipe, key("places"), indices)
+    if recipe.places is None:
+        ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
+        start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
+    else:
+        start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places"), indices)
     return {
         "rgb": appearance.paint(class_id, colours, brightness),
         "class_id": class_id,
         "elevation_m": ground[:, 1:-1, 1:-1],
         "slope_deg": slope,
-        "traversability": quantise(_realised(recipe, key("traversability"), indices, class_id, slope), 16),
-        "environment": environment_of(recipe, indices),
+        "traversability": quantise(realised, 16),
+        "environment": indices % recipe.environments,
         "start_m": start_m,
         "goal_m": goal_m,
     }
 
 
-def _realised(
-    recipe: Recipe, key: int, indices: np.ndarray, class_id: np.ndarray, slope_deg: np.ndarray
-) -> np.ndarray:
-    """Draws λ from the truth of each cell, shape [B, H, W]."""
-    if recipe.synthesis == 1:
-        mean = latent.latent_mean(class_id, slope_deg, recipe.classes)
-        noise = rng.normal(key, indices, recipe.grid.shape)
-        noise *= latent.latent_std(class_id, recipe.classes)
-        return np.minimum(np.maximum(mean + noise, 0), 1)
-    correlation_cells = recipe.correlation_m / recipe.resolution_m
-    noise = copula.correlated_normal(key, indices, recipe.grid.shape, correlation_cells)
-    return latent.quantile_of(latent.truth(class_id, slope_deg, recipe.classes), noise)
+def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
+    """Draws maps that may or may not be solvable; see `complete`."""
 
-
-def _places(recipe: Recipe, key: int, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Start and goal of each map, each of shape [B, 2]."""
-    if recipe.places is not None:
-        return draw_places(recipe.places, recipe.grid, key, indices)
-    start_m, goal_m = (np.asarray(end, np.float64) for end in (recipe.start_m, recipe.goal_m))
-    return np.tile(start_m, (len(indices), 1)), np.tile(goal_m, (len(indices), 1))
-
-
-def _attempt(recipe: Recipe, split: str, indices: np.ndarray, attempt: int) -> Maps:
-    scenario = recipe.scenarios[recipe.splits[split].scenario]
-    class_id = class_map(recipe, split, indices, attempt)
-    height = _elevation(recipe, scenario, split, indices, attempt)
-    return complete(recipe, scenario, split, indices, class_id, framed(height), attempt)
-
-
-def _elevation(
-    recipe: Recipe, scenario: Scenario, split: str, indices: np.ndarray, attempt: int
-) -> np.ndarray:
     def key(purpose: str) -> int:
         return rng.stream_key(recipe.seed, split, purpose, attempt)
 
-    draws = rng.uniform(key("relief"), indices, (2,))
+    grid, scenario = recipe.grid, recipe.scenarios[recipe.splits[split].scenario]
     if recipe.synthesis == 1:
-        ground = elevation.fractal(key("elevation"), indices, recipe.grid.shape, scenario.roughness)
+        ground = elevation.fractal(key("elevation"), indices, grid.shape, scenario.roughness)
     else:
-        reference_cells = max(3, round(REFERENCE_M / recipe.resolution_m))
-        ground = elevation.open_fractal(
-            key("elevation"), indices, recipe.grid.shape, scenario.roughness, reference_cells
-        )
-    ground *= _within(scenario.relief_m, draws[:, 0])[:, None, None]
+        cells = max(3, round(REFERENCE_M / recipe.resolution_m))
+        ground = elevation.open_fractal(key("elevation"), indices, grid.shape, scenario.roughness, cells)
+    relief, crowding = rng.uniform(key("relief"), indices, (2,)).T
+    ground *= _within(scenario.relief_m, relief)[:, None, None]
     low, high = recipe.craters(scenario)
-    if high == 0:
-        return ground
-    count = low + np.floor((high - low + 1) * draws[:, 1])
-    centres, radii = elevation.place_craters(
-        key("craters"), indices, recipe.grid.extent_m, count, scenario.crater_radius_m, high
-    )
-    return ground + elevation.crater_elevation(
-        centres, radii, recipe.grid.shape, recipe.resolution_m, scenario.crater_depth_ratio
-    )
+    if high > 0:
+        count = low + np.floor((high - low + 1) * crowding)
+        craters = elevation.place_craters(
+            key("craters"), indices, grid.extent_m, count, scenario.crater_radius_m, high
+        )
+        ground += elevation.crater_elevation(
+            *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
+        )
+    class_id = class_map(recipe, split, indices, attempt)
+    return complete(recipe, split, indices, class_id, framed(ground), attempt)
 
 
-def _within(limits: tuple[float, float], share: np.ndarray) -> np.ndarray:
+def _within(limits: tuple[float, float], share: ndarray) -> ndarray:
     return limits[0] + (limits[1] - limits[0]) * share

@@ -6,11 +6,12 @@ Source: Perlin (2002), "Improving noise". Letters in shapes: B maps, H×W cells.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy import ndarray
 
 from benchnav.core import rng
 
 
-def perlin(key: int, indices: np.ndarray, shape: tuple[int, int], period: float) -> np.ndarray:
+def perlin(key: int, indices: ndarray, shape: tuple[int, int], period: float) -> ndarray:
     """Draws one octave of Perlin noise a map.
 
     Args:
@@ -36,7 +37,7 @@ def perlin(key: int, indices: np.ndarray, shape: tuple[int, int], period: float)
     return offset_y @ (np.sin(angle) @ weight_x) + weight_y @ (np.cos(angle) @ offset_x)
 
 
-def _corner_weights(position: np.ndarray, lattice: int) -> tuple[np.ndarray, np.ndarray]:
+def _corner_weights(position: ndarray, lattice: int) -> tuple[ndarray, ndarray]:
     """Fade weights of the lattice points next to each position, alone and times the signed distance.
 
     Args:
@@ -55,10 +56,10 @@ def _corner_weights(position: np.ndarray, lattice: int) -> tuple[np.ndarray, np.
 def fractal_perlin(
     seed: int,
     names: tuple[rng.Name, ...],
-    indices: np.ndarray,
+    indices: ndarray,
     shape: tuple[int, int],
     periods: Sequence[float],
-) -> np.ndarray:
+) -> ndarray:
     """Sums octaves of Perlin noise, each weighted by its period, so that large shapes dominate.
 
     Returns:

@@ -4,9 +4,10 @@ Source: Horn (1981), "Hill shading and the reflectance map".
 """
 
 import numpy as np
+from numpy import ndarray
 
 
-def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndarray, np.ndarray]:
+def horn_gradient(elevation_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
     """Estimates ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
 
     At the border the surface is continued linearly, so that planes are exact everywhere.
@@ -21,7 +22,7 @@ def horn_gradient(elevation_m: np.ndarray, resolution_m: float) -> tuple[np.ndar
     return framed_gradient(framed(elevation_m), resolution_m)
 
 
-def framed_gradient(framed_m: np.ndarray, resolution_m: float) -> tuple[np.ndarray, np.ndarray]:
+def framed_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
     """Estimates ∂z/∂x and ∂z/∂y as `horn_gradient` does, with the ground one cell beyond the map.
 
     Args:
@@ -42,12 +43,7 @@ def framed_gradient(framed_m: np.ndarray, resolution_m: float) -> tuple[np.ndarr
     return along_x, along_y
 
 
-def slope_deg(elevation_m: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Inclination of the ground by Horn's method, degrees, shape [B, H, W]."""
-    return inclination_deg(*horn_gradient(elevation_m, resolution_m))
-
-
-def inclination_deg(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
     """Angle between the ground and the horizontal.
 
     Args:
@@ -62,21 +58,15 @@ def inclination_deg(along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
     return angle
 
 
-def framed(elevation_m: np.ndarray) -> np.ndarray:
+def framed(elevation_m: ndarray) -> ndarray:
     """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H + 2, W + 2]."""
-    batch, height, width = elevation_m.shape
-    z = np.full((batch, height + 2, width + 2), np.nan)
-    z[:, 1:-1, 1:-1] = elevation_m
-    return z
+    return np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
 
 
-def _continue_linearly(framed_m: np.ndarray) -> np.ndarray:
+def _continue_linearly(framed_m: ndarray) -> ndarray:
     """Where the frame is not known, takes the plane through the two cells next to it."""
     z = framed_m.copy()
-    for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
-        column = z[:, :, edge]
-        column[...] = np.where(np.isnan(column), 2 * z[:, :, next_to] - z[:, :, beyond], column)
-    for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
-        row = z[:, edge]
-        row[...] = np.where(np.isnan(row), 2 * z[:, next_to] - z[:, beyond], row)
+    for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
+        for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
+            lines[edge] = np.where(np.isnan(lines[edge]), 2 * lines[next_to] - lines[beyond], lines[edge])
     return z

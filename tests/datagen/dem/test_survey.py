@@ -11,7 +11,7 @@ import pytest
 from benchnav.datagen.dem.survey import provenance
 from benchnav.datagen.schema import UNLABELLED, quantise
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.slope import slope_deg
+from benchnav.datagen.synth.slope import horn_gradient, inclination_deg
 from tests.datagen.dem.rasters import (
     FLAT,
     NAMES,
@@ -85,7 +85,7 @@ def test_slopes_are_those_of_the_whole_ground_at_seams_too(
     frame = 1 if resampling == "cubic" else 0  # else the raster ends where the maps begin
     cells = (56, 56) if frame else (60, 60)
     ground = quantise(reprojected(dem, source, resampling, cells, frame), 13)
-    slopes = slope_deg(ground[None], 0.5)[0]
+    slopes = inclination_deg(*horn_gradient(ground[None], 0.5))[0]
     for index, number in enumerate(source["kept"]):
         row, column = (int(2 * metres) + frame for metres in tile_place(source, number))
         own = (slice(row, row + 16), slice(column, column + 24))
@@ -514,7 +514,7 @@ def test_without_a_class_raster_the_recipe_lays_classes_out_by_map_number(tmp_pa
     maps = maps_of(read(write(tmp_path / "dem.tif", rough(48, 48))))
     assert maps["environment"].tolist() == [number % RECIPE.environments for number in range(6)]
     for environment, class_id in zip(maps["environment"], maps["class_id"], strict=True):
-        assert set(np.unique(class_id)) == set(RECIPE.environment_classes(int(environment)))
+        assert set(np.unique(class_id)) == set(RECIPE.environment_classes[int(environment)])
     assert np.isnan(maps["reference_time_s"]).all()
 
 

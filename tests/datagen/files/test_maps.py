@@ -95,6 +95,6 @@ def test_maps_of_a_folder_are_those_of_a_file(tmp_path: Path, monkeypatch: pytes
     for index in (7, 0, 3, 5, 2, 6, 1, 4):
         for name, values in parts[index].items():
             assert torch.equal(values, whole[index][name])
-    assert len(parts.dataset._opened[1]) == 2
+    assert len(parts.dataset._opened) == 2
     loaded = torch.cat([batch["rgb"] for batch in DataLoader(parts, batch_size=3, num_workers=2)])
     assert torch.equal(loaded, torch.stack([whole[index]["rgb"] for index in range(8)]))

@@ -67,7 +67,7 @@ def test_single_classes_are_dealt_equally_and_few_environments_are_alike() -> No
 
 def test_the_environments_of_stakes_show_every_class_alike_and_look_alikes_together() -> None:
     names = [item.name for item in STAKES.classes]
-    table = np.stack([STAKES.environment_classes(e) for e in range(STAKES.environments)])
+    table = STAKES.environment_classes
     assert np.bincount(table.ravel()).tolist() == [4] * 12
     assert len({tuple(sorted(dealt)) for dealt in table.tolist()}) == 12
     for look_alikes in (("packed_soil", "crusted_soil"), ("firm_sand", "drift_sand")):
@@ -77,7 +77,7 @@ def test_the_environments_of_stakes_show_every_class_alike_and_look_alikes_toget
 
 def test_recipes_of_synthesis_1_deal_as_they_did() -> None:
     paper = load_recipe("paper-v1")
-    assert [paper.environment_classes(e).tolist() for e in (0, 1, 2, 9)] == [
+    assert [paper.environment_classes[e].tolist() for e in (0, 1, 2, 9)] == [
         [0, 3, 6, 9], [2, 5, 8, 1], [4, 7, 0, 3], [6, 7, 8, 9],
     ]  # fmt: skip
 
@@ -86,7 +86,7 @@ def test_each_of_two_look_alikes_takes_each_band_of_the_noise_equally_often() ->
     recipe = small_stakes(height=16, width=16, places=None, start_m=(1, 1), goal_m=(7, 7))
     names = [item.name for item in recipe.classes]
     pair = [names.index("packed_soil"), names.index("crusted_soil")]
-    shows = [e for e in range(12) if pair[0] in recipe.environment_classes(e)]
+    shows = [e for e in range(12) if pair[0] in recipe.environment_classes[e]]
     indices = np.sort(np.concatenate([e + 12 * np.arange(500) for e in shows]))
     maps = class_map(recipe, "train", indices)
     # The bands of 30 % differ from those of 20 % by how much of a map they cover.

@@ -17,7 +17,7 @@ def test_horn_is_exact_on_planes_up_to_the_border(along_x: float, along_y: float
     np.testing.assert_allclose(gradient_x, along_x, atol=1e-9)
     np.testing.assert_allclose(gradient_y, along_y, atol=1e-9)
     expected = np.degrees(np.arctan(np.hypot(along_x, along_y)))
-    np.testing.assert_allclose(slope.slope_deg(plane, resolution), expected, atol=1e-9)
+    np.testing.assert_allclose(slope.inclination_deg(gradient_x, gradient_y), expected, atol=1e-9)
 
 
 def test_horn_weights_are_1_2_1() -> None:
