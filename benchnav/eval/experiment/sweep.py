@@ -8,7 +8,7 @@ from typing import Any
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part
-from benchnav.core.settings import of, read
+from benchnav.core.settings import changed, of, read
 
 
 def each_part(kind: str, part: Part) -> list[Part]:
@@ -46,10 +46,7 @@ def each_mapping(given: Any) -> list[Any]:
     if not isinstance(given, Mapping):
         return [given]
     lists = dict(_lists(given, ()))
-    return [
-        _with(given, dict(zip(lists, values, strict=True))) if lists else given
-        for values in product(*lists.values())
-    ]
+    return [_with(given, dict(zip(lists, values, strict=True))) for values in product(*lists.values())]
 
 
 def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
@@ -74,8 +71,7 @@ def _lists(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...],
 def _with(options: Mapping[str, Any], chosen: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
     made = dict(options)
     for path, value in chosen.items():
-        name, *inner = path
-        made[name] = _with(made[name], {tuple(inner): value}) if inner else value
+        made = changed(made, path, value)
     return made
 
 

@@ -51,8 +51,7 @@ def test_hypotheses(
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []
     for plain in about["tests"]:
-        fields = {name: value for name, value in plain.items() if name != "claim"}
-        test = Hypothesis(**{**fields, "names": tuple(plain["names"])})
+        test = Hypothesis(**{name: value for name, value in plain.items() if name not in ("names", "claim")})
         one, other = (
             rows[condition].assign(time_budget_s=time_budgets(rows[condition], worlds[condition]))
             for condition in (test.one, test.other)

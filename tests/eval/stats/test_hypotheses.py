@@ -31,7 +31,7 @@ def fixed(*given: dict[str, Any], **changes: Any) -> dict[str, Any]:
 
 def hypothesis(**changes: Any) -> Hypothesis:
     given = {"metric": "success", "kind": "difference", "direction": "", "margin": 0.0}
-    return Hypothesis(**{"one": "a", "other": "b", "names": ("A", "B"), **given, **changes})
+    return Hypothesis(**{"one": "a", "other": "b", **given, **changes})
 
 
 def beside(one: np.ndarray, other: np.ndarray, column: str = "score") -> pd.DataFrame:
@@ -80,16 +80,16 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
     [
         (
             {"metric": "sucess"},
-            r"Expected `metric` of hypothesis 1 among success, .*Did you mean 'success'\?",
+            r"Expected `metric` of hypothesis 1 as 'success' or .*Did you mean 'success'\?",
         ),
-        ({"kind": "equal"}, "`kind` of hypothesis 1 among difference, non-inferiority, equivalence"),
-        ({"direction": "up"}, "`direction` of hypothesis 1 among higher, lower"),
+        ({"kind": "equal"}, "`kind` of hypothesis 1 as 'difference' or 'non-inferiority' or 'equivalence'"),
+        ({"direction": "up"}, "`direction` of hypothesis 1 as '' or 'higher' or 'lower'"),
         ({"one": {"planner": "mpi"}}, r"`planner` of `one` of hypothesis 1 .*Did you mean 'mppi'\?"),
         ({"one": {"plannner": "mppi"}}, r"labels in `one` of hypothesis 1 .*Did you mean 'planner'\?"),
         ({"one": "mppi"}, "name a condition by labels"),
         ({"one": {"planner": "mppi", "risk": "cvar"}}, r"`risk` .*Did you mean 'cvar:0\.9'\?"),
         ({"metrics": "score"}, r"keys of hypothesis 1 .*Did you mean 'metric'\?"),
-        ({3: 4}, "keys of hypothesis 1 .*got 3"),
+        ({3: 4}, "keys of hypothesis 1 .*got '3'"),
         ({"margin": 1}, "Leave it out"),
         ({"kind": "equivalence"}, "above 0 in points, got 0 for equivalence. Give one"),
         ({"kind": "equivalence", "margin": -1}, "number ≥ 0, got -1"),
