@@ -108,9 +108,9 @@ def rerun(
     original = _own_folder(folder)
     repeated = _own_folder(out or f"{original.resolve()}-rerun")
     show_progress(rerun_all(original, repeated, jobs, scheduler, overwrite, _say), "units")
-    comparison = compare(original, repeated)
-    print("\n".join(comparison.lines))
-    return 0 if comparison.same else 1
+    same, lines = compare(original, repeated)
+    print("\n".join(lines))
+    return 0 if same else 1
 
 
 def list_command(kinds: list[str]) -> None:

@@ -10,18 +10,17 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import check_known
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, to_latex, to_markdown
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
+from benchnav.eval.experiment.unit import DRAW
+from benchnav.eval.folder.folder import EPISODES, Run, caveats, differences, open_run, read_table
 from benchnav.eval.folder.provenance import code_differences
-from benchnav.eval.folder.sameness import differences
 from benchnav.eval.report.comparison import comparison_table
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import (
-    DRAW,
     Compared,
     Pair,
     by_what,
@@ -162,10 +161,7 @@ def _chosen(conditions: Iterable[Compared], asked: Mapping[str, str]) -> list[Co
     for name, values in asked.items():
         known = list(dict.fromkeys(condition.labels[name] for condition in chosen))
         for value in values.split(","):
-            if value not in known:
-                raise ConfigError(
-                    f"Expected `{name}` among {', '.join(known)}, got {value!r}.{registry.hint(value, known)}"
-                )
+            check_known(f"`{name}`", value, known)
         chosen = [condition for condition in chosen if condition.labels[name] in values.split(",")]
     return chosen
 
@@ -217,8 +213,9 @@ def _joined(one: Compared, other: Compared) -> Compared:
     runs = " and ".join([*one.code, *other.code])
     check_maps(one, other, f"{_words(one)} in {runs}")
     first, second = (condition.episodes.drop(columns=list(LABELS)) for condition in (one, other))
-    unlike = [difference for difference in differences(first, second) if difference.columns]
-    if unlike:
+    cells, _ = differences(first, second)
+    if len(cells):
+        unlike = cells.index.droplevel(-1).unique()
         both = len(first.merge(second, on=DRAW))
         why = "; ".join(_in_words(_unlike_code((one, other))))
         raise ConfigError(

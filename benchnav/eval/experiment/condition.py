@@ -304,3 +304,12 @@ def _words(condition: Condition) -> str:
     return ", ".join(
         f"{condition.labels[name]}" for name in ("scenario", "model", "planner", "risk", "world")
     )
+
+
+def differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two values of plain data differ: dotted names of options, with both values; None where one has none."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in dict.fromkeys([*one, *other]):
+            yield from differences(one.get(key), other.get(key), f"{name}.{key}".removeprefix("."))
+    elif one != other:
+        yield name, one, other

@@ -14,6 +14,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known, of, read
 from benchnav.core.store import text_digest
 from benchnav.eval.experiment.condition import LABELS, NOT_USED, Condition
+from benchnav.eval.experiment.unit import Conditions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,15 +85,12 @@ def digest_of_tests(tests: Sequence[Mapping[str, Any]]) -> str:
     return text_digest(tests)[:16]
 
 
-def fix_hypotheses(
-    given: Sequence[Mapping[str, Any]], conditions: Mapping[str, Condition], episodes: Mapping[str, int]
-) -> dict[str, Any]:
+def fix_hypotheses(given: Sequence[Mapping[str, Any]], conditions: Conditions) -> dict[str, Any]:
     """Reads the hypotheses of a suite, for `run.json`.
 
     Args:
         given: as the suite lists them.
-        conditions: its conditions by id.
-        episodes: of each condition, how many are to be run.
+        conditions: its conditions by id, with how often each is to be run.
 
     Returns:
         `tests`, each as plain data: the fields of `Hypothesis`, `names`, what text calls the two, and `claim`; `digest`
@@ -101,10 +99,9 @@ def fix_hypotheses(
     Raises:
         ConfigError: a hypothesis names what is not there, or asks for what cannot be tested.
     """
+    every = [condition for condition, _ in conditions.values()]
     tests = [
-        test
-        for place, one in enumerate(given, start=1)
-        for test in _read(one, f"hypothesis {place}", conditions)
+        test for place, one in enumerate(given, start=1) for test in _read(one, f"hypothesis {place}", every)
     ]
     if not tests:
         return {}
@@ -115,11 +112,11 @@ def fix_hypotheses(
     return {
         "tests": tests,
         "digest": digest_of_tests(tests),
-        "episodes": {condition: episodes[condition] for condition in named},
+        "episodes": {condition: conditions[condition][1].episodes for condition in named},
     }
 
 
-def _read(given: Mapping[str, Any], where: str, conditions: Mapping[str, Condition]) -> list[dict[str, Any]]:
+def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition]) -> list[dict[str, Any]]:
     """A hypothesis of a suite: one test for each pair of conditions that it names."""
     asked = read(Hypothesis, given, of(where))
     metric, kind, margin = METRICS[asked.metric], asked.kind, asked.margin
@@ -140,8 +137,8 @@ def _read(given: Mapping[str, Any], where: str, conditions: Mapping[str, Conditi
         raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {asked.direction!r}.")
     if kind == "non-inferiority" and not asked.direction:
         asked = replace(asked, direction=metric.better)
-    one, ones = _named(asked.one, "one", where, conditions.values())
-    other, others = _named(asked.other, "other", where, conditions.values())
+    one, ones = _named(asked.one, "one", where, conditions)
+    other, others = _named(asked.other, "other", where, conditions)
     unnamed = [name for name in LABELS if name not in {**one, **other}]
     pairs = _pairs(ones, others, unnamed, where)
     if asked.metric == "T_total" and any(
@@ -164,7 +161,7 @@ def _read(given: Mapping[str, Any], where: str, conditions: Mapping[str, Conditi
 
 
 def _named(
-    given: Any, side: str, where: str, conditions: Iterable[Condition]
+    given: Any, side: str, where: str, conditions: Sequence[Condition]
 ) -> tuple[dict[str, str], list[Condition]]:
     """Labels by which a hypothesis names conditions, and the conditions that have them."""
     if not isinstance(given, Mapping) or not given:

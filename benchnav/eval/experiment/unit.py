@@ -10,6 +10,7 @@ from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.suite import Record
 
 BLOCK_MAPS = 50
+DRAW = ["seed", "realisation", "map"]  # columns by which an episode of a condition is known
 
 
 @dataclass(frozen=True, kw_only=True)

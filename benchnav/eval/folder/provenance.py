@@ -29,7 +29,7 @@ from benchnav.core.shipped import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.experiment.condition import PART_KINDS, Condition
+from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import read_config
 from benchnav.models.predictor import find_checkpoint, model_identity
@@ -111,7 +111,7 @@ def describe_parts(condition: Condition) -> Code:
     for kind in PART_KINDS:
         part = getattr(condition, kind)
         name = f"{kind} {part.part}"
-        if kind == "model" and part.part not in registry.names("model") and ":" not in part.part:
+        if is_checkpoint(kind, part.part):
             parts[name] = text_digest(model_identity(part.part)["files"])
             family = read_config(find_checkpoint(part.part))["model"]
             modules.append(registry.find("model", family).target.__module__)

@@ -1,7 +1,7 @@
 """What a number of maps can show: the smallest difference, and the maps that a difference would need.
 
 For a mean of differences over maps that is nearly normal, which from some twenty maps on it is: a difference d with
-standard deviation σ is shown with a chance of `power` where d·√M/σ is the quantile of 1 − α/2 and that of `power`
+standard deviation σ is shown with a chance of `POWER` where d·√M/σ is the quantile of 1 − α/2 and that of `POWER`
 together. Source: Chow, Shao and Wang (2008), "Sample Size Calculations in Clinical Research", 3.1.
 """
 
@@ -12,34 +12,32 @@ from scipy.stats import norm
 POWER = 0.8
 
 
-def smallest_difference(std: float, maps: int, alpha: float, power: float = POWER) -> float:
-    """Difference that a study of so many maps would show, with a chance of `power`.
+def smallest_difference(std: float, maps: int, alpha: float) -> float:
+    """Difference that a study of so many maps would show, with a chance of `POWER`.
 
     Args:
         std: standard deviation over maps of the difference, in its unit.
         maps: number of maps.
         alpha: p under which a difference counts as shown; after a correction over K pairs, that of the first, 0.05/K.
-        power: chance to show it.
 
     Returns:
         In the unit of `std`; infinite where no sign-flip test of so many maps can reach `alpha`, whatever they show.
     """
     if 2.0 ** (1 - maps) >= alpha:
         return math.inf
-    return _quantiles(alpha, power) * std / math.sqrt(maps)
+    return _quantiles(alpha) * std / math.sqrt(maps)
 
 
-def maps_needed(std: float, difference: float, alpha: float, power: float = POWER) -> int:
-    """Smallest number of maps that would show a difference with a chance of `power`.
+def maps_needed(std: float, difference: float, alpha: float) -> int:
+    """Smallest number of maps that would show a difference with a chance of `POWER`.
 
     Args:
         std: as in `smallest_difference`.
         difference: above 0, in the unit of `std`.
         alpha: as there.
-        power: as there.
     """
-    return math.ceil((_quantiles(alpha, power) * std / difference) ** 2)
+    return math.ceil((_quantiles(alpha) * std / difference) ** 2)
 
 
-def _quantiles(alpha: float, power: float) -> float:
-    return float(norm.ppf(1 - alpha / 2) + norm.ppf(power))
+def _quantiles(alpha: float) -> float:
+    return float(norm.ppf(1 - alpha / 2) + norm.ppf(POWER))

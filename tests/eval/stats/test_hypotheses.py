@@ -9,6 +9,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.hypotheses import Hypothesis, fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.stats.difference import success_interval
 from benchnav.eval.stats.hypotheses import p_of
 from benchnav.eval.stats.hypotheses import test_hypotheses as run_tests
@@ -25,8 +26,8 @@ def conditions(**changes: Any) -> dict[str, Condition]:
 
 
 def fixed(*given: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    known = conditions(**changes)
-    return fix_hypotheses(given, known, dict.fromkeys(known, 20))
+    extent = Extent.product((0,), 1, 20)
+    return fix_hypotheses(given, {i: (condition, extent) for i, condition in conditions(**changes).items()})
 
 
 def hypothesis(**changes: Any) -> Hypothesis:
