@@ -11,7 +11,7 @@ from typing import Any, Union, get_args, get_origin
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Option
-from benchnav.core.settings import dataclass_in, list_options, plain
+from benchnav.core.settings import check_known, dataclass_in, list_options, plain
 from benchnav.core.tables import Table, print_table
 
 TITLES = {
@@ -54,10 +54,7 @@ def print_catalogue(*kinds: str) -> None:
     """
     chosen = [kind for kind in kinds if kind] or list(TITLES)
     for kind in chosen:
-        if kind not in TITLES:
-            raise ConfigError(
-                f"Expected a kind among {', '.join(TITLES)}, got {kind!r}.{registry.hint(kind, TITLES)}"
-            )
+        check_known("a kind", kind, TITLES)
     if not sys.stdout.isatty():
         print("\n".join(line for kind in chosen for line in plain_lines(kind)))
         return
@@ -115,14 +112,15 @@ def _purpose(target: Any) -> str:
     return "" if line.startswith(f"{getattr(target, '__name__', '')}(") else line
 
 
-def _option_lines(options: dict[str, Option], prefix: str = "") -> Iterator[str]:
+def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = None) -> Iterator[str]:
+    """Options with types and defaults, those of a dataclass one by one, with the fields of a holder for defaults."""
     for name, option in options.items():
-        config = dataclass_in(option.kind)
-        if config and option.default is not None:
-            yield from _option_lines(_with_values(list_options(config), option.default), f"{prefix}{name}.")
-            continue
-        kind = "" if option.kind is Any else f": {_type_name(option.kind)}"
-        yield f"{prefix}{name}{kind}{_default(option.default)}"
+        config, default = dataclass_in(option.kind), getattr(holder, name, option.default)
+        if config and default is not None:
+            yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
+        else:
+            kind = "" if option.kind is Any else f": {_type_name(option.kind)}"
+            yield f"{prefix}{name}{kind}{_default(default)}"
 
 
 def _type_name(kind: Any) -> str:
@@ -133,14 +131,6 @@ def _type_name(kind: Any) -> str:
     if kind is NoneType:
         return "None"
     return kind.__name__ if isinstance(kind, type) and not members else str(kind).replace("typing.", "")
-
-
-def _with_values(options: dict[str, Option], value: Any) -> dict[str, Option]:
-    """Options of a dataclass with one value's own fields for defaults."""
-    return {
-        name: Option(kind=option.kind, default=getattr(value, name, option.default))
-        for name, option in options.items()
-    }
 
 
 def _default(value: Any) -> str:

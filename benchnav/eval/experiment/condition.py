@@ -92,6 +92,11 @@ class Condition:
             parts |= {"model": NOT_USED, "risk": NOT_USED}
         return {"data": self.data, "scenario": self.scenario, **parts, "world": self.world_label}
 
+    @property
+    def description(self) -> str:
+        """All labels, each after its column."""
+        return ", ".join(f"{name} {label}" for name, label in self.labels.items())
+
     def make_task(self) -> Task:
         """Makes the robot, the objective and with them the task."""
         robot = registry.make("robot", self.robot)
@@ -154,7 +159,8 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
         here: set[str] = set()
         for condition in _product(suite, product, scenarios_of):
             if condition.id in here and condition.risk.label != NOT_USED:
-                raise ConfigError(f"Expected settings that differ, got twice what {_words(condition)} is.")
+                words = " ".join(label_words(condition.labels))
+                raise ConfigError(f"Expected settings that differ, got twice what {words} is.")
             here.add(condition.id)
             every.append(condition)
     check_labels(every)
@@ -300,10 +306,9 @@ def _labelled(condition: Condition, name: str) -> Any:
     return condition.value[name] if name in PART_KINDS else None
 
 
-def _words(condition: Condition) -> str:
-    return ", ".join(
-        f"{condition.labels[name]}" for name in ("scenario", "model", "planner", "risk", "world")
-    )
+def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:
+    """The labels of some columns, those that are used."""
+    return [labels[name] for name in names if labels[name] != NOT_USED]
 
 
 def differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

@@ -6,14 +6,14 @@ margin, or that they are equal to within it. `benchnav.eval.stats.hypotheses` te
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known, of, read
 from benchnav.core.store import text_digest
-from benchnav.eval.experiment.condition import LABELS, NOT_USED, Condition
+from benchnav.eval.experiment.condition import LABELS, NOT_USED, Condition, label_words
 from benchnav.eval.experiment.unit import Conditions
 
 
@@ -153,7 +153,10 @@ def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition])
     varying = {name for name in unnamed if len({own[name] for own in labels} - {NOT_USED}) > 1}
     tests = []
     for first, second in pairs:
-        names = [_words(first, {*one, *varying}), _words(second, {*other, *varying})]
+        names = [
+            ", ".join(label_words(condition.labels, [n for n in LABELS if n in own or n in varying]))
+            for condition, own in ((first, one), (second, other))
+        ]
         test = replace(asked, one=first.id, other=second.id)
         about = {"one": first.id, "other": second.id, "names": names, **asdict(test)}
         tests.append({**about, "claim": test.claim(*names)})
@@ -216,8 +219,3 @@ def _pairs(
 def _agree(one: Mapping[str, str], other: Mapping[str, str], names: Iterable[str]) -> bool:
     """Whether labels are the same; one that is not used goes with any."""
     return all(one[name] == other[name] or NOT_USED in (one[name], other[name]) for name in names)
-
-
-def _words(condition: Condition, names: Collection[str]) -> str:
-    labels = (condition.labels[name] for name in LABELS if name in names)
-    return ", ".join(label for label in labels if label != NOT_USED)

@@ -316,8 +316,9 @@ def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
     about = finished.about
     if not about["traceback"] and not about["errors"]:
         return ""
-    labels = ", ".join(f"{name} {label}" for name, label in unit.condition.labels.items())
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"
     place = finished.path.relative_to(folder)
-    heading = f"{labels}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({place})"
+    heading = (
+        f"{unit.condition.description}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({place})"
+    )
     return "\n".join([heading, *about["errors"], about["traceback"]])

@@ -6,6 +6,7 @@ the planner's, robot's and objective's parts by name first, so that what they ar
 
 import multiprocessing
 import pickle
+import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -101,30 +102,22 @@ class ChildError(BenchnavError):
 
 
 def _serve(connection: Connection, condition: Condition) -> None:
-    import traceback
-
+    """Answers calls of the planner until nobody asks any more."""
     torch.set_num_threads(1)
+    planner: Any = None
     plan_state: Any = None
-    try:
-        condition.make_task()
-        planner = condition.make_planner()
-        connection.send_bytes(pickle.dumps(("started", None)))
-    except (Exception, SystemExit):
-        connection.send_bytes(pickle.dumps(("raised", traceback.format_exc())))
-        return
+    message = pickle.dumps(("start",))
     while True:
         try:
-            message = connection.recv_bytes()
-        except EOFError:
-            return
-        try:
             call, *arguments = pickle.loads(message)
-            if call == "init":
+            if call == "start":
+                condition.make_task()
+                planner, answer = condition.make_planner(), None
+            elif call == "init":
                 problem, seed, state = arguments
                 generator = torch.Generator().manual_seed(seed)
                 generator.set_state(state)
-                plan_state = planner.init(problem, generator)
-                answer: Any = None
+                plan_state, answer = planner.init(problem, generator), None
             else:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, planner.compiled
@@ -134,3 +127,7 @@ def _serve(connection: Connection, condition: Condition) -> None:
         except (Exception, SystemExit):
             text = pickle.dumps(("raised", traceback.format_exc()))
         connection.send_bytes(text)
+        try:
+            message = connection.recv_bytes()
+        except EOFError:
+            return

@@ -13,7 +13,7 @@ from typing import Any
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_place
-from benchnav.eval.experiment.condition import Condition
+from benchnav.eval.experiment.condition import label_words
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import (
@@ -118,7 +118,9 @@ def _unlike(first: Run, other: Run) -> list[str]:
         lines.append(f"number of shards ({_shard(first).of} to {_shard(other).of})")
     for lacking, having in ((other, first), (first, other)):
         names = [
-            _name(condition) for i, (condition, _) in having.conditions.items() if i not in lacking.conditions
+            " ".join(label_words(condition.labels))
+            for i, (condition, _) in having.conditions.items()
+            if i not in lacking.conditions
         ]
         if names:
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
@@ -134,18 +136,14 @@ def _unlike(first: Run, other: Run) -> list[str]:
     return lines
 
 
-def _name(condition: Condition) -> str:
-    return " ".join(condition.labels[name] for name in ("scenario", "world", "planner", "model", "risk"))
-
-
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     """A finished unit of some runs, the newest of each; refuses one that came out differently in two."""
     found = [makings[0] for run in runs if (makings := find_units(run.folder, unit))]
     for other in found[1:]:
         if len(differences(unit_rows(found[0]), unit_rows(other))[0]):
             raise ConfigError(
-                f"Expected the same rows wherever a unit is, but {unit.name} ({_name(unit.condition)}) differs between "
-                f"{found[0].path} and {other.path}. Leave one of them out."
+                f"Expected the same rows wherever a unit is, but {unit.name} ({unit.condition.description}) differs "
+                f"between {found[0].path} and {other.path}. Leave one of them out."
             )
     return found[0] if found else None
 

@@ -171,20 +171,19 @@ def _verdict(
     counts = Counter(condition_id for condition_id, *_ in differing)
     lines = [
         f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:",
-        *(f"  {_label(conditions[condition_id])}: {count} rows" for condition_id, count in counts.items()),
+        *(
+            f"  {conditions[condition_id].description}: {count} rows"
+            for condition_id, count in counts.items()
+        ),
         "first of them:",
     ]
     for (condition_id, *place), values in list(differing.items())[:_SHOWN]:
         where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
-        lines.append(f"  {_label(conditions[condition_id])}, {where}: {', '.join(values)}")
+        lines.append(f"  {conditions[condition_id].description}, {where}: {', '.join(values)}")
     if greatest:
         gaps = ", ".join(f"{name} {value:.3g}" for name, value in greatest.items())
         lines.append(f"greatest differences: {gaps}")
     return lines
-
-
-def _label(condition: Condition) -> str:
-    return ", ".join(f"{name} {label}" for name, label in condition.labels.items())
 
 
 def _text(value: object) -> str:

@@ -113,7 +113,7 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
         ConfigError: `by` is none, or `against` is found nowhere or in several.
     """
     if by:
-        check_known("`by`, of conditions on the same maps,", by, _KEYS)
+        check_known("`by` (other data or scenarios are other maps)", by, _KEYS)
         return by
     if not against:
         return "run" if any(condition.labels["run"] != NOT_USED for condition in conditions) else "risk"
