@@ -23,13 +23,14 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.sweep import each_mapping, each_part
 from benchnav.planning.free_space import Rules
 from benchnav.planning.problem import Task
-from benchnav.planning.risk import RiskMeasure
 from benchnav.planning.world.world import World, read_world
 
 PART_KINDS = ("model", "risk", "planner", "robot", "objective")
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
 NOT_USED = "–"
+# What a product lists, by the names that a suite has for it.
+_LISTED = ("data", "scenarios", "models", "risks", "planners", "robots", "objectives", "world", "task")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,16 +109,6 @@ class Condition:
     def make_planner(self) -> Any:
         """Makes the planner."""
         return registry.make("planner", self.planner)
-
-    def make_model(self) -> Any:
-        """Makes the model, or loads its checkpoint."""
-        from benchnav.models.predictor import load_model
-
-        return load_model(self.model)
-
-    def make_risk(self) -> RiskMeasure:
-        """Makes the risk measure."""
-        return registry.make("risk", self.risk)
 
 
 def condition_from(about: Mapping[str, Any]) -> Condition:
@@ -198,17 +189,7 @@ def check_labels(conditions: Iterable[Condition]) -> None:
 
 def _listed(suite: Suite, product: Mapping[str, Any]) -> dict[str, list[Any]]:
     """What a product lists under each key, in the singular or the plural; the suite's where it names none."""
-    listed: dict[str, Any] = {
-        "data": suite.data,
-        "scenarios": suite.scenarios,
-        "models": suite.models or suite.model,
-        "risks": suite.risks,
-        "planners": suite.planners,
-        "robots": suite.robots,
-        "objectives": suite.objectives,
-        "world": suite.world,
-        "task": suite.task,
-    }
+    listed = {key: getattr(suite, key) for key in _LISTED} | {"models": suite.models or suite.model}
     for given, values in product.items():
         spellings = (given, f"{given}s", str(given).removesuffix("s"))
         key = next((key for key in spellings if key in listed), given)

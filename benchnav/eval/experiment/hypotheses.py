@@ -120,18 +120,12 @@ def _read(given: Mapping[str, Any], where: str, conditions: Sequence[Condition])
     """A hypothesis of a suite: one test for each pair of conditions that it names."""
     asked = read(Hypothesis, given, of(where))
     metric, kind, margin = METRICS[asked.metric], asked.kind, asked.margin
-    if not 0 <= margin < math.inf:
-        raise ConfigError(f"Expected `margin` of {where} to be a number ≥ 0, got {margin:g}.")
-    if (kind == "difference") != (margin == 0):
-        remedy = "Leave it out" if kind == "difference" else "Give one"
-        unit = f" in {metric.unit}" if metric.unit else ""
+    most = 100 if metric.unit == "points" else math.inf
+    if kind == "difference" and margin:
+        raise ConfigError(f"Expected no `margin` of {where}, a difference, got {margin:g}. Leave it out.")
+    if kind != "difference" and not 0 < margin < most:
         raise ConfigError(
-            f"Expected `margin` of {where} where its kind is non-inferiority or equivalence, above 0{unit}, got "
-            f"{margin:g} for {kind}. {remedy}."
-        )
-    if metric.unit == "points" and margin >= 100:
-        raise ConfigError(
-            f"Expected `margin` of {where} below 100 points, got {margin:g}, which says nothing."
+            f"Expected `margin` of {where}, a test of {kind}, above 0 and below {most} {metric.unit}, got {margin:g}."
         )
     if kind == "equivalence" and asked.direction:
         raise ConfigError(f"Expected no `direction` of {where}, an equivalence, got {asked.direction!r}.")

@@ -26,7 +26,7 @@ from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
 from benchnav.eval.experiment.unit import DRAW, Extent, Unit
-from benchnav.eval.folder.provenance import Origin
+from benchnav.eval.folder.provenance import Origin, code_digest
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 5
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
@@ -225,15 +225,16 @@ def write_unit(
     """
     key = origin.key(unit)
     about = {
-        **{"unit": _identity(unit), "key": key, "code": origin.code, "digests": list(origin.maps)},
-        **{
-            "record": unit.record,
-            "made": secrets.token_hex(8),
-            "traceback": traceback,
-            "errors": list(errors),
-        },
+        "unit": _identity(unit),
+        "key": key,
+        "code": origin.code,
+        "digests": list(origin.maps),
+        "record": unit.record,
+        "made": secrets.token_hex(8),
+        "traceback": traceback,
+        "errors": list(errors),
     }
-    table = pa.Table.from_pandas(rows.assign(code=origin.code_digest), preserve_index=False)
+    table = pa.Table.from_pandas(rows.assign(code=code_digest(origin.code)), preserve_index=False)
     with replacing(folder / "units" / unit.condition.id / f"{unit.name}-{key}.parquet") as partial:
         pq.write_table(with_metadata(table, about), partial)
 
@@ -260,10 +261,7 @@ def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: 
     table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table, partial)
-    codes = {}
-    for _, one in finished:
-        origin = Origin(code=one.about["code"], maps=())
-        codes[origin.code_digest] = origin.code
+    codes = {code_digest(one.about["code"]): one.about["code"] for _, one in finished}
     known = {"codes": codes, "reused": reused, "tables": {EPISODES: _digest_of_file(folder / EPISODES)}}
     if {name: about.get(name) for name in known} != known:
         write_run(folder, {**about, **known})

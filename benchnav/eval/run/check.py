@@ -24,7 +24,7 @@ from benchnav.eval.experiment.unit import BLOCK_MAPS, Extent
 from benchnav.eval.run.unit import noise_key, read_maps
 from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint
+from benchnav.models.predictor import class_mismatch, find_checkpoint, load_model
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Task, pose_problem
 from benchnav.planning.world.realisation import check_known
@@ -243,7 +243,7 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
 
 def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     """Loads the model, which may refuse; tells of another class table, and refuses single-class where it has none."""
-    part, model = condition.model.part, condition.make_model()
+    part, model = condition.model.part, load_model(condition.model)
     knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
     if condition.risk.part == "single-class" and not knows_classes:
         raise ConfigError(

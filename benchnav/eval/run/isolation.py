@@ -47,14 +47,10 @@ class IsolatedPlanner(Planner[int]):
         try:
             self._answer("start", _START_S)
         except BaseException:
-            self.__exit__()
+            self.close()
             raise
 
-    def __enter__(self) -> "IsolatedPlanner":
-        """Ends the child at the end."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Ends the child."""
         self._child.kill()
         self._child.join()

@@ -168,18 +168,14 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     """`run.json` of the whole: that of the first shard, with what was measured, said and commanded of all."""
     about = {name: value for name, value in runs[0].about.items() if name != "shard"}
-    conditions = {i: dict(entry) for i, entry in about["conditions"].items()}
-    for run in runs:
-        for condition_id, entry in run.about["conditions"].items():
-            if "latency" in entry:
-                conditions[condition_id].setdefault("latency", entry["latency"])
-    joined: dict[str, list[Any]] = {
-        name: provenance.join(*(run.about.get(name, ()) for run in runs))
-        for name in ("warnings", "dropped", "history")
-    }
-    commands = provenance.command_lines(provenance.join(*(run.about["commands"] for run in runs)))
-    history = provenance.extend_history(joined["history"], about["suite"])
-    return {**about, **joined, "conditions": conditions, "commands": commands, "history": history}
+    entries = {i: [run.about["conditions"][i] for run in reversed(runs)] for i in runs[0].conditions}
+    # They are alike but for latencies, which only those shards have that measured them.
+    about["conditions"] = {i: {k: v for entry in own for k, v in entry.items()} for i, own in entries.items()}
+    for name in ("warnings", "dropped", "history", "commands"):
+        about[name] = provenance.join(*(run.about[name] for run in runs))
+    about["commands"] = provenance.command_lines(about["commands"])
+    about["history"] = provenance.extend_history(about["history"], about["suite"])
+    return about
 
 
 def _shard(run: Run) -> Shard:

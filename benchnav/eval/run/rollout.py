@@ -6,8 +6,10 @@ tensors until the end. Letters in shapes: B episodes, N steps, S state and A act
 """
 
 import itertools
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +19,6 @@ from torch import Tensor
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.core.settings import one_line
-from benchnav.eval.run.clock import Clock
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
@@ -61,6 +62,41 @@ class Episodes:
     planned: Tensor
     errors: tuple[str, ...]
     traceback: str = ""
+
+
+class Clock:
+    """Times calls one after another without waiting for a GPU: there, events of its own stream are read at the end.
+
+    Args:
+        device: where the calls compute.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        """Begins with nothing."""
+        self._on_gpu = device.type == "cuda"
+        self._seconds: list[float] = []
+        self._events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Times what is done within; what raises is not counted."""
+        if self._on_gpu:
+            begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            begin.record()
+            yield
+            end.record()
+            self._events.append((begin, end))
+        else:
+            began = time.perf_counter()
+            yield
+            self._seconds.append(time.perf_counter() - began)
+
+    def seconds(self) -> list[float]:
+        """The time of each call so far."""
+        if self._on_gpu:
+            torch.cuda.synchronize()
+            return [begin.elapsed_time(end) / 1e3 for begin, end in self._events]
+        return self._seconds
 
 
 class _Log:

@@ -18,8 +18,12 @@ from scipy.stats import norm
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import sign_flips, standard_deviation, success_interval
-from benchnav.eval.stats.power import smallest_difference
+from benchnav.eval.stats.difference import (
+    sign_flips,
+    smallest_difference,
+    standard_deviation,
+    success_interval,
+)
 from benchnav.eval.stats.summary import units_of
 
 # Conditions of a block met the same maps and the same noise, and were asked the same.

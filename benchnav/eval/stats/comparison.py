@@ -9,15 +9,16 @@ from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.stats.difference import (
     by_map,
+    maps_needed,
     mean_interval,
     sign_flip_p,
     signed_rank_p,
+    smallest_difference,
     standard_deviation,
     success_interval,
     total_time_interval,
 )
 from benchnav.eval.stats.pairing import Pair
-from benchnav.eval.stats.power import maps_needed, smallest_difference
 from benchnav.eval.stats.summary import units_of
 
 ALPHA = 0.05

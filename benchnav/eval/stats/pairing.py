@@ -52,7 +52,6 @@ class Pair:
         episodes: of both, paired by seed, realisation and map, on all maps that both met: one's `success`,
             `total_time_s`, `time_budget_s` and other measures, the other's with `_other`; and `group`, the statistical
             unit, where the tables have it. Maps may have unequally many.
-        left_out: episodes of either condition that the other does not have.
         members: the conditions.
     """
 
@@ -60,7 +59,6 @@ class Pair:
     other: str
     shared: Mapping[str, str]
     episodes: pd.DataFrame
-    left_out: int
     members: tuple[Compared, ...] = ()
 
 
@@ -214,7 +212,6 @@ def _pair(one: Compared, other: Compared, by: str) -> Pair:
         other=other.labels[by],
         shared=shared,
         episodes=both,
-        left_out=len(one.episodes) + len(other.episodes) - 2 * len(both),
         members=(one, other),
     )
 

@@ -88,11 +88,10 @@ def cautious_design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     Returns:
         At least 1.
     """
-    _, size = np.unique(maps, return_counts=True)
+    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
     each = round(size.mean())
     if each == 1:
         return design_effect(success, maps)
-    _, member = np.unique(maps, return_inverse=True)
     added = np.repeat([len(size), len(size) + 1], each)
     ends = np.repeat([True, False], each)
     effect = design_effect(np.concatenate([success, ends]), np.concatenate([member, added]))
