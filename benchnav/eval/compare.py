@@ -107,10 +107,10 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path
         ".md": to_markdown(shown),
         ".tex": to_latex([shown], _CAPTION, stem.name),
     }
-    paths = [stem.with_name(stem.name + suffix) for suffix in texts]
-    for path, text in zip(paths, texts.values(), strict=True):
+    written = {stem.with_name(stem.name + suffix): text for suffix, text in texts.items()}
+    for path, text in written.items():
         write_text(path, text)
-    return paths
+    return list(written)
 
 
 def read_conditions(runs: Sequence[Run]) -> list[Compared]:

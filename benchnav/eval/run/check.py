@@ -68,7 +68,7 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
             f"Expected a suite with at least one condition, got none; data has {builder.scenarios(suite.data)}."
         )
     for condition in conditions:
-        builder.check_split(condition)
+        builder.check_split(condition, suite.maps)
     conditions, dropped = _steered(conditions)
     if elsewhere:
         check_everywhere(conditions)
@@ -117,7 +117,7 @@ class Builder:
         splits = self.dataset(data).splits
         return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
 
-    def check_split(self, condition: Condition) -> None:
+    def check_split(self, condition: Condition, maps: int) -> None:
         """Refuses a scenario that a dataset lacks, and more maps than it has."""
         dataset, known = self.dataset(condition.data), self.scenarios(condition.data)
         if condition.scenario not in known:
@@ -126,10 +126,10 @@ class Builder:
                 f"{hint(condition.scenario, known)}{_make_all(dataset, condition.split, 1)}"
             )
         count = dataset.map_count(condition.split)
-        if self.maps > count:
+        if maps > count:
             raise ConfigError(
-                f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {self.maps}. "
-                f"0 takes all.{_make_all(dataset, condition.split, self.maps)}"
+                f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {maps}. "
+                f"0 takes all.{_make_all(dataset, condition.split, maps)}"
             )
 
     def build(self, condition: Condition) -> None:
@@ -243,7 +243,8 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
 
 def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     """Loads the model, which may refuse; tells of another class table, and refuses single-class where it has none."""
-    part, model = condition.model.part, load_model(condition.model)
+    part = condition.model.part
+    model: Any = load_model(condition.model)
     knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
     if condition.risk.part == "single-class" and not knows_classes:
         raise ConfigError(

@@ -5,6 +5,7 @@ What is repeated are the conditions of `run.json`, each as often as it was run, 
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -136,15 +137,8 @@ def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
     lacking: dict[str, None] = {}
     builder = Builder(seed=0, maps=1)
-
-    def check_maps(condition: Condition) -> None:
-        maps = run.conditions[condition.id][1].maps
-        count = builder.dataset(condition.data).map_count(condition.split)
-        if count < maps:
-            raise ConfigError(f"Expected {maps} maps of {condition.data} {condition.split}, got {count}.")
-
-    for condition, _ in run.conditions.values():
-        for check in (check_maps, provenance.describe_parts):
+    for condition, extent in run.conditions.values():
+        for check in (partial(builder.check_split, maps=extent.maps), provenance.describe_parts):
             try:
                 check(condition)
             except BenchnavError as error:

@@ -106,10 +106,8 @@ class _Log:
         self.dt_s = problem.dt_s
         self.states = [start.state]
         # Of each step actions, observed λ, and how far and by what turn rate ground of λ = 1 would have led.
-        still = start.state.new_zeros(len(start.state), 0)
-        actions = len(problem.robot.action_low)
-        self._none = still[..., None].expand(-1, 0, actions), still, still, still
-        self._steps: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
+        none = start.state.new_zeros(len(start.state), 0)
+        self._steps = [[none[..., None].expand(-1, 0, len(problem.robot.action_low)), none, none, none]]
         self.clock = Clock(start.state.device)  # what is prepared, then each plan
         self.planned: list[int] = []
         self._reasons: list[str] = []
@@ -125,13 +123,13 @@ class _Log:
     def add(self, after: SimulationState, action: Tensor, met: Tensor, free: Tensor) -> None:
         before = self.states[-1]
         turned = (free[:, 2] - before[:, 2]) / self.dt_s
-        self._steps.append((action, met, distance(free, before[:, :2]), turned))
+        kept = action, met, distance(free, before[:, :2]), turned
+        self._steps.append([value.unsqueeze(1) for value in kept])
         self.states.append(after.state)
 
     def episodes(self, now: SimulationState, traceback_: str) -> Episodes:
-        track, taken = torch.stack(self.states, dim=1), len(self._steps)
-        stacked = [torch.stack(values, dim=1) for values in zip(*self._steps, strict=True)]
-        actions, met, driven, turned = stacked or self._none
+        track, taken = torch.stack(self.states, dim=1), len(self._steps) - 1
+        actions, met, driven, turned = (torch.cat(values, dim=1) for values in zip(*self._steps, strict=True))
         seconds = self.clock.seconds()
         return Episodes(
             states=track.cpu(),

@@ -107,12 +107,11 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
     return min(float(chances[far].sum()), 1.0)
 
 
-def sign_flips(maps: int, seed: int = 0) -> np.ndarray:
+def sign_flips(maps: int) -> np.ndarray:
     """Ways to flip the sign of each map's differences: all of them on few maps, else as they are and 9 999 draws.
 
     Args:
         maps: M.
-        seed: of the draws.
 
     Returns:
         ±1, shape [ways, M].
@@ -120,7 +119,7 @@ def sign_flips(maps: int, seed: int = 0) -> np.ndarray:
     if maps <= _ALL_FLIPPED:
         bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
         return 1.0 - 2.0 * bits
-    drawn = np.random.default_rng(seed).integers(0, 2, (_FLIPS, maps), dtype=np.int8)
+    drawn = np.random.default_rng(0).integers(0, 2, (_FLIPS, maps), dtype=np.int8)
     return np.concatenate([np.ones((1, maps)), 1.0 - 2.0 * drawn])
 
 

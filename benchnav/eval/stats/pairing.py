@@ -85,7 +85,8 @@ def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") 
     if against:
         check_known("`against`", against, values)
     pairs = [
-        _pair(*_ordered(a, b, by, against), by)
+        # What is compared first: the later of the two, unless the earlier is compared with a named one.
+        _pair(a, b, by) if against and b.labels[by] == against else _pair(b, a, by)
         for a, b in combinations(conditions, 2)
         if _differ_in(a, b, by) and (not against or against in (a.labels[by], b.labels[by]))
     ]
@@ -186,11 +187,6 @@ def _field(condition: Compared) -> dict[str, Any]:
         return {"noise": world["noise"]}
     below = (world.get("immobile") or {}).get("below")
     return {"noise": "frozen", "correlation_m": world.get("correlation_m"), "immobile.below": below}
-
-
-def _ordered(a: Compared, b: Compared, by: str, against: str) -> tuple[Compared, Compared]:
-    """What is compared first: the later of the two, unless the earlier is compared with a named one."""
-    return (a, b) if against and b.labels[by] == against else (b, a)
 
 
 def _pair(one: Compared, other: Compared, by: str) -> Pair:

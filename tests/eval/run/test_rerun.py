@@ -219,7 +219,7 @@ def test_a_dataset_with_fewer_maps_is_told(suite: Suite, tmp_path: Path) -> None
     run = finish(suite, tmp_path / "run")
     (tmp_path / "tiny.h5").unlink()
     factories.tiny_dataset(tmp_path / "tiny.h5", factories.tiny_recipe(test_std=1))
-    with pytest.raises(ConfigError, match=r"Expected 2 maps of .* test/std, got 1"):
+    with pytest.raises(ConfigError, match=r"Expected `maps` at most 1, the maps of test/std in .*, got 2"):
         repeat(run, tmp_path / "again")
 
 
