@@ -29,6 +29,7 @@ PART_KINDS = ("model", "risk", "planner", "robot", "objective")
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
 NOT_USED = "–"
+_ORDER = ("robot", "objective", "model", "risk", "planner")  # of tables
 # What a product lists, by the names that a suite has for it.
 _LISTED = ("data", "scenarios", "models", "risks", "planners", "robots", "objectives", "world", "task")
 
@@ -220,14 +221,12 @@ def _product(suite: Suite, listed: Mapping[str, list[Any]], scenarios_of: Any) -
         for task in each_mapping(listed_task)
     ]
     for data in listed["data"]:
-        for scenario, (world, rules, label), robot, objective, model, risk, planner in itertools.product(
-            listed["scenarios"] or scenarios_of(data),
-            worlds,
-            *(parts[kind] for kind in ("robot", "objective", "model", "risk", "planner")),
+        for scenario, (world, rules, label), *chosen in itertools.product(
+            listed["scenarios"] or scenarios_of(data), worlds, *(parts[kind] for kind in _ORDER)
         ):
             condition = Condition(
-                data=data, scenario=scenario, model=model, risk=risk, planner=planner, robot=robot,
-                objective=objective, rules=rules, world=world, world_label=label,
+                data=data, scenario=scenario, rules=rules, world=world, world_label=label,
+                **dict(zip(_ORDER, chosen, strict=True)),
             )  # fmt: skip
             yield _as_run_once(condition)
 

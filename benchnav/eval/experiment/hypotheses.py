@@ -8,7 +8,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import check_known, of, read
@@ -17,8 +17,7 @@ from benchnav.eval.experiment.condition import LABELS, NOT_USED, Condition, labe
 from benchnav.eval.experiment.unit import Conditions
 
 
-@dataclass(frozen=True, kw_only=True)
-class Metric:
+class Metric(NamedTuple):
     """What two conditions are compared by.
 
     Args:
@@ -33,15 +32,15 @@ class Metric:
     name: str
     unit: str
     scale: float
-    better: str
+    better: Literal["higher", "lower"]
 
 
 METRICS = {
-    "success": Metric(column="success", name="success", unit="points", scale=100, better="higher"),
-    "T_total": Metric(column="total_time_s", name="T_total", unit="s", scale=1, better="lower"),
-    "score": Metric(column="score", name="score", unit="", scale=1, better="higher"),
-    "traversability": Metric(column="traversability", name="λ̄", unit="points", scale=100, better="higher"),
-    "path_length": Metric(column="path_length_m", name="path length", unit="m", scale=1, better="lower"),
+    "success": Metric("success", "success", "points", 100, "higher"),
+    "T_total": Metric("total_time_s", "T_total", "s", 1, "lower"),
+    "score": Metric("score", "score", "", 1, "higher"),
+    "traversability": Metric("traversability", "λ̄", "points", 100, "higher"),
+    "path_length": Metric("path_length_m", "path length", "m", 1, "lower"),
 }
 
 

@@ -116,11 +116,11 @@ def _in_words(shard: Shard | None) -> str:
 def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> dict[str, Any]:
     """What `run.json` is to hold, of which the folder may hold an earlier state."""
     known = earlier.get("conditions", {})
-    latencies = {i: {"latency": entry["latency"]} for i, entry in known.items() if "latency" in entry}
     entries = {
         condition_id: {
             **{"value": condition.value, "labels": condition.labels, **_notes(condition)},
-            **{"seeds": extent.seeds, "draws": extent.draws, **latencies.get(condition_id, {})},
+            **{"seeds": extent.seeds, "draws": extent.draws},
+            **{name: value for name, value in known.get(condition_id, {}).items() if name == "latency"},
         }
         for condition_id, (condition, extent) in conditions.items()
     }

@@ -22,8 +22,8 @@ from benchnav.planning.problem import Problem
 _START_S = 120.0
 
 
-class TimeLimitError(BenchnavError):
-    """A planner did not answer in time, or its process ended."""
+class PlannerProcessError(BenchnavError):
+    """A planner did not answer in time, or its process ended, or it raised: its last line, its traceback as a note."""
 
 
 class IsolatedPlanner(Planner[int]):
@@ -77,24 +77,20 @@ class IsolatedPlanner(Planner[int]):
         try:
             if not self._here.poll(limit_s):
                 self._child.kill()
-                raise TimeLimitError(f"The planner gave no answer to `{what}` within {limit_s:g} s.")
+                raise PlannerProcessError(f"The planner gave no answer to `{what}` within {limit_s:g} s.")
             kind, value = pickle.loads(self._here.recv_bytes())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self._child.join(1)
-            raise TimeLimitError(
+            raise PlannerProcessError(
                 f"The planner's process ended in `{what}` with status {self._child.exitcode}."
             ) from error
         if kind == "lost":
             raise gpu_failed(value)
         if kind == "raised":
-            raised = ChildError(value.strip().splitlines()[-1])
+            raised = PlannerProcessError(value.strip().splitlines()[-1])
             raised.add_note(value)
             raise raised
         return value
-
-
-class ChildError(BenchnavError):
-    """What a planner raised in its process: its last line, and the child's traceback as a note."""
 
 
 def _serve(connection: Connection, condition: Condition) -> None:

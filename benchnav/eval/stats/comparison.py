@@ -104,7 +104,6 @@ def budgets_differ(pair: Pair) -> bool:
 
 def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, object]:
     rows = pair.episodes
-    one, other = rows["success"].astype(int), rows["success_other"].astype(int)
     gain, draws = gain_by_map(rows)
     mean, low, high = success_interval(gain, draws)
     std = float(standard_deviation(gain, draws))
@@ -115,11 +114,11 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
         "n_maps": rows["map"].nunique(),
         "n_groups": len(gain),
         "n_episodes": len(rows),
-        "success_one": one.mean(),
-        "success_other": other.mean(),
-        "success_difference": float(mean),
-        "success_low": float(low),
-        "success_high": float(high),
+        "success_one": rows["success"].mean(),
+        "success_other": rows["success_other"].mean(),
+        "success_difference": mean,
+        "success_low": low,
+        "success_high": high,
         "success_p": sign_flip_p(gain),
         "success_detectable": smallest_difference(std, len(gain), alpha),
         "maps_needed": maps_needed(std, difference, alpha),
