@@ -4,9 +4,9 @@ import inspect
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, NamedTuple, Union, get_args, get_origin
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
@@ -28,8 +28,7 @@ HELP = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entry:
+class Entry(NamedTuple):
     """One thing that can be named.
 
     Args:
@@ -99,11 +98,11 @@ def _describe(kind: str, name: str) -> Entry:
     try:
         target = registry.find(kind, name).target
         if kind == "model" and is_family(target):
-            return Entry(name=name, purpose=f"{_purpose(target)} A family: name a checkpoint of it.")
+            return Entry(name, f"{_purpose(target)} A family: name a checkpoint of it.")
         options = tuple(_option_lines(registry.options_of(kind, target)))
-        return Entry(name=name, purpose=_purpose(target), options=options)
+        return Entry(name, _purpose(target), options)
     except BenchnavError as error:
-        return Entry(name=name, purpose=f"cannot be used: {error}")
+        return Entry(name, f"cannot be used: {error}")
 
 
 def _purpose(target: Any) -> str:
@@ -147,9 +146,8 @@ def _worlds() -> Iterator[Entry]:
     from benchnav.planning.world.world import PRESETS
 
     for name, preset in PRESETS.items():
-        settings = {f"world.{key}": value for key, value in preset.world.to_dict().items()}
-        settings |= {f"task.{key}": value for key, value in asdict(preset.rules).items()}
-        yield Entry(name=name, purpose=preset.purpose, options=tuple(_setting_lines(settings)))
+        settings = {"world": preset.world.to_dict(), "task": asdict(preset.rules)}
+        yield Entry(name, preset.purpose, tuple(_setting_lines(settings)))
 
 
 def _setting_lines(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -172,4 +170,4 @@ def _checkpoints() -> Iterator[Entry]:
             purpose = f"Checkpoint of the family {config.get('model')} in {folder}{told}."
         except BenchnavError as error:
             purpose = f"cannot be used: {error}"
-        yield Entry(name=folder.name, purpose=purpose)
+        yield Entry(folder.name, purpose)

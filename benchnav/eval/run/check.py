@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from benchnav.core import registry
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.settings import hint, one_line
+from benchnav.core.settings import call, hint
 from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
@@ -203,16 +203,17 @@ def _check_planner(condition: Condition, task: Task) -> None:
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
     places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
-    try:
+
+    def prepare() -> None:
         problem = pose_problem(task, seen, mixture, ground, *places, 1.0)
         condition.make_planner().init(problem, torch.Generator())
-    except BenchnavError:
-        raise
-    except Exception as error:
-        raise ConfigError(
-            f"Planner {condition.planner.label!r} cannot be prepared for robot {condition.robot.label!r} and objective "
-            f"{condition.objective.label!r}: {one_line(error)}"
-        ) from error
+
+    labels = condition.labels
+    call(
+        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and objective {labels['objective']!r}",
+        prepare,
+        {},
+    )
 
 
 def _check_known_ground(condition: Condition, dataset: TerrainDataset, maps: int) -> None:

@@ -246,8 +246,6 @@ def check_maps(one: Compared, other: Compared, names: str) -> None:
 
 
 def _draws(condition: Compared) -> str:
-    def listed(values: Iterable[Any]) -> str:
-        return ", ".join(str(value) for value in sorted(set(values)))
-
     rows = condition.episodes
-    return f"seeds {listed(rows['seed'])}, realisations {listed(rows['realisation'])}"
+    numbers = {name: ", ".join(map(str, sorted(rows[name].unique()))) for name in ("seed", "realisation")}
+    return ", ".join(f"{name}s {listed}" for name, listed in numbers.items())
