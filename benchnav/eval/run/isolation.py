@@ -45,7 +45,7 @@ class IsolatedPlanner(Planner[int]):
         self._child.start()
         there.close()
         try:
-            self._answer("start", _START_S)
+            self._ask(_START_S, "start")
         except BaseException:
             self.close()
             raise
@@ -58,31 +58,28 @@ class IsolatedPlanner(Planner[int]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> int:
         """See `Planner`. The plan state stays in the child; here it is the number of calls."""
-        self._send(("init", problem, generator.initial_seed(), generator.get_state()))
-        self._answer("init", self.limit_s + _START_S)
+        seed, state = generator.initial_seed(), generator.get_state()
+        self._ask(self.limit_s + _START_S, "init", problem, seed, state)
         return 0
 
     def plan(self, step: Step, plan_state: int) -> tuple[torch.Tensor, int, Plan]:
         """See `Planner`."""
-        self._send(("plan", step))
         # The first call may compile.
         limit_s = self.limit_s if plan_state else self.limit_s + _START_S
-        action, plan, self.compiled = self._answer("plan", limit_s)
+        action, plan, self.compiled = self._ask(limit_s, "plan", step)
         return action, plan_state + 1, plan
 
-    def _send(self, message: Any) -> None:
-        self._here.send_bytes(pickle.dumps(message))
-
-    def _answer(self, what: str, limit_s: float) -> Any:
+    def _ask(self, limit_s: float, call: str, *arguments: Any) -> Any:
         try:
+            self._here.send_bytes(pickle.dumps((call, *arguments)))
             if not self._here.poll(limit_s):
                 self._child.kill()
-                raise PlannerProcessError(f"The planner gave no answer to `{what}` within {limit_s:g} s.")
+                raise PlannerProcessError(f"The planner gave no answer to `{call}` within {limit_s:g} s.")
             kind, value = pickle.loads(self._here.recv_bytes())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self._child.join(1)
             raise PlannerProcessError(
-                f"The planner's process ended in `{what}` with status {self._child.exitcode}."
+                f"The planner's process ended in `{call}` with status {self._child.exitcode}."
             ) from error
         if kind == "lost":
             raise gpu_failed(value)
@@ -98,8 +95,11 @@ def _serve(connection: Connection, condition: Condition) -> None:
     torch.set_num_threads(1)
     planner: Any = None
     plan_state: Any = None
-    message = pickle.dumps(("start",))
     while True:
+        try:
+            message = connection.recv_bytes()
+        except EOFError:
+            return
         try:
             call, *arguments = pickle.loads(message)
             if call == "start":
@@ -119,7 +119,3 @@ def _serve(connection: Connection, condition: Condition) -> None:
         except (Exception, SystemExit):
             text = pickle.dumps(("raised", traceback.format_exc()))
         connection.send_bytes(text)
-        try:
-            message = connection.recv_bytes()
-        except EOFError:
-            return
