@@ -193,9 +193,8 @@ def signed_rank_p(late: np.ndarray) -> float:
     if len(late) > _ALL_FLIPPED:
         return float(wilcoxon(late).pvalue) if np.any(late) else 1.0
     differing = late[late != 0]
-    twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(
-        differing
-    )  # whole numbers, those of ties too
+    # Whole numbers, those of ties too.
+    twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(differing)
     return sign_flip_p(twice_ranks.astype(np.int64))
 
 

@@ -115,9 +115,8 @@ def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
     more = rows[column] - rows[f"{column}_other"]
     sums = more.groupby(units_of(rows).to_numpy()).sum().to_numpy()
     flipped, seen = sign_flips(len(sums)) @ sums, sums.sum()
-    slack = (
-        1e-9 * np.abs(sums).sum()
-    )  # sums are exact to rounding, and ways that tie with what was seen count
+    # Sums are exact to rounding, and ways that tie with what was seen count.
+    slack = 1e-9 * np.abs(sums).sum()
     far = {"higher": flipped >= seen - slack, "lower": flipped <= seen + slack}
     return float(np.mean(far.get(test.direction, np.abs(flipped) >= abs(seen) - slack)))
 
@@ -131,7 +130,7 @@ def _margin_p(test: Hypothesis, rows: pd.DataFrame, side: float) -> float:
     def end(signed: float) -> float:
         """Of the confidence the end on the margin's side; of a negative one the other end."""
         _, low, high = _interval(rows, test.metric, abs(signed))
-        return side * ((high if side > 0 else low) if signed >= 0 else (low if side > 0 else high))
+        return side * (high if (side > 0) == (signed >= 0) else low)
 
     if np.isnan(end(0.5)):
         return 1.0
