@@ -372,6 +372,24 @@ def hint(name: str, known: Iterable[str], prefix: str = "") -> str:
     return f" Did you mean {prefix + close[0]!r}?" if close else ""
 
 
+def check_known(what: str, value: Any, known: Iterable[str]) -> None:
+    """Refuses what is not among known names, and gives the nearest.
+
+    Args:
+        what: what is expected to be known, for the message.
+        value: what was given.
+        known: the names.
+
+    Raises:
+        ConfigError: it is not among them.
+    """
+    names = list(known)
+    if value not in names:
+        raise ConfigError(
+            f"Expected {what} among {', '.join(names)}, got {value!r}.{hint(str(value), names)}"
+        )
+
+
 def one_line(error: BaseException) -> str:
     """An error as one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())

@@ -4,14 +4,14 @@ import inspect
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, NamedTuple, Union, get_args, get_origin
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Option
-from benchnav.core.settings import dataclass_in, list_options, plain
+from benchnav.core.settings import check_known, dataclass_in, list_options, plain
 from benchnav.core.tables import Table, print_table
 
 TITLES = {
@@ -28,8 +28,7 @@ HELP = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Entry:
+class Entry(NamedTuple):
     """One thing that can be named.
 
     Args:
@@ -54,10 +53,7 @@ def print_catalogue(*kinds: str) -> None:
     """
     chosen = [kind for kind in kinds if kind] or list(TITLES)
     for kind in chosen:
-        if kind not in TITLES:
-            raise ConfigError(
-                f"Expected a kind among {', '.join(TITLES)}, got {kind!r}.{registry.hint(kind, TITLES)}"
-            )
+        check_known("a kind", kind, TITLES)
     if not sys.stdout.isatty():
         print("\n".join(line for kind in chosen for line in plain_lines(kind)))
         return
@@ -102,11 +98,11 @@ def _describe(kind: str, name: str) -> Entry:
     try:
         target = registry.find(kind, name).target
         if kind == "model" and is_family(target):
-            return Entry(name=name, purpose=f"{_purpose(target)} A family: name a checkpoint of it.")
+            return Entry(name, f"{_purpose(target)} A family: name a checkpoint of it.")
         options = tuple(_option_lines(registry.options_of(kind, target)))
-        return Entry(name=name, purpose=_purpose(target), options=options)
+        return Entry(name, _purpose(target), options)
     except BenchnavError as error:
-        return Entry(name=name, purpose=f"cannot be used: {error}")
+        return Entry(name, f"cannot be used: {error}")
 
 
 def _purpose(target: Any) -> str:
@@ -115,14 +111,15 @@ def _purpose(target: Any) -> str:
     return "" if line.startswith(f"{getattr(target, '__name__', '')}(") else line
 
 
-def _option_lines(options: dict[str, Option], prefix: str = "") -> Iterator[str]:
+def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = None) -> Iterator[str]:
+    """Options with types and defaults, those of a dataclass one by one, with the fields of a holder for defaults."""
     for name, option in options.items():
-        config = dataclass_in(option.kind)
-        if config and option.default is not None:
-            yield from _option_lines(_with_values(list_options(config), option.default), f"{prefix}{name}.")
-            continue
-        kind = "" if option.kind is Any else f": {_type_name(option.kind)}"
-        yield f"{prefix}{name}{kind}{_default(option.default)}"
+        config, default = dataclass_in(option.kind), getattr(holder, name, option.default)
+        if config and default is not None:
+            yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
+        else:
+            kind = "" if option.kind is Any else f": {_type_name(option.kind)}"
+            yield f"{prefix}{name}{kind}{_default(default)}"
 
 
 def _type_name(kind: Any) -> str:
@@ -133,14 +130,6 @@ def _type_name(kind: Any) -> str:
     if kind is NoneType:
         return "None"
     return kind.__name__ if isinstance(kind, type) and not members else str(kind).replace("typing.", "")
-
-
-def _with_values(options: dict[str, Option], value: Any) -> dict[str, Option]:
-    """Options of a dataclass with one value's own fields for defaults."""
-    return {
-        name: Option(kind=option.kind, default=getattr(value, name, option.default))
-        for name, option in options.items()
-    }
 
 
 def _default(value: Any) -> str:
@@ -157,9 +146,8 @@ def _worlds() -> Iterator[Entry]:
     from benchnav.planning.world.world import PRESETS
 
     for name, preset in PRESETS.items():
-        settings = {f"world.{key}": value for key, value in preset.world.to_dict().items()}
-        settings |= {f"task.{key}": value for key, value in asdict(preset.rules).items()}
-        yield Entry(name=name, purpose=preset.purpose, options=tuple(_setting_lines(settings)))
+        settings = {"world": preset.world.to_dict(), "task": asdict(preset.rules)}
+        yield Entry(name, preset.purpose, tuple(_setting_lines(settings)))
 
 
 def _setting_lines(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -182,4 +170,4 @@ def _checkpoints() -> Iterator[Entry]:
             purpose = f"Checkpoint of the family {config.get('model')} in {folder}{told}."
         except BenchnavError as error:
             purpose = f"cannot be used: {error}"
-        yield Entry(name=folder.name, purpose=purpose)
+        yield Entry(folder.name, purpose)

@@ -5,14 +5,13 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from benchnav.core.command import INTERRUPTED, Command, Device, run, tell
+from benchnav.core.command import INTERRUPTED, Command, Device, run, show_progress, tell
+from benchnav.core.errors import ConfigError
+from benchnav.core.store import read_shard
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.replay import other_folder, program, replay
-
-if TYPE_CHECKING:
-    from benchnav.eval.report.write import Report
 
 SUITES = Path(__file__).parent / "suites"
 
@@ -44,9 +43,6 @@ def run_command(
         device: Where maps are predicted and episodes run; auto takes CUDA where there is a GPU.
         reuse_code: Take finished units that other code has made, and mark their rows; they are not used otherwise.
     """
-    from benchnav.core.command import show_progress
-    from benchnav.core.errors import ConfigError
-    from benchnav.core.store import read_shard
     from benchnav.eval.run.runner import run_suite
 
     _check_workers(jobs, backend, scheduler)
@@ -74,7 +70,6 @@ def merge(out: str, parts: list[str]) -> int:
         out: Run folder to be made.
         parts: Folders of all the run's shards, in any order.
     """
-    from benchnav.core.command import show_progress
     from benchnav.eval.run.merge import merge_shards
 
     folder = _own_folder(out)
@@ -100,17 +95,15 @@ def rerun(
         backend: Worker processes on this machine, or those of a Dask cluster.
         scheduler: Address of the Dask cluster's scheduler, tcp://HOST:PORT.
     """
-    from benchnav.core.command import show_progress
-    from benchnav.eval.run.rerun import compare
-    from benchnav.eval.run.rerun import rerun as rerun_all
+    from benchnav.eval.run import rerun
 
     _check_workers(jobs, backend, scheduler)
     original = _own_folder(folder)
     repeated = _own_folder(out or f"{original.resolve()}-rerun")
-    show_progress(rerun_all(original, repeated, jobs, scheduler, overwrite, _say), "units")
-    comparison = compare(original, repeated)
-    print("\n".join(comparison.lines))
-    return 0 if comparison.same else 1
+    show_progress(rerun.rerun(original, repeated, jobs, scheduler, overwrite, _say), "units")
+    same, lines = rerun.compare(original, repeated)
+    print("\n".join(lines))
+    return 0 if same else 1
 
 
 def list_command(kinds: list[str]) -> None:
@@ -131,11 +124,7 @@ def report(folder: str, out: str = "") -> None:
         folder: Run folder.
         out: Folder that they are written to, such as for a run that cannot be written; the run's own when not given.
     """
-    from benchnav.eval.failed_ground import ground_of_run
-    from benchnav.eval.report.write import write_report
-
-    run, place = Path(folder), other_folder(folder, out)
-    _print(write_report(run, ground_of_run(run), place), place)
+    _report(Path(folder), other_folder(folder, out))
 
 
 def compare(
@@ -173,17 +162,15 @@ def compare(
         allow_different: code compares conditions that other code made too, and names in every table what differs.
         out: Path without a suffix; .csv, .md and .tex are written there.
     """
-    from benchnav.core.errors import ConfigError
     from benchnav.core.tables import print_table
     from benchnav.eval.compare import compare_runs, write_comparison
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
         raise ConfigError(f"Expected `out` as the path of files without a suffix, got the folder {out}.")
-    labels = {
+    asked = {
         **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
         **{"robot": robot, "objective": objective, "world": world, "data": data},
     }
-    asked = {name: label for name, label in labels.items() if label}
     runs = [Path(folder) for folder in folders]
     table, shown = compare_runs(runs, by, against, asked, points / 100, allow_different == "code")
     print_table(shown)
@@ -193,16 +180,12 @@ def compare(
 
 def _own_folder(path: str) -> Path:
     """A run folder by its path; one that has no name of its own, as `/`, is none."""
-    from benchnav.core.errors import ConfigError
-
     if not Path(path).resolve().name:
         raise ConfigError(f"Expected the path of a run folder, got {path}.")
     return Path(path)
 
 
 def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
-    from benchnav.core.errors import ConfigError
-
     if jobs < 1:
         raise ConfigError(f"Expected `jobs` ≥ 1, got {jobs}.")
     if (backend == "dask") != bool(scheduler):
@@ -215,12 +198,10 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
 
 def _finish(folder: Path) -> int:
     """Reports on a finished run; gives the exit status."""
-    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.playback.files import write_viewer_files
-    from benchnav.eval.report.write import write_report
 
     write_viewer_files(folder)
-    _print(write_report(folder, ground_of_run(folder)), folder)
+    _report(folder, folder)
     _print_recorded(folder)
     _print_replay(folder)
     return _failed(folder)
@@ -230,11 +211,12 @@ def _say(line: str) -> None:
     tell(f"benchnav-eval: {line}")
 
 
-def _print(report: "Report", folder: Path) -> None:
-    from benchnav.eval.report.write import PAGE, print_report
+def _report(folder: Path, place: Path) -> None:
+    from benchnav.eval.failed_ground import ground_of_run
+    from benchnav.eval.report.write import PAGE, print_report, write_report
 
-    print_report(report)
-    print(f"report:  {folder / PAGE}")
+    print_report(write_report(folder, ground_of_run(folder), place))
+    print(f"report:  {place / PAGE}")
 
 
 def _print_recorded(folder: Path) -> None:
@@ -267,13 +249,13 @@ def _failed(folder: Path) -> int:
     from benchnav.eval.folder.folder import EPISODES, ERRORS, read_table
 
     rows = read_table(folder, EPISODES)
-    faults = {kind: int((rows["outcome"] == kind).sum()) for kind in ("planner_error", "model_error")}
-    if not any(faults.values()):
+    faults = rows[rows["outcome"].isin(["planner_error", "model_error"])]
+    if faults.empty:
         return 0
-    counted = " and ".join(f"{count} in {kind}" for kind, count in faults.items() if count)
-    first = rows.loc[rows["outcome"].isin(list(faults)), "error"].iloc[0]
+    counted = " and ".join(f"{count} in {kind}" for kind, count in faults["outcome"].value_counts().items())
     _say(
-        f"episodes that ended by a fault of the code they ran: {counted}, the first by {first}; see {folder / ERRORS}"
+        f"episodes that ended by a fault of the code they ran: {counted}, the first by {faults['error'].iloc[0]}; "
+        f"see {folder / ERRORS}"
     )
     return 1
 

@@ -4,24 +4,23 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from benchnav.core import registry
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import check_known
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, to_latex, to_markdown
-from benchnav.eval.experiment.condition import LABELS, NOT_USED
-from benchnav.eval.folder.folder import EPISODES, Run, caveats, open_run, read_table
+from benchnav.eval.experiment.condition import LABELS, NOT_USED, label_words
+from benchnav.eval.experiment.unit import DRAW
+from benchnav.eval.folder.folder import EPISODES, Run, caveats, differences, open_run, read_table
 from benchnav.eval.folder.provenance import code_differences
-from benchnav.eval.folder.sameness import differences
 from benchnav.eval.report.comparison import comparison_table
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairing import (
-    DRAW,
     Compared,
     Pair,
     by_what,
@@ -51,7 +50,7 @@ def compare_runs(
         folders: finished runs.
         by: in what conditions differ; see `pairing.by_what`.
         against: what all others are compared with; all pairs when empty.
-        asked: labels of the conditions that are looked at, several with a comma between; all when not named.
+        asked: labels of the conditions that are looked at, several with a comma between; all when empty or not named.
         difference: of success, for which the maps needed are counted.
         allow_different_code: compare what other code made too, and say so in the table. Runs that are compared with
             each other always are.
@@ -75,9 +74,8 @@ def compare_runs(
     pairs = find_pairs(conditions, by, against)
     unlike = [_unlike_code(pair.members) for pair in pairs]
     # Versions and machines may differ between rows; what a label names may not.
-    lines = _in_words(
-        *unlike, _unlike_code({member for pair in pairs for member in pair.members}, parts_alone=True)
-    )
+    members = {member for pair in pairs for member in pair.members}
+    lines = _in_words([*chain.from_iterable(unlike), *_unlike_code(members, parts_alone=True)])
     if lines and by != "run" and not allow_different_code:
         raise ConfigError(
             f"Expected conditions that differ in their {by} alone, but the code that made them differs too: "
@@ -109,10 +107,10 @@ def write_comparison(stem: Path, table: pd.DataFrame, shown: Table) -> list[Path
         ".md": to_markdown(shown),
         ".tex": to_latex([shown], _CAPTION, stem.name),
     }
-    paths = [stem.with_name(stem.name + suffix) for suffix in texts]
-    for path, text in zip(paths, texts.values(), strict=True):
+    written = {stem.with_name(stem.name + suffix): text for suffix, text in texts.items()}
+    for path, text in written.items():
         write_text(path, text)
-    return paths
+    return list(written)
 
 
 def read_conditions(runs: Sequence[Run]) -> list[Compared]:
@@ -160,41 +158,37 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _chosen(conditions: Iterable[Compared], asked: Mapping[str, str]) -> list[Compared]:
     chosen = list(conditions)
     for name, values in asked.items():
+        if not values:
+            continue
         known = list(dict.fromkeys(condition.labels[name] for condition in chosen))
         for value in values.split(","):
-            if value not in known:
-                raise ConfigError(
-                    f"Expected `{name}` among {', '.join(known)}, got {value!r}.{registry.hint(value, known)}"
-                )
+            check_known(f"`{name}`", value, known)
         chosen = [condition for condition in chosen if condition.labels[name] in values.split(",")]
     return chosen
 
 
-def _unlike_code(
-    conditions: Iterable[Compared], parts_alone: bool = False
-) -> dict[tuple[str, str], list[str]]:
+def _unlike_code(conditions: Iterable[Compared], parts_alone: bool = False) -> list[tuple[str, str, str]]:
     """What of the code that made conditions differs, by the two runs; of parts and our own sources alone, or of all."""
     held = [
         (run, {**code, "environment": {}} if parts_alone else code)
         for condition in conditions
         for run, code in condition.code.items()
     ]
-    found: dict[tuple[str, str], list[str]] = {}
-    for (first, earlier), (second, now) in combinations(sorted(held, key=lambda one: one[0]), 2):
-        if first != second:
-            found.setdefault((first, second), []).extend(code_differences(earlier, now))
-    return found
-
-
-def _in_words(*found: Mapping[tuple[str, str], Sequence[str]]) -> list[str]:
-    """Says what code differs, a line for two runs."""
-    lines: dict[tuple[str, str], dict[str, None]] = {}
-    for (first, second), names in (item for one in found for item in one.items()):
-        lines.setdefault((first, second), {}).update(dict.fromkeys(names))
     return [
-        f"{second} differs from {first} in {', '.join(names)}"
-        for (first, second), names in lines.items()
-        if names
+        (first, second, name)
+        for (first, earlier), (second, now) in combinations(sorted(held, key=lambda one: one[0]), 2)
+        if first != second
+        for name in code_differences(earlier, now)
+    ]
+
+
+def _in_words(found: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Says what code differs, a line for two runs."""
+    lines: dict[tuple[str, str], list[str]] = {}
+    for first, second, name in dict.fromkeys(found):
+        lines.setdefault((first, second), []).append(name)
+    return [
+        f"{second} differs from {first} in {', '.join(names)}" for (first, second), names in lines.items()
     ]
 
 
@@ -214,26 +208,23 @@ def _once_each(conditions: Iterable[Compared]) -> list[Compared]:
 
 
 def _joined(one: Compared, other: Compared) -> Compared:
-    runs = " and ".join([*one.code, *other.code])
-    check_maps(one, other, f"{_words(one)} in {runs}")
+    runs, words = " and ".join([*one.code, *other.code]), " ".join(label_words(one.labels))
+    check_maps(one, other, f"{words} in {runs}")
     first, second = (condition.episodes.drop(columns=list(LABELS)) for condition in (one, other))
-    unlike = [difference for difference in differences(first, second) if difference.columns]
-    if unlike:
+    cells, _ = differences(first, second)
+    if len(cells):
+        unlike = cells.index.droplevel(-1).unique()
         both = len(first.merge(second, on=DRAW))
         why = "; ".join(_in_words(_unlike_code((one, other))))
         raise ConfigError(
             f"Expected one set of rows of a condition that several runs hold, but {len(unlike)} of {both} episodes of "
-            f"{_words(one)} came out differently in {runs}{f' ({why})' if why else ''}. Leave one of them out, or "
+            f"{words} came out differently in {runs}{f' ({why})' if why else ''}. Leave one of them out, or "
             "compare the runs with each other by --by run."
         )
     rows = pd.concat([one.episodes, other.episodes]).drop_duplicates(DRAW, ignore_index=True)
     longer = max((one.maps, other.maps), key=len)
     labels = {**one.labels, "run": NOT_USED}
     return replace(one, labels=labels, episodes=rows, maps=longer, code={**one.code, **other.code})
-
-
-def _words(condition: Compared, names: Iterable[str] = LABELS[1:]) -> str:
-    return " ".join(condition.labels[name] for name in names if condition.labels[name] != NOT_USED)
 
 
 def _about(pairs: Sequence[Pair], table: pd.DataFrame) -> list[str]:
@@ -259,24 +250,21 @@ def _left_out(pairs: Sequence[Pair]) -> list[str]:
     """Says which episodes of a condition its partner was not run on."""
     lines: dict[str, None] = {}
     for pair in pairs:
-        paired = pd.MultiIndex.from_frame(pair.episodes[DRAW])
-        for condition, own, partner in zip(
-            pair.members, (pair.one, pair.other), (pair.other, pair.one), strict=True
-        ):
-            drawn = pd.MultiIndex.from_frame(condition.episodes[DRAW])
-            rows = condition.episodes.loc[~drawn.isin(paired), DRAW]
-            if len(rows):
-                seeds = {
-                    f"seed {seed}" + (f", realisation {realisation}" if realisation else ""): sorted(
-                        group["map"]
-                    )
-                    for (seed, realisation), group in rows.groupby(["seed", "realisation"])
-                }
-                where = "; ".join(f"{name} on {_maps(maps)}" for name, maps in list(seeds.items())[:_NAMED])
-                more = f" and {len(seeds) - _NAMED} more draws" if len(seeds) > _NAMED else ""
+        sides = (pair.one, pair.other), (pair.other, pair.one)
+        for condition, (own, partner) in zip(pair.members, sides, strict=True):
+            both = condition.episodes[DRAW].merge(pair.episodes[DRAW], how="left", indicator=True)
+            rows = both[both["_merge"] == "left_only"]
+            places = [
+                f"seed {seed}"
+                + (f", realisation {realisation}" if realisation else "")
+                + f" on {_maps(sorted(maps))}"
+                for (seed, realisation), maps in rows.groupby(["seed", "realisation"])["map"]
+            ]
+            if places:
+                more = f" and {len(places) - _NAMED} more draws" if len(places) > _NAMED else ""
                 line = (
                     f"Left out: {len(rows)} of {len(condition.episodes)} episodes of {own}, on which {partner} was not "
-                    f"run ({where}{more})."
+                    f"run ({'; '.join(places[:_NAMED])}{more})."
                 )
                 lines[line] = None
     return _first_of(list(lines), "pairs with episodes left out")
@@ -298,7 +286,7 @@ def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair]) -> list[s
     varying = [
         name for name in (*LABELS, "run") if len({condition.labels[name] for condition in conditions}) > 1
     ]
-    names = [_words(condition, varying) for condition in alone]
+    names = [" ".join(label_words(condition.labels, varying)) for condition in alone]
     return [f"Without a partner, so in no row: {'; '.join(_first_of(names, 'conditions'))}."] if names else []
 
 

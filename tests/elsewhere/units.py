@@ -56,13 +56,13 @@ def unit_of(data: Path | str, **changes: Any) -> Unit:
     return Unit(condition=condition, seed=0, realisation=0, maps=(0, 1), record="all", leads=True)
 
 
-def run_here(unit: Unit, folder: Path, **settings: Any) -> None:
-    asked = Settings(**settings)
+def run_here(unit: Unit, folder: Path, device: torch.device | str = "cpu", limit_s: float = 0.0) -> None:
+    asked = Settings(planner_limit_s=limit_s, device=str(device))
     run_unit(unit, folder, asked.origins().of(unit), asked)
 
 
 def made(folder: Path) -> dict[str, Any]:
-    """All that a unit has written but wall times, by file."""
+    """All that a unit has written but wall times and what code it was, of which its device is one, by file."""
     found: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -70,8 +70,9 @@ def made(folder: Path) -> dict[str, Any]:
             with np.load(path) as stored:
                 found |= {f"{name} {key}": stored[key] for key in stored.files}
         elif path.suffix == ".parquet":
-            rows = pd.read_parquet(path)
-            found |= {f"{name} {key}": rows[key].to_numpy() for key in rows if "planning" not in str(key)}
+            rows = pd.read_parquet(path).drop(columns="code", errors="ignore")
+            kind = name.split("/")[0]
+            found |= {f"{kind} {key}": rows[key].to_numpy() for key in rows if "planning" not in str(key)}
     return found
 
 
@@ -184,7 +185,7 @@ def test_a_gpu_that_fails_ends_the_run_and_makes_no_rows(
     changes: dict[str, Any], limit_s: float, said: str, dataset_path: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(DeviceError, match=said):
-        run_here(unit_of(dataset_path, **changes), tmp_path, planner_limit_s=limit_s)
+        run_here(unit_of(dataset_path, **changes), tmp_path, limit_s=limit_s)
     assert not list(tmp_path.rglob("*.parquet"))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, open_run, write_run
-from benchnav.eval.folder.provenance import Origin
+from benchnav.eval.folder.provenance import code_digest
 
 CODE: dict[str, dict[str, Any]] = {
     "modules": {"benchnav.eval.run.unit": "s"},
@@ -38,7 +38,7 @@ def forge_run(
     `conditions` are as `run.json` has them, and `changes` other keys, or `code`, which made the rows.
     """
     code = changes.pop("code", CODE)
-    digest = Origin(code=code, maps=()).code_digest
+    digest = code_digest(code)
     notes: dict[str, Any] = {"follows": "", "remarks": [], "changed": []}
     about: dict[str, Any] = {
         "format": "benchnav-run", "format_version": FORMAT_VERSION, "suite": {}, "commands": [],

@@ -14,6 +14,7 @@ from scipy.stats import t
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent
 from tests.eval.report.made import condition, row, rows
 from tests.eval.test_compare import run_folder
 
@@ -39,11 +40,11 @@ def test_each_suite_makes_conditions_and_names_them_in_its_hypotheses(
 ) -> None:
     monkeypatch.chdir(ROOT)
     suite = Suite(**yaml.safe_load(path.read_text()))
-    conditions = {
-        condition.id: condition for condition in conditions_of(suite, lambda data: ["std", "hg", "hs"])
-    }
+    conditions = conditions_of(suite, lambda data: ["std", "hg", "hs"])
     assert len(conditions) >= 6
-    tests = fix_hypotheses(suite.hypotheses, conditions, dict.fromkeys(conditions, 1)).get("tests", [])
+    extent = Extent.product((0,), 1, 1)
+    known = {condition.id: (condition, extent) for condition in conditions}
+    tests = fix_hypotheses(suite.hypotheses, known).get("tests", [])
     assert len(tests) >= len(suite.hypotheses)
 
 

@@ -5,10 +5,8 @@ the digest of that value; its labels are for people. Seeds, realisations and map
 is run, and belong to the suite.
 """
 
-import hashlib
 import itertools
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,25 +17,21 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
-from benchnav.core.settings import of, read
+from benchnav.core.settings import check_known, of, read
+from benchnav.core.store import text_digest
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.sweep import each_mapping, each_part
 from benchnav.planning.free_space import Rules
 from benchnav.planning.problem import Task
-from benchnav.planning.risk import RiskMeasure
 from benchnav.planning.world.world import World, read_world
 
 PART_KINDS = ("model", "risk", "planner", "robot", "objective")
 # Columns of `Condition.labels`, in the order of tables.
 LABELS = ("data", "scenario", "world", "robot", "objective", "model", "planner", "risk")
 NOT_USED = "–"
-
-# What the mappings of `conditions` may hold, with the other way to write it.
-_KEYS = {
-    **{"data": "datas", "scenarios": "scenario", "models": "model", "risks": "risk", "planners": "planner"},
-    **{"robots": "robot", "objectives": "objective", "world": "worlds", "task": "tasks"},
-}
-_SINGULAR = {other: key for key, other in _KEYS.items()}
+_ORDER = ("robot", "objective", "model", "risk", "planner")  # of tables
+# What a product lists, by the names that a suite has for it.
+_LISTED = ("data", "scenarios", "models", "risks", "planners", "robots", "objectives", "world", "task")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +84,7 @@ class Condition:
     @property
     def id(self) -> str:
         """Digest of the value, 16 hexadecimal digits."""
-        text = json.dumps(self.value, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return text_digest(self.value)[:16]
 
     @property
     def labels(self) -> dict[str, str]:
@@ -100,6 +93,11 @@ class Condition:
         if self.blind:
             parts |= {"model": NOT_USED, "risk": NOT_USED}
         return {"data": self.data, "scenario": self.scenario, **parts, "world": self.world_label}
+
+    @property
+    def description(self) -> str:
+        """All labels, each after its column."""
+        return ", ".join(f"{name} {label}" for name, label in self.labels.items())
 
     def make_task(self) -> Task:
         """Makes the robot, the objective and with them the task."""
@@ -112,16 +110,6 @@ class Condition:
     def make_planner(self) -> Any:
         """Makes the planner."""
         return registry.make("planner", self.planner)
-
-    def make_model(self) -> Any:
-        """Makes the model, or loads its checkpoint."""
-        from benchnav.models.predictor import load_model
-
-        return load_model(self.model)
-
-    def make_risk(self) -> RiskMeasure:
-        """Makes the risk measure."""
-        return registry.make("risk", self.risk)
 
 
 def condition_from(about: Mapping[str, Any]) -> Condition:
@@ -152,13 +140,19 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
     Raises:
         ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
     """
-    _check_options_used(suite)
+    products = [_listed(suite, product) for product in suite.conditions or ({},)]
+    planners = dict.fromkeys(
+        registry.read_part("planner", given).part for product in products for given in product["planners"]
+    )
+    for name in suite.planner_options:  # such as a mistyped one
+        check_known("`planner_options` of planners of the suite", name, planners)
     every: list[Condition] = []
-    for product in suite.conditions or ({},):
+    for product in products:
         here: set[str] = set()
         for condition in _product(suite, product, scenarios_of):
             if condition.id in here and condition.risk.label != NOT_USED:
-                raise ConfigError(f"Expected settings that differ, got twice what {_words(condition)} is.")
+                words = " ".join(label_words(condition.labels))
+                raise ConfigError(f"Expected settings that differ, got twice what {words} is.")
             here.add(condition.id)
             every.append(condition)
     check_labels(every)
@@ -194,121 +188,78 @@ def check_labels(conditions: Iterable[Condition]) -> None:
                 )
 
 
-def _product(suite: Suite, product: Mapping[str, Any], scenarios_of: Any) -> Iterator[Condition]:
-    given = {}
-    for key, values in product.items():
-        key = _SINGULAR.get(key, key)
-        if key not in _KEYS:
-            known = [*_KEYS, *_SINGULAR]
-            raise ConfigError(
-                f"Expected keys of `conditions` among {', '.join(_KEYS)}, got {key!r}.{registry.hint(key, known)}"
-            )
-        given[key] = values if isinstance(values, list | tuple) else [values]
+def _listed(suite: Suite, product: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """What a product lists under each key, in the singular or the plural; the suite's where it names none."""
+    listed = {key: getattr(suite, key) for key in _LISTED} | {"models": suite.models or suite.model}
+    for given, values in product.items():
+        spellings = (given, f"{given}s", str(given).removesuffix("s"))
+        key = next((key for key in spellings if key in listed), given)
+        check_known("keys of `conditions`", key, listed)
+        listed[key] = values
+    return {
+        key: list(values) if isinstance(values, list | tuple) else [values] for key, values in listed.items()
+    }
 
-    def chosen(key: str, default: Sequence[Any]) -> Sequence[Any]:
-        return given.get(key, default)
 
+def _product(suite: Suite, listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Condition]:
     parts = {
-        "model": chosen("models", suite.models or (suite.model,)),
-        "risk": chosen("risks", suite.risks),
-        "planner": chosen("planners", suite.planners),
-        "robot": chosen("robots", suite.robots),
-        "objective": chosen("objectives", suite.objectives),
+        kind: [part for given in listed[f"{kind}s"] for part in _parts(kind, given, suite)]
+        for kind in PART_KINDS
     }
-    ready = {
-        kind: [part for given in listed for part in _parts(kind, given, suite)]
-        for kind, listed in parts.items()
-    }
-    worlds = [
-        _world(suite, world, task)
-        for listed_world in chosen(
-            "world", suite.world if isinstance(suite.world, list | tuple) else (suite.world,)
-        )
-        for world in each_mapping(listed_world)
-        for listed_task in chosen("task", (suite.task,))
-        for task in each_mapping(listed_task)
-    ]
-    for data in chosen("data", (suite.data,)):
-        for scenario, (world, rules, label), robot, objective, model, risk, planner in itertools.product(
-            chosen("scenarios", suite.scenarios) or scenarios_of(data),
-            worlds,
-            *(ready[kind] for kind in ("robot", "objective", "model", "risk", "planner")),
-        ):
-            condition = Condition(
-                data=data, scenario=scenario, model=model, risk=risk, planner=planner, robot=robot,
-                objective=objective, rules=rules, world=world, world_label=label,
-            )  # fmt: skip
-            yield _as_run_once(condition)
-
-
-def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
-    """What is given as one part: several where options are given lists of values."""
-    part = registry.read_part(kind, given)
-    if kind == "model" and part.part not in registry.names("model") and ":" not in part.part:
-        return [read_model(part)]
-    if kind == "planner" and part.part in suite.planner_options:
-        part = replace(part, options={**suite.planner_options[part.part], **part.options})
-    every = each_part(kind, part)
-    made = [read_model(one) if kind == "model" else registry.complete(kind, one) for one in every]
-    for one in made if kind == "risk" else ():
-        _check_risk(one)
-    return made
-
-
-def _check_risk(part: Part) -> None:
-    """Lets a shipped risk measure refuse its options, on one cell, also where no condition uses it."""
-    measure = registry.make("risk", part)
-    if registry.find("risk", part.part).shipped:
-        cell = torch.full((1, 1, 1, 1), 0.5)
-        measure(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
-
-
-def read_model(given: Any) -> Part:
-    """Reads a model: a registered one, or a checkpoint, which has no options.
-
-    Raises:
-        ConfigError: there is no such model, or it is refused its options.
-    """
-    from benchnav.models.base import is_family
-    from benchnav.models.predictor import find_checkpoint, load_model
-
-    part = registry.read_part("model", given)
-    if part.part in registry.names("model") or ":" in part.part:
-        if is_family(registry.find("model", part.part).target):
-            load_model(part)  # says what to name in place of a family
-        return registry.complete("model", part)
-    find_checkpoint(part.part)
-    if part.options:
-        raise ConfigError(f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
-    return replace(part, label=Path(part.part).name) if part.label == part.part else part
-
-
-def _check_options_used(suite: Suite) -> None:
-    """Refuses options of planners that no product names, such as a mistyped one."""
-    listed: list[Any] = []
-    for product in suite.conditions or ({},):
-        given = next((product[key] for key in ("planners", "planner") if key in product), suite.planners)
-        listed += given if isinstance(given, list | tuple) else [given]
-    known = list(dict.fromkeys(registry.read_part("planner", part).part for part in listed))
-    for name in suite.planner_options:
-        if name not in known:
-            raise ConfigError(
-                f"Expected `planner_options` of planners of the suite, {', '.join(known)}, got {name!r}."
-                f"{registry.hint(name, known)}"
-            )
-
-
-def _world(suite: Suite, world: Any, task: Any) -> tuple[World, Rules, str]:
-    """The world and rules of a product, with the suite's short forms where it names none itself."""
     if suite.noise == "frozen":
         raise ConfigError(
             "Expected `noise` 'resampled' or 'stored', got 'frozen', which is now 'stored': the map's own λ. "
             "For λ drawn once an episode say `world.noise` frozen, or take the world stakes."
         )
-    short: dict[str, Any] = {"noise": suite.noise} if suite.noise else {}
-    if suite.time_budget_s:
-        short["time_budget_s"] = suite.time_budget_s
-    return read_world(world, task, short)
+    short = {"noise": suite.noise, "time_budget_s": suite.time_budget_s}
+    # Short forms hold where a world itself names nothing.
+    worlds = [
+        read_world(world, task, {name: value for name, value in short.items() if value})
+        for listed_world in listed["world"]
+        for world in each_mapping(listed_world)
+        for listed_task in listed["task"]
+        for task in each_mapping(listed_task)
+    ]
+    for data in listed["data"]:
+        for scenario, (world, rules, label), *chosen in itertools.product(
+            listed["scenarios"] or scenarios_of(data), worlds, *(parts[kind] for kind in _ORDER)
+        ):
+            condition = Condition(
+                data=data, scenario=scenario, rules=rules, world=world, world_label=label,
+                **dict(zip(_ORDER, chosen, strict=True)),
+            )  # fmt: skip
+            yield _as_run_once(condition)
+
+
+def is_checkpoint(kind: str, source: str) -> bool:
+    """Whether a part is a checkpoint, by folder or by name: a model that is neither registered nor of a module."""
+    return kind == "model" and ":" not in source and source not in registry.names("model")
+
+
+def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
+    """What is given as one part: several where options are given lists of values."""
+    from benchnav.models.base import is_family
+    from benchnav.models.predictor import find_checkpoint, load_model
+
+    part = registry.read_part(kind, given)
+    if is_checkpoint(kind, part.part):
+        find_checkpoint(part.part)
+        if part.options:
+            raise ConfigError(
+                f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}."
+            )
+        return [replace(part, label=Path(part.part).name) if part.label == part.part else part]
+    if kind == "model" and is_family(registry.find("model", part.part).target):
+        load_model(part)  # says what to name in place of a family
+    if kind == "planner" and part.part in suite.planner_options:
+        part = replace(part, options={**suite.planner_options[part.part], **part.options})
+    made = [registry.complete(kind, one) for one in each_part(kind, part)]
+    if kind == "risk" and registry.find("risk", part.part).shipped:
+        # Lets it refuse its options on one cell, also where no condition uses it.
+        cell = torch.full((1, 1, 1, 1), 0.5)
+        for one in made:
+            registry.make("risk", one)(TraversabilityMixture(torch.ones_like(cell), cell, cell, (0,)))
+    return made
 
 
 def _as_run_once(condition: Condition) -> Condition:
@@ -335,7 +286,15 @@ def _labelled(condition: Condition, name: str) -> Any:
     return condition.value[name] if name in PART_KINDS else None
 
 
-def _words(condition: Condition) -> str:
-    return ", ".join(
-        f"{condition.labels[name]}" for name in ("scenario", "model", "planner", "risk", "world")
-    )
+def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:
+    """The labels of some columns, those that are used."""
+    return [labels[name] for name in names if labels[name] != NOT_USED]
+
+
+def differences(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two values of plain data differ: dotted names of options, with both values; None where one has none."""
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        for key in dict.fromkeys([*one, *other]):
+            yield from differences(one.get(key), other.get(key), f"{name}.{key}".removeprefix("."))
+    elif one != other:
+        yield name, one, other

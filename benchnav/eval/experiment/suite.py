@@ -4,7 +4,7 @@
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from benchnav.core.errors import ConfigError
 
@@ -12,7 +12,7 @@ PartSpec = str | dict[str, Any]
 
 # What is kept of episodes beside their rows, each with all that stands before it.
 Record = Literal["none", "steps", "first", "failures", "all"]
-RECORDS: tuple[Record, ...] = ("none", "steps", "first", "failures", "all")
+RECORDS: tuple[Record, ...] = get_args(Record)
 
 _SEEDS = 2**63  # what a table's column of whole numbers holds
 

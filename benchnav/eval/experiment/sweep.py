@@ -8,7 +8,9 @@ from typing import Any
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import Part
-from benchnav.core.settings import of, read
+from benchnav.core.settings import changed, of, read
+
+_Chosen = dict[tuple[str, ...], Any]  # values by where they stand
 
 
 def each_part(kind: str, part: Part) -> list[Part]:
@@ -25,31 +27,30 @@ def each_part(kind: str, part: Part) -> list[Part]:
         The part itself where nothing is swept.
     """
     known = registry.options_of(kind, registry.find(kind, part.part).target)
-    lists = {
-        path: values
+    swept = {
+        name: value
         for name, value in part.options.items()
         if name in known and not _taken(kind, part.part, name, known[name], value)
-        for path, values in _lists(value, (name,))
     }
-    first = next(iter(known), None)
-    made = []
-    for values in product(*lists.values()):
-        chosen = dict(zip(lists, values, strict=True))
-        made.append(
-            replace(part, label=_label(part.label, chosen, first), options=_with(part.options, chosen))
-        )
-    return made
+    first = next(iter(known), "")
+    return [
+        replace(part, label=_label(part.label, chosen, first), options=_with(part.options, chosen))
+        for chosen in _choices(swept)
+    ]
 
 
 def each_mapping(given: Any) -> list[Any]:
     """Gives a mapping for each combination of values where one is a list, at any depth; anything else as it is."""
     if not isinstance(given, Mapping):
         return [given]
+    return [_with(given, chosen) for chosen in _choices(given)]
+
+
+def _choices(given: Mapping[str, Any]) -> Iterator[_Chosen]:
+    """A value for each list in a mapping, by where it stands, in all combinations."""
     lists = dict(_lists(given, ()))
-    return [
-        _with(given, dict(zip(lists, values, strict=True))) if lists else given
-        for values in product(*lists.values())
-    ]
+    for values in product(*lists.values()):
+        yield dict(zip(lists, values, strict=True))
 
 
 def _taken(kind: str, source: str, name: str, option: Any, value: Any) -> bool:
@@ -71,16 +72,15 @@ def _lists(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...],
             yield from _lists(inner, (*path, str(name)))
 
 
-def _with(options: Mapping[str, Any], chosen: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
+def _with(options: Mapping[str, Any], chosen: _Chosen) -> dict[str, Any]:
     made = dict(options)
     for path, value in chosen.items():
-        name, *inner = path
-        made[name] = _with(made[name], {tuple(inner): value}) if inner else value
+        made = changed(made, path, value)
     return made
 
 
-def _label(label: str, chosen: Mapping[tuple[str, ...], Any], first: str | None) -> str:
-    if first is not None and list(chosen) == [(first,)]:
+def _label(label: str, chosen: _Chosen, first: str) -> str:
+    if list(chosen) == [(first,)]:
         return f"{label}:{_text(chosen[(first,)])}"
     return " ".join([label, *(f"{'.'.join(path)}={_text(value)}" for path, value in chosen.items())])
 

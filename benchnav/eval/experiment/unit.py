@@ -10,6 +10,7 @@ from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.suite import Record
 
 BLOCK_MAPS = 50
+DRAW = ["seed", "realisation", "map"]  # columns by which an episode of a condition is known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,11 +111,9 @@ class Unit:
         words += [self.condition.id[:8], f"{self.seed}", f"{self.realisation}", f"{self.maps[member]:05d}"]
         return Path("playback", "-".join(re.sub(r"[^A-Za-z0-9_-]+", "-", word) for word in words) + suffix)
 
-    def watched(self) -> range:
+    def watched(self) -> list[int]:
         """Which episodes may come to be recorded, known before they are run."""
-        if self.record in ("failures", "all"):
-            return range(len(self.maps))
-        return range(1 if self.record == "first" and self.leads else 0)
+        return self.recorded([False] * len(self.maps))
 
     def recorded(self, succeeded: Sequence[bool]) -> list[int]:
         """Which episodes are recorded, by how they ended."""

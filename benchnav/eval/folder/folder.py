@@ -10,8 +10,6 @@ that an edit of either is found.
 import hashlib
 import json
 import secrets
-import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,20 +25,14 @@ from benchnav.core.settings import one_line
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
-from benchnav.eval.experiment.unit import Extent, Unit
-from benchnav.eval.folder.provenance import Origin
+from benchnav.eval.experiment.unit import DRAW, Extent, Unit
+from benchnav.eval.folder.provenance import Origin, code_digest
 
 FORMAT, FORMAT_VERSION = "benchnav-run", 5
 RUN, EPISODES, ERRORS = "run.json", "episodes.parquet", "errors.txt"
-KEYS = ["condition", "seed", "realisation", "map"]  # of a row
+KEYS = ["condition", *DRAW]  # of a row
 
 METADATA = b"benchnav"  # key of ours in a Parquet file's metadata
-
-# What reading a damaged file raises: of a condition's rules and world what refuses a suite, of a table its library's.
-_DAMAGE = (
-    *(ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError, OSError),
-    *(ConfigError, pa.ArrowException, EOFError, zipfile.BadZipFile, zlib.error),
-)
 
 
 class DamageError(ValueError):
@@ -77,34 +69,33 @@ def open_run(folder: Path) -> Run:
     with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
         text = (folder / RUN).read_text()
         version = _format_version(json.loads(text))
-    if version != FORMAT_VERSION:
-        reader = (
-            "a newer benchnav" if version > FORMAT_VERSION else "benchnav 0.7, which reads versions 1 to 3"
-        )
-        raise ConfigError(
-            f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. Read it "
-            f"with {reader}, or run its suite again."
-        )
-    with damaged(folder / RUN, "Take it from a copy, or run the suite again into another folder."):
-        about = unseal(text)
-        conditions = {
-            i: (condition_from(entry), Extent(draws=tuple(tuple(draw) for draw in entry["draws"])))
-            for i, entry in about["conditions"].items()
-        }
-        shard = Shard(**about["shard"]) if "shard" in about else None
-    return Run(folder=folder, about=about, conditions=conditions, shard=shard)
+        if version == FORMAT_VERSION:
+            about = unseal(text)
+            conditions = {
+                i: (condition_from(entry), Extent(draws=tuple(tuple(draw) for draw in entry["draws"])))
+                for i, entry in about["conditions"].items()
+            }
+            shard = Shard(**about["shard"]) if "shard" in about else None
+            return Run(folder=folder, about=about, conditions=conditions, shard=shard)
+    reader = "a newer benchnav" if version > FORMAT_VERSION else "benchnav 0.7, which reads versions 1 to 3"
+    raise ConfigError(
+        f"Expected a run folder of format version {FORMAT_VERSION}, got {folder} of version {version}. Read it "
+        f"with {reader}, or run its suite again."
+    )
 
 
 def _format_version(about: Any) -> int:
     """The version of `run.json`; before there was one it had no format, but the command that made it."""
-    if not isinstance(about, dict):
-        raise DamageError("it is no mapping")
-    if "format" not in about and "command" in about:
+    if isinstance(about, dict) and "format" not in about and "command" in about:
         return 1
-    version = about.get("format_version")
-    if about.get("format") != FORMAT or type(version) is not int:
-        raise DamageError("it does not say that it is a run, or of which version")
-    return version
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise DamageError("it does not say that it is a run")
+    return int(about["format_version"])
+
+
+def is_taken(folder: Path) -> bool:
+    """Whether a place holds anything, so that no new run can be begun there."""
+    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
 def write_run(folder: Path, about: Mapping[str, Any]) -> None:
@@ -161,7 +152,7 @@ def damaged(path: Path, remedy: str) -> Iterator[None]:
         yield
     except PermissionError:
         raise
-    except _DAMAGE as error:
+    except Exception as error:  # of a table what its library raises, of a rule what refuses a suite
         said = error if isinstance(error, DamageError | ConfigError) else one_line(error)
         raise ConfigError(f"{path} is damaged: {said}. {remedy}") from error
 
@@ -234,15 +225,16 @@ def write_unit(
     """
     key = origin.key(unit)
     about = {
-        **{"unit": _identity(unit), "key": key, "code": origin.code, "digests": list(origin.maps)},
-        **{
-            "record": unit.record,
-            "made": secrets.token_hex(8),
-            "traceback": traceback,
-            "errors": list(errors),
-        },
+        "unit": _identity(unit),
+        "key": key,
+        "code": origin.code,
+        "digests": list(origin.maps),
+        "record": unit.record,
+        "made": secrets.token_hex(8),
+        "traceback": traceback,
+        "errors": list(errors),
     }
-    table = pa.Table.from_pandas(rows.assign(code=origin.code_digest), preserve_index=False)
+    table = pa.Table.from_pandas(rows.assign(code=code_digest(origin.code)), preserve_index=False)
     with replacing(folder / "units" / unit.condition.id / f"{unit.name}-{key}.parquet") as partial:
         pq.write_table(with_metadata(table, about), partial)
 
@@ -256,7 +248,7 @@ def clear_unit(folder: Path, unit: Unit) -> None:
 
 
 def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: str = "") -> None:
-    """Writes `episodes.parquet` of all units, a unit at a time, its digest and codes into `run.json`, and `errors.txt`.
+    """Writes `episodes.parquet` of all units, its digest and codes into `run.json`, and `errors.txt`.
 
     Args:
         folder: the run folder.
@@ -265,11 +257,11 @@ def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: 
     """
     about = open_run(folder).about
     write_errors(folder, finished)
-    _merge(folder / EPISODES, (_episode_table(one.path) for _, one in finished))
-    codes = {}
-    for _, one in finished:
-        origin = Origin(code=one.about["code"], maps=())
-        codes[origin.code_digest] = origin.code
+    rows = pd.concat([unit_rows(one) for _, one in finished], ignore_index=True)
+    table = pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
+    with replacing(folder / EPISODES) as partial:
+        pq.write_table(table, partial)
+    codes = {code_digest(one.about["code"]): one.about["code"] for _, one in finished}
     known = {"codes": codes, "reused": reused, "tables": {EPISODES: _digest_of_file(folder / EPISODES)}}
     if {name: about.get(name) for name in known} != known:
         write_run(folder, {**about, **known})
@@ -284,32 +276,47 @@ def write_errors(folder: Path, finished: Iterable[tuple[Unit, Finished]]) -> Non
         (folder / ERRORS).unlink(missing_ok=True)
 
 
-def _merge(path: Path, tables: Iterable[pa.Table]) -> None:
-    with replacing(path) as partial:
-        writer = None
-        for table in tables:
-            writer = writer or pq.ParquetWriter(partial, table.schema)
-            writer.write_table(table.cast(writer.schema))
-        if writer is not None:
-            writer.close()
-
-
 def unit_rows(finished: Finished) -> pd.DataFrame:
     """Reads the rows of a finished unit."""
-    return _episode_table(finished.path).to_pandas()
+    return pq.read_table(finished.path, partitioning=None).to_pandas()
 
 
-def _episode_table(path: Path) -> pa.Table:
-    rows = pq.read_table(path, partitioning=None).to_pandas()
-    return pa.Table.from_pandas(rows, preserve_index=False).replace_schema_metadata(None)
+def differences(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFrame, pd.Index]:
+    """What differs between two tables of episodes, bit for bit, in columns of results that both have.
+
+    Args:
+        first: rows of episodes, in any order.
+        second: as well.
+
+    Returns:
+        The cells that differ, in the order of the first: `first`, `second`, by `KEYS` and the column's name. And the
+        keys of episodes that one of the tables lacks.
+    """
+    common = _results(first) & _results(second)
+    one, other = (rows.set_index(KEYS)[sorted(common, key=list(first).index)] for rows in (first, second))
+    both = one.index.intersection(other.index, sort=False)
+    cells = one.loc[both].compare(other.loc[both], result_names=("first", "second"))
+    lacking = one.index.symmetric_difference(other.index, sort=False)
+    return cells.stack(level=0, future_stack=True).dropna(how="all"), lacking
+
+
+def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:
+    """Columns of results that only one of two tables has."""
+    return sorted(_results(first) ^ _results(second))
+
+
+def _results(rows: pd.DataFrame) -> set[str]:
+    """Columns of results: no wall times, and not the digest of the code."""
+    return {name for name in rows if name not in (*KEYS, "code") and not name.startswith("planning_")}
 
 
 def _trace(unit: Unit, finished: Finished, folder: Path) -> str:
     about = finished.about
     if not about["traceback"] and not about["errors"]:
         return ""
-    labels = ", ".join(f"{name} {label}" for name, label in unit.condition.labels.items())
     maps = f"maps {unit.maps[0]}–{unit.maps[-1]}"
     place = finished.path.relative_to(folder)
-    heading = f"{labels}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({place})"
+    heading = (
+        f"{unit.condition.description}, seed {unit.seed}, realisation {unit.realisation}, {maps} ({place})"
+    )
     return "\n".join([heading, *about["errors"], about["traceback"]])

@@ -29,7 +29,7 @@ from benchnav.core.shipped import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.experiment.condition import PART_KINDS, Condition
+from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import read_config
 from benchnav.models.predictor import find_checkpoint, model_identity
@@ -57,16 +57,16 @@ class Origin:
     code: Code
     maps: tuple[str, ...]
 
-    @property
-    def code_digest(self) -> str:
-        """Digest of the code, 12 hexadecimal digits."""
-        return text_digest(self.code)[:12]
-
     def key(self, unit: Unit) -> str:
         """The key of a unit that is made so, 16 hexadecimal digits."""
         return text_digest([unit.condition.id, unit.seed, unit.realisation, unit.maps, self.maps, self.code])[
             :16
         ]
+
+
+def code_digest(code: Code) -> str:
+    """Digest of code, 12 hexadecimal digits."""
+    return text_digest(code)[:12]
 
 
 class Origins:
@@ -88,8 +88,7 @@ class Origins:
             "planner_limit_s": planner_limit_s,
         }
         self._codes: dict[str, Code] = {}
-        self._maps: dict[tuple[str, str], list[str]] = {}
-        self._meanings: dict[tuple[str, str], str] = {}
+        self._maps: dict[tuple[str, str], list[str]] = {}  # a digest of what they mean, and one of each
 
     def of(self, unit: Unit) -> Origin:
         """The origin of a unit that is made now."""
@@ -97,11 +96,12 @@ class Origins:
         if condition.id not in self._codes:
             self._codes[condition.id] = {"environment": self._environment, **describe_parts(condition)}
         place = condition.data, condition.split
-        if len(self._maps.get(place, ())) <= unit.maps[-1]:
+        if len(self._maps.get(place, ())) <= unit.maps[-1] + 1:
             dataset = TerrainDataset(find_dataset(condition.data))
-            self._maps[place] = map_digests(dataset, condition.split, unit.maps[-1] + 1)
-            self._meanings[place] = dataset.about_digest(condition.split)
-        maps = (self._meanings[place], *(self._maps[place][i] for i in unit.maps))
+            digests = map_digests(dataset, condition.split, unit.maps[-1] + 1)
+            self._maps[place] = [dataset.about_digest(condition.split), *digests]
+        meaning, *digests = self._maps[place]
+        maps = (meaning, *(digests[i] for i in unit.maps))
         return Origin(code=self._codes[condition.id], maps=maps)
 
 
@@ -111,7 +111,7 @@ def describe_parts(condition: Condition) -> Code:
     for kind in PART_KINDS:
         part = getattr(condition, kind)
         name = f"{kind} {part.part}"
-        if kind == "model" and part.part not in registry.names("model") and ":" not in part.part:
+        if is_checkpoint(kind, part.part):
             parts[name] = text_digest(model_identity(part.part)["files"])
             family = read_config(find_checkpoint(part.part))["model"]
             modules.append(registry.find("model", family).target.__module__)
@@ -128,19 +128,17 @@ def describe_parts(condition: Condition) -> Code:
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
-    used: dict[str, dict[str, int]] = {}
+    used: dict[tuple[str, str], int] = {}
     for condition, extent in conditions.values():
-        splits = used.setdefault(condition.data, {})
-        splits[condition.split] = max(extent.maps, splits.get(condition.split, 0))
-    datasets = {data: TerrainDataset(find_dataset(data)) for data in used}
-    return {
-        data: {
-            "id": datasets[data].id,
-            "maps": {split: map_digests(datasets[data], split, count) for split, count in splits.items()},
-            "about": {split: datasets[data].about_digest(split) for split in splits},
-        }
-        for data, splits in used.items()
-    }
+        place = condition.data, condition.split
+        used[place] = max(extent.maps, used.get(place, 0))
+    described: dict[str, Any] = {}
+    for (data, split), count in used.items():
+        dataset = TerrainDataset(find_dataset(data))
+        about = described.setdefault(data, {"id": dataset.id, "maps": {}, "about": {}})
+        about["maps"][split] = map_digests(dataset, split, count)
+        about["about"][split] = dataset.about_digest(split)
+    return described
 
 
 def map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:

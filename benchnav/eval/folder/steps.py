@@ -17,7 +17,9 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import check_known
 from benchnav.core.store import replacing
+from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.folder import DamageError, damaged, metadata, open_run, with_metadata
 
@@ -39,8 +41,12 @@ def write_steps(folder: Path, unit: Unit, key: str, table: pa.Table) -> None:
         key: of the unit.
         table: from `step_table`.
     """
-    with replacing(folder / unit.steps_path) as partial:
-        pq.write_table(with_metadata(table, {"key": key}), partial, compression="zstd")
+    _write(folder / unit.steps_path, table, {"key": key})
+
+
+def _write(path: Path, table: pa.Table, about: Mapping[str, Any]) -> None:
+    with replacing(path) as partial:
+        pq.write_table(with_metadata(table, about), partial, compression="zstd")
 
 
 def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
@@ -54,20 +60,15 @@ def align_steps(folder: Path, finished: Iterable[Unit]) -> None:
     """
     paths = [path for unit in finished if (path := folder / unit.steps_path).exists()]
     with damaged(folder / STEPS, _REMEDY):
-        _align(paths)
-
-
-def _align(paths: Sequence[Path]) -> None:
-    fields = {field.name: field for path in paths for field in pq.read_schema(path)}
-    names = [name for name in fields if name != LAST_COLUMN] + [LAST_COLUMN]
-    for path in paths:
-        if pq.read_schema(path).names == names:
-            continue
-        table = pq.read_table(path, partitioning=None)
-        none = pa.array(np.full(len(table), np.nan, np.float32))
-        full = {name: table[name] if name in table.column_names else none for name in names}
-        with replacing(path) as partial:
-            pq.write_table(with_metadata(pa.table(full), metadata(path)), partial, compression="zstd")
+        held = {path: pq.read_schema(path).names for path in paths}
+        every = dict.fromkeys(name for names in held.values() for name in names if name != LAST_COLUMN)
+        for path, names in held.items():
+            if names == [*every, LAST_COLUMN]:
+                continue
+            table = pq.read_table(path, partitioning=None)
+            none = pa.array(np.full(len(table), np.nan, np.float32))
+            full = {name: table[name] if name in names else none for name in [*every, LAST_COLUMN]}
+            _write(path, pa.table(full), metadata(path))
 
 
 def open_steps(folder: Path) -> ds.Dataset | None:
@@ -88,7 +89,7 @@ def open_steps(folder: Path) -> ds.Dataset | None:
 
 
 def rows_of(
-    folder: Path, source: ds.Dataset, columns: Sequence[str] | None, chosen: pc.Expression | None
+    folder: Path, source: ds.Dataset, columns: Sequence[str] | None, chosen: pc.Expression
 ) -> pd.DataFrame:
     """Reads steps.
 
@@ -96,15 +97,12 @@ def rows_of(
         folder: the run folder.
         source: its steps.
         columns: which; None for all.
-        chosen: of which rows; None for all.
+        chosen: of which rows.
 
     Raises:
         ConfigError: a file of them is damaged.
     """
     with damaged(folder / STEPS, _REMEDY):
-        for name in columns or _KEYS:
-            if name not in source.schema.names:
-                raise DamageError(f"no column {name}")
         for field in source.schema:
             fits = pa.types.is_integer if field.name in _KEYS else pa.types.is_floating
             if field.name in (*_KEYS, *_VALUES) and not fits(field.type):
@@ -127,39 +125,20 @@ def read_steps(folder: Path, **filters: Any) -> pd.DataFrame:
     Raises:
         ConfigError: the run has no steps, or nothing by that filter's name.
     """
-    run = open_run(folder)
-    wanted = {name: _several(value) for name, value in filters.items()}
-    wanted = _by_condition({i: condition.labels for i, (condition, _) in run.conditions.items()}, wanted)
-    source = open_steps(folder)
+    run, source = open_run(folder), open_steps(folder)
     if source is None:
         raise ConfigError(
             f"Expected a run with steps, got {folder} without any. Make them with `--record steps`."
         )
-    unknown = [name for name in wanted if name not in source.schema.names]
-    if unknown:
-        raise ConfigError(f"Expected filters among {', '.join(source.schema.names)}, got {unknown[0]!r}.")
-    chosen = None
-    for name, values in wanted.items():
-        own = ds.field(name).isin(pa.array(values, source.schema.field(name).type))
-        chosen = own if chosen is None else chosen & own
+    chosen = pc.scalar(True)
+    for name, value in filters.items():
+        values = list(value) if isinstance(value, list | tuple | set | range | np.ndarray) else [value]
+        if name in LABELS:
+            values = [i for i, (condition, _) in run.conditions.items() if condition.labels[name] in values]
+            name = "condition"
+        check_known("filters", name, source.schema.names)
+        chosen &= ds.field(name).isin(pa.array(values, source.schema.field(name).type))
     rows = rows_of(folder, source, None, chosen)
     order = [name for name in _ORDER if name in rows]
     rows = rows.sort_values(order, kind="stable", ignore_index=True)
     return rows[[*order, *(name for name in rows if name not in order)]]
-
-
-def _several(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple | set | range | np.ndarray) else [value]
-
-
-def _by_condition(
-    labels: Mapping[str, Mapping[str, str]], wanted: Mapping[str, list[Any]]
-) -> dict[str, list[Any]]:
-    """Turns filters by labels into one by the conditions' ids."""
-    names = next(iter(labels.values()))
-    asked = {name: values for name, values in wanted.items() if name in names}
-    rest = {name: values for name, values in wanted.items() if name not in names}
-    fitting = [i for i, own in labels.items() if all(own[name] in values for name, values in asked.items())]
-    if asked:
-        rest["condition"] = [i for i in fitting if i in rest.get("condition", fitting)]
-    return rest

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,40 +13,41 @@ from benchnav.core.device import gpu_name
 from benchnav.core.errors import ConfigError
 from benchnav.core.registry import NO_DEFAULT, Part
 from benchnav.core.store import Shard
-from benchnav.eval.experiment.condition import Condition, check_labels
+from benchnav.eval.experiment.condition import Condition, check_labels, differences
 from benchnav.eval.experiment.suite import Record
 from benchnav.eval.experiment.unit import Conditions
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import EPISODES, FORMAT, FORMAT_VERSION, RUN, Run, open_run, write_run
-from benchnav.eval.run.check import Say
+from benchnav.eval.folder.folder import (
+    EPISODES,
+    FORMAT,
+    FORMAT_VERSION,
+    RUN,
+    Run,
+    is_taken,
+    open_run,
+    write_run,
+)
+from benchnav.eval.run.check import Checked, Say
 from benchnav.eval.run.unit import Settings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Work:
-    """What a command asks of a run.
+class Work(Checked):
+    """What a command asks of a run, beside what of a suite is to be run.
 
     Args:
         suite: as it was written, for `run.json`.
-        conditions: by id, with how often each is to be run.
         record: what is kept of episodes beside their rows.
         settings: how units are run.
         shard: which shard of the units is run; None for all.
         reuse_code: whether finished units of other code count.
-        dropped: pairs of planner and robot that were left out, as `check.Checked` has them.
-        warnings: what readers of the results should know.
-        hypotheses: from `fix_hypotheses`; empty where there are none.
     """
 
     suite: Mapping[str, Any]
-    conditions: Conditions
     record: Record
     settings: Settings
     shard: Shard | None = None
     reuse_code: bool = False
-    dropped: tuple[Mapping[str, str], ...] = ()
-    warnings: tuple[str, ...] = ()
-    hypotheses: Mapping[str, Any] = field(default_factory=dict)
 
 
 def begin(work: Work, folder: Path, say: Say) -> Conditions:
@@ -56,7 +57,7 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
         ConfigError: the folder holds something else, or a run that this one cannot extend.
     """
     if not (folder / RUN).exists():
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if is_taken(folder):
             raise ConfigError(
                 f"Expected `out` to be a new folder or a run folder, but {folder} holds something else."
             )
@@ -81,7 +82,7 @@ def begin(work: Work, folder: Path, say: Say) -> Conditions:
 
 def drop(folder: Path) -> None:
     """Empties a run folder, which stays what it is: a link, another file system, the folder that the user is in."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if is_taken(folder):
         open_run(folder)  # Only what is a run folder may be dropped.
         place = folder.resolve()
         with TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.dropped-") as dropped:
@@ -115,11 +116,11 @@ def _in_words(shard: Shard | None) -> str:
 def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> dict[str, Any]:
     """What `run.json` is to hold, of which the folder may hold an earlier state."""
     known = earlier.get("conditions", {})
-    latencies = {i: {"latency": entry["latency"]} for i, entry in known.items() if "latency" in entry}
     entries = {
         condition_id: {
             **{"value": condition.value, "labels": condition.labels, **_notes(condition)},
-            **{"seeds": extent.seeds, "draws": extent.draws, **latencies.get(condition_id, {})},
+            **{"seeds": extent.seeds, "draws": extent.draws},
+            **{name: value for name, value in known.get(condition_id, {}).items() if name == "latency"},
         }
         for condition_id, (condition, extent) in conditions.items()
     }
@@ -156,21 +157,7 @@ def _notes(condition: Condition) -> dict[str, Any]:
 
 def changed_options(planner: Part) -> list[str]:
     """Options of a planner that differ from their defaults, as `name = value`, nested ones with dots."""
-    target = registry.find("planner", planner.part).target
-    known = registry.options_of("planner", target)
-    given = {name: option.default for name, option in known.items() if option.default is not NO_DEFAULT}
-    defaults = registry.complete(
-        "planner", Part(part=planner.part, label="", options={**planner.options, **given})
-    )
-    return _differences(defaults.options, planner.options)
-
-
-def _differences(defaults: Mapping[str, Any], values: Mapping[str, Any], prefix: str = "") -> list[str]:
-    found = []
-    for name, value in values.items():
-        default = defaults.get(name)
-        if isinstance(value, Mapping) and isinstance(default, Mapping):
-            found += _differences(default, value, f"{prefix}{name}.")
-        elif value != default:
-            found.append(f"{prefix}{name} = {value}")
-    return found
+    options = registry.options_of("planner", registry.find("planner", planner.part).target)
+    required = {n: planner.options[n] for n, option in options.items() if option.default is NO_DEFAULT}
+    defaults = registry.complete("planner", replace(planner, options=required)).options
+    return [f"{name} = {now}" for name, _, now in differences(defaults, planner.options)]

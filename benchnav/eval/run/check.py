@@ -11,20 +11,20 @@ import numpy as np
 import torch
 
 from benchnav.core import registry
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.settings import one_line
+from benchnav.core.settings import call, hint
 from benchnav.core.terrain import Grid, Observation
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.recipe.recipe import load_recipe, shipped_recipes
-from benchnav.eval.experiment.condition import PART_KINDS, Condition, conditions_of
+from benchnav.eval.experiment.condition import PART_KINDS, Condition, conditions_of, is_checkpoint
 from benchnav.eval.experiment.hypotheses import fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import BLOCK_MAPS, Extent
 from benchnav.eval.run.unit import noise_key, read_maps
 from benchnav.models.base import PrivilegedModel
 from benchnav.models.checkpoint import load_checkpoint
-from benchnav.models.predictor import class_mismatch, find_checkpoint
+from benchnav.models.predictor import class_mismatch, find_checkpoint, load_model
 from benchnav.planning.planners.planner import check_steers
 from benchnav.planning.problem import Task, pose_problem
 from benchnav.planning.world.realisation import check_known
@@ -61,41 +61,30 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         ConfigError: a part, scenario, map or combination cannot be had, or no planner can steer any robot.
         DatasetError: there is no such dataset.
     """
-    datasets: dict[str, TerrainDataset] = {}
-
-    def scenarios_of(data: str) -> list[str]:
-        if data not in datasets:
-            datasets[data] = TerrainDataset(find_dataset(data))
-        return [name.removeprefix("test/") for name in datasets[data].splits if name.startswith("test/")]
-
-    conditions = conditions_of(suite, scenarios_of)
+    builder = Builder(suite.all_seeds[0], suite.maps)
+    conditions = conditions_of(suite, builder.scenarios)
     if not conditions:
         raise ConfigError(
-            f"Expected a suite with at least one condition, got none; data has {scenarios_of(suite.data)}."
+            f"Expected a suite with at least one condition, got none; data has {builder.scenarios(suite.data)}."
         )
     for condition in conditions:
-        _check_split(condition, scenarios_of(condition.data), datasets[condition.data], suite.maps)
+        builder.check_split(condition, suite.maps)
     conditions, dropped = _steered(conditions)
     if elsewhere:
         check_everywhere(conditions)
-    builder = Builder(datasets, suite.all_seeds[0], suite.maps)
     for condition in conditions:
         builder.build(condition)
-    doubts = [line for condition in conditions for line in _doubts(condition, datasets[condition.data])]
-    wanted = {}
+    wanted, doubts = {}, []
     for condition in conditions:
-        count = datasets[condition.data].map_count(condition.split)
-        extent = Extent.product(suite.all_seeds, suite.realisations, suite.maps or count)
-        wanted[condition.id] = (condition, extent)
+        dataset = builder.dataset(condition.data)
+        doubts += _doubts(condition, dataset)
+        maps = suite.maps or dataset.map_count(condition.split)
+        wanted[condition.id] = (condition, Extent.product(suite.all_seeds, suite.realisations, maps))
     return Checked(
         conditions=wanted,
         dropped=tuple(dropped),
         warnings=tuple(dict.fromkeys([*builder.warnings, *doubts])),
-        hypotheses=fix_hypotheses(
-            suite.hypotheses,
-            {i: condition for i, (condition, _) in wanted.items()},
-            {i: extent.episodes for i, (_, extent) in wanted.items()},
-        ),
+        hypotheses=fix_hypotheses(suite.hypotheses, wanted),
     )
 
 
@@ -103,7 +92,6 @@ class Builder:
     """Builds conditions on the first map of their splits; what is the same in several is built once.
 
     Args:
-        datasets: those that are open, by path or id.
         seed: root seed of the draw of λ.
         maps: of each split; 0 for all.
 
@@ -111,11 +99,38 @@ class Builder:
         warnings: what readers of the results should know.
     """
 
-    def __init__(self, datasets: dict[str, TerrainDataset], seed: int, maps: int) -> None:
+    def __init__(self, seed: int, maps: int) -> None:
         """Has built nothing yet."""
-        self.datasets, self.seed, self.maps = datasets, seed, maps
+        self.seed, self.maps = seed, maps
         self.warnings: list[str] = []
+        self._datasets: dict[str, TerrainDataset] = {}
         self._seen: set[str] = set()
+
+    def dataset(self, data: str) -> TerrainDataset:
+        """A dataset by path or id, which is opened once."""
+        if data not in self._datasets:
+            self._datasets[data] = TerrainDataset(find_dataset(data))
+        return self._datasets[data]
+
+    def scenarios(self, data: str) -> list[str]:
+        """The scenarios of a dataset's test splits."""
+        splits = self.dataset(data).splits
+        return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
+
+    def check_split(self, condition: Condition, maps: int) -> None:
+        """Refuses a scenario that a dataset lacks, and more maps than it has."""
+        dataset, known = self.dataset(condition.data), self.scenarios(condition.data)
+        if condition.scenario not in known:
+            raise ConfigError(
+                f"Expected `scenarios` among {known} of {dataset.path}, got {condition.scenario!r}."
+                f"{hint(condition.scenario, known)}{_make_all(dataset, condition.split, 1)}"
+            )
+        count = dataset.map_count(condition.split)
+        if maps > count:
+            raise ConfigError(
+                f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {maps}. "
+                f"0 takes all.{_make_all(dataset, condition.split, maps)}"
+            )
 
     def build(self, condition: Condition) -> None:
         """Builds a condition.
@@ -123,9 +138,7 @@ class Builder:
         Raises:
             BenchnavError: it cannot be run.
         """
-        if condition.data not in self.datasets:
-            self.datasets[condition.data] = TerrainDataset(find_dataset(condition.data))
-        dataset, task = self.datasets[condition.data], condition.make_task()
+        dataset, task = self.dataset(condition.data), condition.make_task()
         if self._is_new("planner", condition.planner, condition.robot, condition.objective):
             _check_planner(condition, task)
         place = condition.data, condition.split
@@ -148,20 +161,6 @@ class Builder:
         return new
 
 
-def _check_split(condition: Condition, known: list[str], dataset: TerrainDataset, maps: int) -> None:
-    if condition.scenario not in known:
-        raise ConfigError(
-            f"Expected `scenarios` among {known} of {dataset.path}, got {condition.scenario!r}."
-            f"{registry.hint(condition.scenario, known)}{_make_all(dataset, condition.split, 1)}"
-        )
-    there = dataset.map_count(condition.split)
-    if maps > there:
-        raise ConfigError(
-            f"Expected `maps` at most {there}, the maps of {condition.split} in {dataset.path}, "
-            f"got {maps}. 0 takes all.{_make_all(dataset, condition.split, maps)}"
-        )
-
-
 def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
     """How to make the maps that a file lacks, where its shipped recipe has them."""
     if dataset.id not in shipped_recipes():
@@ -174,19 +173,25 @@ def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:
 
 def _steered(conditions: list[Condition]) -> tuple[list[Condition], list[dict[str, str]]]:
     """The conditions in which the planner can steer the robot, and the pairs in which it cannot."""
-    unfit: dict[str, dict[str, str]] = {}
-    pairs = {repr([condition.planner, condition.robot]): condition for condition in conditions}
-    for pair, condition in pairs.items():
-        planner, robot = condition.planner.label, condition.robot.label
-        task, made = condition.make_task(), condition.make_planner()
-        try:
-            check_steers(made, task.robot, planner)
-        except ConfigError as error:
-            unfit[pair] = {"planner": planner, "robot": robot, "reason": str(error)}
-    left = [one for one in conditions if repr([one.planner, one.robot]) not in unfit]
+    reasons: dict[tuple[str, str], str] = {}
+    for condition in conditions:
+        pair = condition.planner.label, condition.robot.label
+        if pair not in reasons:
+            task, planner = condition.make_task(), condition.make_planner()
+            try:
+                check_steers(planner, task.robot, condition.planner.label)
+                reasons[pair] = ""
+            except ConfigError as error:
+                reasons[pair] = str(error)
+    left = [one for one in conditions if not reasons[one.planner.label, one.robot.label]]
     if not left:
-        raise ConfigError(next(iter(unfit.values()))["reason"])
-    return left, list(unfit.values())
+        raise ConfigError(next(iter(reasons.values())))
+    dropped = [
+        {"planner": planner, "robot": robot, "reason": reason}
+        for (planner, robot), reason in reasons.items()
+        if reason
+    ]
+    return left, dropped
 
 
 def _check_planner(condition: Condition, task: Task) -> None:
@@ -198,16 +203,17 @@ def _check_planner(condition: Condition, task: Task) -> None:
     ones = torch.ones_like(ground).unsqueeze(1)
     mixture = TraversabilityMixture(ones, 0.9 * ones, 0 * ones)
     places = torch.tensor([[0.5, 0.5]]), torch.tensor([[3.5, 3.5]])
-    try:
+
+    def prepare() -> None:
         problem = pose_problem(task, seen, mixture, ground, *places, 1.0)
         condition.make_planner().init(problem, torch.Generator())
-    except BenchnavError:
-        raise
-    except Exception as error:
-        raise ConfigError(
-            f"Planner {condition.planner.label!r} cannot be prepared for robot {condition.robot.label!r} and objective "
-            f"{condition.objective.label!r}: {one_line(error)}"
-        ) from error
+
+    labels = condition.labels
+    call(
+        f"Planner {labels['planner']!r} for robot {labels['robot']!r} and objective {labels['objective']!r}",
+        prepare,
+        {},
+    )
 
 
 def _check_known_ground(condition: Condition, dataset: TerrainDataset, maps: int) -> None:
@@ -238,14 +244,15 @@ def _late(condition: Condition, task: Task, dataset: TerrainDataset, maps: int) 
 
 def _check_model(condition: Condition, dataset: TerrainDataset) -> list[str]:
     """Loads the model, which may refuse; tells of another class table, and refuses single-class where it has none."""
-    part, model = condition.model.part, condition.make_model()
+    part = condition.model.part
+    model: Any = load_model(condition.model)
     knows_classes = bool(model.class_names) or isinstance(model, PrivilegedModel)
     if condition.risk.part == "single-class" and not knows_classes:
         raise ConfigError(
             f"Expected a model that tells classes for the risk setting 'single-class', got {condition.model.label!r}, "
             "which has no `class_names`."
         )
-    if ":" not in part and part not in registry.names("model"):
+    if is_checkpoint("model", part):
         model = load_checkpoint(find_checkpoint(part))  # which has a class table in any case
     line = class_mismatch(model, dataset.recipe, f"model {condition.model.label}")
     return [line] if line else []
@@ -260,8 +267,7 @@ def check_everywhere(conditions: Iterable[Condition]) -> None:
     for condition in conditions:
         for kind in PART_KINDS:
             source = getattr(condition, kind).part
-            known = kind != "model" or source in registry.names("model") or ":" in source
-            if known and not registry.find(kind, source).everywhere:
+            if not is_checkpoint(kind, source) and not registry.find(kind, source).everywhere:
                 raise ConfigError(
                     f"Expected {kind} {source!r} to be found by other processes, which `jobs` > 1, "
                     "`scheduler` and `planner_limit_s` need, but it is registered in this one alone. Name it as "

@@ -6,6 +6,7 @@ the planner's, robot's and objective's parts by name first, so that what they ar
 
 import multiprocessing
 import pickle
+import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -21,8 +22,8 @@ from benchnav.planning.problem import Problem
 _START_S = 120.0
 
 
-class TimeLimitError(BenchnavError):
-    """A planner did not answer in time, or its process ended."""
+class PlannerProcessError(BenchnavError):
+    """A planner did not answer in time, or its process ended, or it raised: its last line, its traceback as a note."""
 
 
 class IsolatedPlanner(Planner[int]):
@@ -44,16 +45,12 @@ class IsolatedPlanner(Planner[int]):
         self._child.start()
         there.close()
         try:
-            self._answer("start", _START_S)
+            self._ask(_START_S, "start")
         except BaseException:
-            self.__exit__()
+            self.close()
             raise
 
-    def __enter__(self) -> "IsolatedPlanner":
-        """Ends the child at the end."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Ends the child."""
         self._child.kill()
         self._child.join()
@@ -61,57 +58,43 @@ class IsolatedPlanner(Planner[int]):
 
     def init(self, problem: Problem, generator: torch.Generator) -> int:
         """See `Planner`. The plan state stays in the child; here it is the number of calls."""
-        self._send(("init", problem, generator.initial_seed(), generator.get_state()))
-        self._answer("init", self.limit_s + _START_S)
+        seed, state = generator.initial_seed(), generator.get_state()
+        self._ask(self.limit_s + _START_S, "init", problem, seed, state)
         return 0
 
     def plan(self, step: Step, plan_state: int) -> tuple[torch.Tensor, int, Plan]:
         """See `Planner`."""
-        self._send(("plan", step))
         # The first call may compile.
         limit_s = self.limit_s if plan_state else self.limit_s + _START_S
-        action, plan, self.compiled = self._answer("plan", limit_s)
+        action, plan, self.compiled = self._ask(limit_s, "plan", step)
         return action, plan_state + 1, plan
 
-    def _send(self, message: Any) -> None:
-        self._here.send_bytes(pickle.dumps(message))
-
-    def _answer(self, what: str, limit_s: float) -> Any:
+    def _ask(self, limit_s: float, call: str, *arguments: Any) -> Any:
         try:
+            self._here.send_bytes(pickle.dumps((call, *arguments)))
             if not self._here.poll(limit_s):
                 self._child.kill()
-                raise TimeLimitError(f"The planner gave no answer to `{what}` within {limit_s:g} s.")
+                raise PlannerProcessError(f"The planner gave no answer to `{call}` within {limit_s:g} s.")
             kind, value = pickle.loads(self._here.recv_bytes())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self._child.join(1)
-            raise TimeLimitError(
-                f"The planner's process ended in `{what}` with status {self._child.exitcode}."
+            raise PlannerProcessError(
+                f"The planner's process ended in `{call}` with status {self._child.exitcode}."
             ) from error
         if kind == "lost":
             raise gpu_failed(value)
         if kind == "raised":
-            raised = ChildError(value.strip().splitlines()[-1])
+            raised = PlannerProcessError(value.strip().splitlines()[-1])
             raised.add_note(value)
             raise raised
         return value
 
 
-class ChildError(BenchnavError):
-    """What a planner raised in its process: its last line, and the child's traceback as a note."""
-
-
 def _serve(connection: Connection, condition: Condition) -> None:
-    import traceback
-
+    """Answers calls of the planner until nobody asks any more."""
     torch.set_num_threads(1)
+    planner: Any = None
     plan_state: Any = None
-    try:
-        condition.make_task()
-        planner = condition.make_planner()
-        connection.send_bytes(pickle.dumps(("started", None)))
-    except (Exception, SystemExit):
-        connection.send_bytes(pickle.dumps(("raised", traceback.format_exc())))
-        return
     while True:
         try:
             message = connection.recv_bytes()
@@ -119,12 +102,14 @@ def _serve(connection: Connection, condition: Condition) -> None:
             return
         try:
             call, *arguments = pickle.loads(message)
-            if call == "init":
+            if call == "start":
+                condition.make_task()
+                planner, answer = condition.make_planner(), None
+            elif call == "init":
                 problem, seed, state = arguments
                 generator = torch.Generator().manual_seed(seed)
                 generator.set_state(state)
-                plan_state = planner.init(problem, generator)
-                answer: Any = None
+                plan_state, answer = planner.init(problem, generator), None
             else:
                 action, plan_state, plan = planner.plan(arguments[0], plan_state)
                 answer = action, plan, planner.compiled

@@ -5,7 +5,7 @@ prepares and perhaps compiles, and is not counted; each later one is, with whate
 """
 
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,6 @@ from benchnav.eval.run.unit import Settings, build, one_thread, simulate
 
 _MOST_STEPS = 100
 _MOST_S = 3.0
-
-_FACTORS = ("planner", "robot", "objective")
 
 
 def measure_latencies(folder: Path, chosen: Collection[str], settings: Settings) -> None:
@@ -36,26 +34,21 @@ def measure_latencies(folder: Path, chosen: Collection[str], settings: Settings)
     """
     run = open_run(folder)
     entries = run.about["conditions"]
-    found: dict[str, dict[str, Any] | None] = {}
-    for condition_id in chosen:
-        if "latency" in entries[condition_id]:
-            found[_key(run.conditions[condition_id][0])] = entries[condition_id]["latency"]
-    changed = False
-    for condition_id, (condition, extent) in run.conditions.items():
-        if condition_id not in chosen or "latency" in entries[condition_id]:
-            continue
-        if _key(condition) not in found:
-            found[_key(condition)] = _measure(condition, extent, settings)
-        if latency := found[_key(condition)]:
-            entries[condition_id]["latency"] = latency
-            changed = True
-    if changed:
+    own = [i for i in run.conditions if i in chosen]
+    known = {_key(entries[i]): entries[i]["latency"] for i in own if "latency" in entries[i]}
+    missing = [i for i in own if "latency" not in entries[i]]
+    for condition_id in missing:
+        entry = entries[condition_id]
+        if _key(entry) not in known:
+            known[_key(entry)] = _measure(*run.conditions[condition_id], settings)
+        if latency := known[_key(entry)]:
+            entry["latency"] = latency
+    if missing:
         write_run(folder, run.about)
 
 
-def _key(condition: Condition) -> str:
-    value = condition.value
-    return repr([value[name] for name in _FACTORS])
+def _key(entry: Mapping[str, Any]) -> str:
+    return repr([entry["value"][name] for name in ("planner", "robot", "objective")])
 
 
 def _measure(condition: Condition, extent: Extent, settings: Settings) -> dict[str, Any] | None:

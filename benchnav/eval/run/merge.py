@@ -6,29 +6,30 @@ Units are files that are known by what made them, so that merging is copying the
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_place
+from benchnav.eval.experiment.condition import label_words
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import (
     RUN,
     Finished,
     Run,
+    differences,
     find_units,
     finish_run,
+    is_taken,
     open_run,
     unit_rows,
     write_run,
 )
-from benchnav.eval.folder.sameness import differences
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.run.driven_ground import keep_ground
-
-_COPIED = ("units", "steps", "playback")
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:
@@ -44,37 +45,47 @@ def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int
         ConfigError: a part is no shard, the parts are not of one run, or units are missing; nothing is written.
     """
     with sole_writer(folder, str(folder)):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if is_taken(folder):
             raise ConfigError(
                 f"Expected `out` to be a new folder, got {folder}, which is there. Write `benchnav-eval merge OUT PART "
                 "…`, with the new folder first."
             )
         runs = [_open_shard(part) for part in parts]
-        of = _check_alike(runs)
+        _check_alike(runs)
         every = in_table_order(units(runs[0].conditions), runs[0].conditions)
-        found = [(unit, _find(unit, runs)) for unit in every]
-        _check_whole([unit for unit, finished in found if finished is None], runs, of)
-        _check_one_code([finished for _, finished in found if finished is not None])
+        makings = [(unit, _find(unit, runs)) for unit in every]
+        _check_whole([unit for unit, finished in makings if finished is None], runs)
+        found = [(unit, finished) for unit, finished in makings if finished is not None]
+        for (_, earlier), (_, now) in pairwise(found):
+            if changed := provenance.code_differences(earlier.about["code"], now.about["code"]):
+                raise ConfigError(
+                    f"Expected shards that one code has made, but {earlier.path} and {now.path} differ in "
+                    f"{'; '.join(changed)}. Give the commands of the shards again, by one code."
+                )
         target = folder.resolve()
         partial = new_folder(target)
         write_run(partial, _about(runs))
         yield 0, len(every)
-        for done, (unit, finished) in enumerate(found, start=1):
-            if finished is not None:
-                _copy(finished.path, partial / "units" / unit.condition.id / finished.path.name)
-            yield done, len(every)
-        for run in runs:
-            for path in sorted(path for kind in _COPIED[1:] for path in (run.folder / kind).rglob("*")):
-                if path.is_file() and not path.name.startswith("."):
-                    _copy(path, partial / path.relative_to(run.folder))
+        copied = []
+        for unit, finished in found:
+            path = partial / "units" / unit.condition.id / finished.path.name
+            _copy(finished.path, path)
+            copied.append((unit, replace(finished, path=path)))
+            yield len(copied), len(every)
+        for source in [run.folder / kind for run in runs for kind in ("steps", "playback")]:
+            if source.exists():
+                hidden = shutil.ignore_patterns(".*")
+                shutil.copytree(
+                    source, partial / source.name, ignore=hidden, copy_function=_copy, dirs_exist_ok=True
+                )
         align_steps(partial, every)
-        finish_run(partial, [(unit, find_units(partial, unit)[0]) for unit in every])
+        finish_run(partial, copied)
         keep_ground(partial)
         take_place(partial, target, last=RUN)
 
 
-def _copy(source: Path, target: Path) -> None:
-    with replacing(target) as partial:
+def _copy(source: str | Path, target: str | Path) -> None:
+    with replacing(Path(target)) as partial:
         shutil.copyfile(source, partial)
 
 
@@ -88,78 +99,60 @@ def _open_shard(part: Path) -> Run:
     return run
 
 
-def _check_alike(runs: Sequence[Run]) -> int:
-    """Refuses shards of different runs, with all that differs; gives how many shards the run has."""
+def _check_alike(runs: Sequence[Run]) -> None:
+    """Refuses shards of different runs, with all that differs."""
     if not runs:
         raise ConfigError("Expected one or more `parts`, folders of shards, got none.")
-    first = runs[0]
-    reasons = []
-    for run in runs[1:]:
-        unlike = _unlike_conditions(first, run)
-        unlike += provenance.dataset_differences(first.about["datasets"], run.about["datasets"])
-        if run.about.get("hypotheses") != first.about.get("hypotheses"):
-            unlike.append("hypotheses")
-        if _shard(run).of != _shard(first).of:
-            unlike.insert(0, f"number of shards ({_shard(first).of} to {_shard(run).of})")
-        if unlike:
-            reasons.append(f"{run.folder}: {'; '.join(unlike)}")
+    reasons = [f"{run.folder}: {'; '.join(unlike)}" for run in runs[1:] if (unlike := _unlike(runs[0], run))]
     if reasons:
         raise ConfigError(
-            f"Expected shards of one run, but these differ from {first.folder} in what is named: "
+            f"Expected shards of one run, but these differ from {runs[0].folder} in what is named: "
             f"{'. '.join(reasons)}. Give one command, of one code and data, for each of the shards."
         )
-    return _shard(first).of
 
 
-def _check_one_code(finished: Sequence[Finished]) -> None:
-    """Refuses units of one run that different code has made, but for what was taken as such."""
-    for earlier, now in pairwise(finished):
-        changed = provenance.code_differences(earlier.about["code"], now.about["code"])
-        if changed:
-            raise ConfigError(
-                f"Expected shards that one code has made, but {earlier.path} and {now.path} differ in "
-                f"{'; '.join(changed)}. Give the commands of the shards again, by one code."
-            )
-
-
-def _unlike_conditions(first: Run, other: Run) -> list[str]:
-    """Names the conditions that are not the same in two runs, or not run as often."""
+def _unlike(first: Run, other: Run) -> list[str]:
+    """Names what is not the same in two runs: the number of shards, conditions, how often they are run, and maps."""
     lines = []
+    if _shard(other).of != _shard(first).of:
+        lines.append(f"number of shards ({_shard(first).of} to {_shard(other).of})")
     for lacking, having in ((other, first), (first, other)):
         names = [
-            _name(condition) for i, (condition, _) in having.conditions.items() if i not in lacking.conditions
+            " ".join(label_words(condition.labels))
+            for i, (condition, _) in having.conditions.items()
+            if i not in lacking.conditions
         ]
         if names:
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
             lines.append(f"conditions that {lacking.folder} lacks ({', '.join(names[:3])}{more})")
-    both = [i for i in first.conditions if i in other.conditions]
-    if any(first.conditions[i][0].labels != other.conditions[i][0].labels for i in both):
+    both = [(run, other.conditions[i]) for i, run in first.conditions.items() if i in other.conditions]
+    if any(one.labels != another.labels for (one, _), (another, _) in both):
         lines.append("labels of conditions")
-    if any(set(first.conditions[i][1].draws) != set(other.conditions[i][1].draws) for i in both):
+    if any(set(one.draws) != set(another.draws) for (_, one), (_, another) in both):
         lines.append("seeds, realisations or maps")
+    lines += provenance.dataset_differences(first.about["datasets"], other.about["datasets"])
+    if other.about.get("hypotheses") != first.about.get("hypotheses"):
+        lines.append("hypotheses")
     return lines
-
-
-def _name(condition: Any) -> str:
-    return " ".join(condition.labels[name] for name in ("scenario", "world", "planner", "model", "risk"))
 
 
 def _find(unit: Unit, runs: Sequence[Run]) -> Finished | None:
     """A finished unit of some runs, the newest of each; refuses one that came out differently in two."""
     found = [makings[0] for run in runs if (makings := find_units(run.folder, unit))]
     for other in found[1:]:
-        if differences(unit_rows(found[0]), unit_rows(other)):
+        if len(differences(unit_rows(found[0]), unit_rows(other))[0]):
             raise ConfigError(
-                f"Expected the same rows wherever a unit is, but {unit.name} ({_name(unit.condition)}) differs between "
-                f"{found[0].path} and {other.path}. Leave one of them out."
+                f"Expected the same rows wherever a unit is, but {unit.name} ({unit.condition.description}) differs "
+                f"between {found[0].path} and {other.path}. Leave one of them out."
             )
     return found[0] if found else None
 
 
-def _check_whole(missing: Sequence[Unit], runs: Sequence[Run], of: int) -> None:
+def _check_whole(missing: Sequence[Unit], runs: Sequence[Run]) -> None:
     """Refuses a run that is not whole, and says which shards are to be run."""
     if not missing:
         return
+    of = _shard(runs[0]).of
     counts = Counter(unit.shard(of).index for unit in missing)
     folders = {_shard(run).index: run.folder for run in runs}
     named = []
@@ -175,18 +168,14 @@ def _check_whole(missing: Sequence[Unit], runs: Sequence[Run], of: int) -> None:
 def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     """`run.json` of the whole: that of the first shard, with what was measured, said and commanded of all."""
     about = {name: value for name, value in runs[0].about.items() if name != "shard"}
-    conditions = {i: dict(entry) for i, entry in about["conditions"].items()}
-    for run in runs:
-        for condition_id, entry in run.about["conditions"].items():
-            if "latency" in entry:
-                conditions[condition_id].setdefault("latency", entry["latency"])
-    joined: dict[str, list[Any]] = {
-        name: provenance.join(*(run.about.get(name, ()) for run in runs))
-        for name in ("warnings", "dropped", "history")
-    }
-    commands = provenance.command_lines(provenance.join(*(run.about["commands"] for run in runs)))
-    history = provenance.extend_history(joined["history"], about["suite"])
-    return {**about, **joined, "conditions": conditions, "commands": commands, "history": history}
+    entries = {i: [run.about["conditions"][i] for run in reversed(runs)] for i in runs[0].conditions}
+    # They are alike but for latencies, which only those shards have that measured them.
+    about["conditions"] = {i: {k: v for entry in own for k, v in entry.items()} for i, own in entries.items()}
+    for name in ("warnings", "dropped", "history", "commands"):
+        about[name] = provenance.join(*(run.about[name] for run in runs))
+    about["commands"] = provenance.command_lines(about["commands"])
+    about["history"] = provenance.extend_history(about["history"], about["suite"])
+    return about
 
 
 def _shard(run: Run) -> Shard:

@@ -4,52 +4,37 @@ What is repeated are the conditions of `run.json`, each as often as it was run, 
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.store import sole_writer
-from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import EPISODES, RUN, Run, find_units, open_run, read_table
-from benchnav.eval.folder.sameness import KEYS, Difference, differences, differing_columns
+from benchnav.eval.folder.folder import (
+    EPISODES,
+    KEYS,
+    RUN,
+    Run,
+    differences,
+    differing_columns,
+    find_units,
+    open_run,
+    read_table,
+)
 from benchnav.eval.run.begin import Work
 from benchnav.eval.run.check import Builder, Say, check_everywhere
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
 _SHOWN = 5
-
-
-@dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """How a run that was repeated came out.
-
-    Args:
-        episodes: how many were compared.
-        different: those that are not the same.
-        columns: those that only one of the two tables has.
-        lines: all that is to be told.
-    """
-
-    episodes: int
-    different: tuple[Difference, ...]
-    columns: tuple[str, ...]
-    lines: tuple[str, ...]
-
-    @property
-    def same(self) -> bool:
-        """Whether every row came out the same, in all columns of either table."""
-        return not self.different and not self.columns
 
 
 def rerun(
@@ -76,15 +61,10 @@ def rerun(
     run = _open(run_folder)
     if folder.resolve() == run_folder.resolve():
         raise ConfigError(f"Expected `out` to be another folder than the run that is repeated, got {folder}.")
-    if not overwrite:
-        _check_no_copy(run, folder)
+    if not overwrite and (folder / RUN).exists():
+        _check_repeats(run, folder)
     settings = Settings(planner_limit_s=run.about["planner_limit_s"], device=device_of_run(run.about).type)
     _check_there(run)
-    if not overwrite and (folder / RUN).exists() and set(open_run(folder).conditions) != set(run.conditions):
-        raise ConfigError(
-            f"Expected `out` to be new or an earlier rerun of {run_folder}, but {folder} has other conditions. Choose "
-            "another `out`."
-        )
     if jobs > 1 or scheduler or settings.planner_limit_s:
         check_everywhere(condition for condition, _ in run.conditions.values())
     work = Work(
@@ -100,26 +80,30 @@ def rerun(
         yield from run_work(work, folder, jobs, scheduler, overwrite, say)
 
 
-def compare(run_folder: Path, folder: Path) -> Comparison:
+def compare(run_folder: Path, folder: Path) -> tuple[bool, list[str]]:
     """Compares a run with its rerun, row by row.
 
     Args:
         run_folder: what was repeated.
         folder: what came out.
 
+    Returns:
+        Whether every row came out the same, in all columns of either table, and all that is to be told.
+
     Raises:
         ConfigError: one of them is not finished.
     """
     run, again = _open(run_folder), open_run(folder)
     first, second = read_table(run_folder, EPISODES), read_table(folder, EPISODES)
-    different, columns = differences(first, second), differing_columns(first, second)
-    conditions = {i: condition for i, (condition, _) in (*again.conditions.items(), *run.conditions.items())}
-    lines = [] if columns and not different else _verdict(conditions, len(first), different)
+    columns = differing_columns(first, second)
+    cells, lacking = differences(first, second)
+    same = not (len(cells) or len(lacking) or columns)
+    lines = [f"all {len(first)} rows came out the same"] if same else []
+    if len(cells) or len(lacking):
+        conditions = {i: one for i, (one, _) in (*again.conditions.items(), *run.conditions.items())}
+        lines += _verdict(conditions, len(first), cells, lacking)
     lines += [f"only one of the two tables has the column {name}" for name in columns]
-    lines += _environment(run.about, again.about)
-    return Comparison(
-        episodes=len(first), different=tuple(different), columns=tuple(columns), lines=tuple(lines)
-    )
+    return same, [*lines, _environment(run.about, again.about)]
 
 
 def _open(folder: Path) -> Run:
@@ -128,10 +112,15 @@ def _open(folder: Path) -> Run:
     return run
 
 
-def _check_no_copy(run: Run, folder: Path) -> None:
-    """Refuses a folder with units that were copied from the run: to compare a run with itself certifies nothing."""
-    every = units(run.conditions) if folder.is_dir() else []
-    copied = sum(bool(_makings(run.folder, unit) & _makings(folder, unit)) for unit in every)
+def _check_repeats(run: Run, folder: Path) -> None:
+    """Refuses a run that is no rerun: one of other conditions, or with units that were copied from the run itself."""
+    if set(open_run(folder).conditions) != set(run.conditions):
+        raise ConfigError(
+            f"Expected `out` to be new or an earlier rerun of {run.folder}, but {folder} has other conditions. Choose "
+            "another `out`."
+        )
+    every = units(run.conditions)
+    copied = len(_makings(run.folder, every) & _makings(folder, every))
     if copied:
         raise ConfigError(
             f"Expected `out` to be new or an earlier rerun of {run.folder}, but {copied} of the {len(every)} units in "
@@ -139,17 +128,17 @@ def _check_no_copy(run: Run, folder: Path) -> None:
         )
 
 
-def _makings(folder: Path, unit: Unit) -> set[str]:
-    """Tokens of all makings of a unit, which copies of it share."""
-    return {finished.about["made"] for finished in find_units(folder, unit)}
+def _makings(folder: Path, every: Sequence[Unit]) -> set[str]:
+    """Tokens of all makings of units, which copies of them share."""
+    return {finished.about["made"] for unit in every for finished in find_units(folder, unit)}
 
 
 def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
     lacking: dict[str, None] = {}
-    builder = Builder({}, seed=0, maps=1)
+    builder = Builder(seed=0, maps=1)
     for condition, extent in run.conditions.values():
-        for check in (partial(_check_maps, extent.maps), provenance.describe_parts):
+        for check in (partial(builder.check_split, maps=extent.maps), provenance.describe_parts):
             try:
                 check(condition)
             except BenchnavError as error:
@@ -162,57 +151,40 @@ def _check_there(run: Run) -> None:
         )
 
 
-def _check_maps(maps: int, condition: Condition) -> None:
-    count = TerrainDataset(find_dataset(condition.data)).map_count(condition.split)
-    if count < maps:
-        raise ConfigError(f"Expected {maps} maps of {condition.data} {condition.split}, got {count}.")
-
-
-def _verdict(conditions: Mapping[str, Condition], rows: int, different: list[Difference]) -> list[str]:
-    if not different:
-        return [f"all {rows} rows came out the same"]
-    counts = Counter(difference.episode[0] for difference in different)
+def _verdict(
+    conditions: Mapping[str, Condition], rows: int, cells: pd.DataFrame, lacking: pd.Index
+) -> list[str]:
+    """Which rows came out differently, the first of them with all that differs, and the greatest differences."""
+    differing: dict[tuple[Any, ...], list[str]] = {}
+    greatest: dict[str, float] = {}
+    for (*episode, name), (a, b) in zip(cells.index, cells.to_numpy(), strict=True):
+        differing.setdefault(tuple(episode), []).append(f"{name} {_text(a)} → {_text(b)}")
+        if isinstance(a, float) and isinstance(b, float) and not np.isnan(a - b):
+            greatest[name] = max(abs(a - b), greatest.get(name, 0.0))
+    differing |= {episode: ["in one of the tables alone"] for episode in lacking}
+    counts = Counter(condition_id for condition_id, *_ in differing)
     lines = [
-        f"{len(different)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:"
+        f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:",
+        *(
+            f"  {conditions[condition_id].description}: {count} rows"
+            for condition_id, count in counts.items()
+        ),
+        "first of them:",
     ]
-    for condition_id, count in counts.items():
-        lines.append(f"  {_label(conditions[condition_id])}: {count} rows")
-    lines.append("first of them:")
-    for difference in islice(different, _SHOWN):
-        condition_id, *place = difference.episode
+    for (condition_id, *place), values in list(differing.items())[:_SHOWN]:
         where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
-        lines.append(f"  {_label(conditions[condition_id])}, {where}: {_by_how_much(difference)}")
-    greatest = _greatest(different)
+        lines.append(f"  {conditions[condition_id].description}, {where}: {', '.join(values)}")
     if greatest:
-        lines.append(f"greatest differences: {', '.join(greatest)}")
+        gaps = ", ".join(f"{name} {value:.3g}" for name, value in greatest.items())
+        lines.append(f"greatest differences: {gaps}")
     return lines
-
-
-def _label(condition: Condition) -> str:
-    return ", ".join(f"{name} {label}" for name, label in condition.labels.items())
-
-
-def _by_how_much(difference: Difference) -> str:
-    if not difference.columns:
-        return "in one of the tables alone"
-    return ", ".join(f"{name} {_text(a)} → {_text(b)}" for name, (a, b) in difference.columns.items())
 
 
 def _text(value: object) -> str:
     return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
-def _greatest(different: list[Difference]) -> list[str]:
-    """The greatest difference of each column of numbers."""
-    greatest: dict[str, float] = {}
-    for difference in different:
-        for name, (a, b) in difference.columns.items():
-            if isinstance(a, float) and isinstance(b, float) and not pd.isna(a - b):
-                greatest[name] = max(abs(a - b), greatest.get(name, 0.0))
-    return [f"{name} {value:.3g}" for name, value in greatest.items()]
-
-
-def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """What differs between what two runs were made by, in words."""
     codes = zip(before["codes"].values(), now["codes"].values(), strict=False)
     changed = [line for pair in codes for line in provenance.code_differences(*pair)]
@@ -223,5 +195,5 @@ def _environment(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]
     if machines[0] != machines[1]:
         changed.append(f"machine ({machines[0]} to {machines[1]})")
     if not changed:
-        return ["nothing that is known of the environment differs"]
-    return [f"what differs in the environment: {'; '.join(dict.fromkeys(changed))}"]
+        return "nothing that is known of the environment differs"
+    return f"what differs in the environment: {'; '.join(dict.fromkeys(changed))}"

@@ -6,8 +6,10 @@ tensors until the end. Letters in shapes: B episodes, N steps, S state and A act
 """
 
 import itertools
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +19,6 @@ from torch import Tensor
 from benchnav.core.device import GPU_FAULTS, DeviceError, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.core.settings import one_line
-from benchnav.eval.run.clock import Clock
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
@@ -63,16 +64,50 @@ class Episodes:
     traceback: str = ""
 
 
+class Clock:
+    """Times calls one after another without waiting for a GPU: there, events of its own stream are read at the end.
+
+    Args:
+        device: where the calls compute.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        """Begins with nothing."""
+        self._on_gpu = device.type == "cuda"
+        self._seconds: list[float] = []
+        self._events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Times what is done within; what raises is not counted."""
+        if self._on_gpu:
+            begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            begin.record()
+            yield
+            end.record()
+            self._events.append((begin, end))
+        else:
+            began = time.perf_counter()
+            yield
+            self._seconds.append(time.perf_counter() - began)
+
+    def seconds(self) -> list[float]:
+        """The time of each call so far."""
+        if self._on_gpu:
+            torch.cuda.synchronize()
+            return [begin.elapsed_time(end) / 1e3 for begin, end in self._events]
+        return self._seconds
+
+
 class _Log:
     """What is kept of the steps while they are taken."""
 
-    def __init__(self, start: SimulationState, dt_s: float) -> None:
-        self.dt_s = dt_s
+    def __init__(self, start: SimulationState, problem: Problem) -> None:
+        self.dt_s = problem.dt_s
         self.states = [start.state]
-        self.actions: list[Tensor] = []
-        self.met: list[Tensor] = []
-        self.driven_m: list[Tensor] = []
-        self.turned: list[Tensor] = []
+        # Of each step actions, observed λ, and how far and by what turn rate ground of λ = 1 would have led.
+        none = start.state.new_zeros(len(start.state), 0)
+        self._steps = [[none[..., None].expand(-1, 0, len(problem.robot.action_low)), none, none, none]]
         self.clock = Clock(start.state.device)  # what is prepared, then each plan
         self.planned: list[int] = []
         self._reasons: list[str] = []
@@ -85,32 +120,28 @@ class _Log:
             self._reasons.append(reason)
         self._fault = torch.where(which, self._reasons.index(reason), self._fault)
 
-    def add(self, before: Tensor, after: SimulationState, action: Tensor, met: Tensor, free: Tensor) -> None:
+    def add(self, after: SimulationState, action: Tensor, met: Tensor, free: Tensor) -> None:
+        before = self.states[-1]
+        turned = (free[:, 2] - before[:, 2]) / self.dt_s
+        kept = action, met, distance(free, before[:, :2]), turned
+        self._steps.append([value.unsqueeze(1) for value in kept])
         self.states.append(after.state)
-        self.actions.append(action)
-        self.met.append(met)
-        self.driven_m.append(distance(free, before[:, :2]))
-        self.turned.append((free[:, 2] - before[:, 2]) / self.dt_s)
 
-    def episodes(self, now: SimulationState, actions: int, traceback_: str) -> Episodes:
-        track = torch.stack(self.states, dim=1)
-        none = track.new_zeros(len(track), 0)
-        driven = torch.stack(self.driven_m, dim=1) if self.actions else none
-        commanded = (
-            torch.stack(self.actions, dim=1) if self.actions else none[..., None].expand(-1, 0, actions)
-        )
+    def episodes(self, now: SimulationState, traceback_: str) -> Episodes:
+        track, taken = torch.stack(self.states, dim=1), len(self._steps) - 1
+        actions, met, driven, turned = (torch.cat(values, dim=1) for values in zip(*self._steps, strict=True))
         seconds = self.clock.seconds()
         return Episodes(
             states=track.cpu(),
-            actions=commanded.cpu(),
-            traversability=(torch.stack(self.met, dim=1) if self.actions else none).cpu(),
-            turn_rate_radps=(torch.stack(self.turned, dim=1) if self.actions else none).cpu(),
+            actions=actions.cpu(),
+            traversability=met.cpu(),
+            turn_rate_radps=turned.cpu(),
             outcome=tell_standstill(now.outcome, now.step, track[..., :2], driven, self.dt_s).cpu(),
             steps=now.step.cpu(),
             begin_s=seconds[0] if seconds else 0.0,
             # A planner that raised has no step for its last plan.
-            planning_s=torch.tensor(seconds[1 : len(self.actions) + 1], dtype=torch.float64),
-            planned=torch.tensor(self.planned[: len(self.actions)]),
+            planning_s=torch.tensor(seconds[1 : taken + 1], dtype=torch.float64),
+            planned=torch.tensor(self.planned[:taken]),
             errors=tuple("" if place < 0 else self._reasons[place] for place in self._fault.tolist()),
             traceback=traceback_,
         )
@@ -148,7 +179,7 @@ def run_episodes(
         DeviceError: the GPU failed.
     """
     now = simulation.init(problem.start)
-    log = _Log(now, problem.dt_s)
+    log = _Log(now, problem)
     observed = torch.full_like(now.state[:, 0], torch.nan)
     look_every = 1 if observed.device.type == "cpu" else _LOOK_EVERY
     trace = ""
@@ -175,9 +206,8 @@ def run_episodes(
             log.blame(now.running & faulty, answer.reason)
             now = end(now, faulty, Outcome.PLANNER_ERROR)
             now = end(now, status == PlanStatus.FAILED, Outcome.PLANNER_FAILURE)
-            before = now.state
             now, observed, free = _move(simulation, now, action)
-            log.add(before, now, action, observed, free)
+            log.add(now, action, observed, free)
     except (RobotError, DeviceError):
         raise
     except GPU_FAULTS as error:
@@ -186,7 +216,7 @@ def run_episodes(
         trace = traceback.format_exc() if bool(now.running.any()) else ""
         log.blame(now.running, fault(error))
         now = end(now, now.running, Outcome.PLANNER_ERROR)
-    return log.episodes(now, len(problem.robot.action_low), trace)
+    return log.episodes(now, trace)
 
 
 class _Batch:

@@ -70,7 +70,6 @@ def episode_rows(
         reference = float(reference_time_s[b]) / top_speed
         rows.append(
             {
-                **_named(unit, groups, b),
                 "outcome": outcome.name.lower(),
                 "success": success,
                 "total_time_s": end_time_s if success else float(problem.time_budget_s[b]),
@@ -88,7 +87,7 @@ def episode_rows(
                 "error": episodes.errors[b],
             }
         )
-    return pd.DataFrame(rows)
+    return _named(unit, groups).join(pd.DataFrame(rows))
 
 
 def error_rows(unit: Unit, groups: np.ndarray, time_budget_s: Tensor, error: str) -> pd.DataFrame:
@@ -97,22 +96,14 @@ def error_rows(unit: Unit, groups: np.ndarray, time_budget_s: Tensor, error: str
         **{"outcome": Outcome.MODEL_ERROR.name.lower(), "success": False, "end_time_s": 0.0, "score": 0.0},
         **{"rejected_draws": 0, "compiled": False, "error": error},
     }
-    rows = [
-        {**_named(unit, groups, b), **failed, "total_time_s": budget}
-        for b, budget in enumerate(time_budget_s.tolist())
-    ]
-    return pd.DataFrame(rows)
+    return _named(unit, groups).assign(**failed | {"total_time_s": time_budget_s.tolist()})
 
 
-def _named(unit: Unit, groups: np.ndarray, member: int) -> dict[str, Any]:
-    """What an episode is known by."""
+def _named(unit: Unit, groups: np.ndarray) -> pd.DataFrame:
+    """What episodes are known by, a row each."""
     condition = unit.condition
-    return {
-        "condition": condition.id,
-        **condition.labels,
-        **{"seed": unit.seed, "realisation": unit.realisation},
-        **{"map": unit.maps[member], "group": groups[member]},
-    }
+    draw = {"seed": unit.seed, "realisation": unit.realisation, "map": unit.maps, "group": groups}
+    return pd.DataFrame({"condition": condition.id, **condition.labels, **draw})
 
 
 def planning_times(episodes: Episodes, member: int) -> dict[str, float]:
@@ -164,26 +155,24 @@ def step_table(unit: Unit, problem: Problem, episodes: Episodes) -> pa.Table:
         `seed`, `realisation`, `map`, `step`, `time_s`, `x_m`, `y_m`, `heading_rad`, each action by its
         name, and `traversability` as met; actions and `traversability` are NaN at the last state.
     """
-    counts = [int(steps) + 1 for steps in episodes.steps]
-    step = np.concatenate([np.arange(count) for count in counts])
+    every, steps = np.arange(episodes.states.shape[1]), episodes.steps.numpy()[:, None]
+    inside = every <= steps
+    step = np.broadcast_to(every, inside.shape)[inside]
 
-    def stacked(values: Any, extra: bool) -> np.ndarray:
-        """One value a row; NaN at the last state of each episode where it has none."""
-        rows = []
-        for member, count in enumerate(counts):
-            own = values[member, : count if extra else count - 1].numpy().astype(np.float32)
-            rows.append(own if extra else np.append(own, np.float32(np.nan)))
-        return np.concatenate(rows)
+    def of_steps(values: Tensor) -> np.ndarray:
+        """One value a row, NaN at the last state of each episode."""
+        padded = np.pad(values.numpy().astype(np.float32), ((0, 0), (0, 1)))
+        return np.where(every < steps, padded, np.float32(np.nan))[inside]
 
     columns: dict[str, Any] = {
         "seed": np.full(len(step), unit.seed),
         "realisation": np.full(len(step), unit.realisation, np.int32),
-        "map": np.repeat(np.array(unit.maps, np.int32), counts),
+        "map": np.repeat(np.array(unit.maps, np.int32), inside.sum(1)),
         "step": step.astype(np.int32),
         "time_s": step * problem.dt_s,
     }
     for index, name in enumerate(("x_m", "y_m", "heading_rad")):
-        columns[name] = stacked(episodes.states[..., index], True)
+        columns[name] = episodes.states[..., index].numpy().astype(np.float32)[inside]
     for index, name in enumerate(problem.robot.action_names):
-        columns[name] = stacked(episodes.actions[..., index], False)
-    return pa.table(columns | {LAST_COLUMN: stacked(episodes.traversability, False)})
+        columns[name] = of_steps(episodes.actions[..., index])
+    return pa.table(columns | {LAST_COLUMN: of_steps(episodes.traversability)})

@@ -20,7 +20,7 @@ from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Suite
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder.folder import Finished, caveats, find_units, finish_run, write_errors
-from benchnav.eval.folder.provenance import Origin, code_differences
+from benchnav.eval.folder.provenance import Origin, Origins, code_differences
 from benchnav.eval.folder.steps import align_steps
 from benchnav.eval.run.begin import Work, begin, drop
 from benchnav.eval.run.check import Say, check_suite
@@ -28,8 +28,6 @@ from benchnav.eval.run.cluster import run_on_worker, store_files
 from benchnav.eval.run.driven_ground import keep_ground
 from benchnav.eval.run.latency import measure_latencies
 from benchnav.eval.run.unit import Settings, run_unit
-
-Task = tuple[Unit, Origin]
 
 
 def run_suite(
@@ -66,14 +64,11 @@ def run_suite(
     settings = Settings(planner_limit_s=planner_limit_s, device=find_device(device).type)
     with sole_writer(folder, str(folder)):
         checked = check_suite(suite, elsewhere=jobs > 1 or bool(scheduler) or planner_limit_s > 0)
-        for line in caveats({"warnings": checked.warnings, "dropped": checked.dropped}):
+        for line in caveats(vars(checked)):
             say(line)
         work = Work(
+            **vars(checked),
             suite=plain(suite),
-            conditions=checked.conditions,
-            dropped=checked.dropped,
-            warnings=checked.warnings,
-            hypotheses=checked.hypotheses,
             record=suite.record,
             settings=settings,
             shard=shard,
@@ -97,20 +92,22 @@ def run_work(
     every = units(conditions, work.record)
     own = [unit for unit in every if work.shard is None or unit.shard(work.shard.of) == work.shard]
     origins = work.settings.origins()
-    tasks = [(unit, origins.of(unit)) for unit in own]
-    missing = _missing(tasks, folder, work.reuse_code, say)
+    missing = _missing(own, origins, folder, work.reuse_code, say)
     done = len(own) - len(missing)
     if own:
         yield done, len(own)
     else:
         say(f"none of the {len(every)} units is in shard {work.shard}")
-    for _ in _run(missing, folder, work.settings, jobs, scheduler):
+    # Workers may be older than this call, so that they are told where names of files begin.
+    run = partial(run_on_worker, Path.cwd()) if scheduler else partial(_run_in, Path.cwd(), folder.resolve())
+    calls: list[Any] = [partial(run, unit, origin, work.settings) for unit, origin in missing]
+    for files in run_calls(calls, jobs, scheduler):
+        if scheduler:
+            store_files(folder, *files)
         done += 1
         yield done, len(own)
     measure_latencies(folder, {unit.condition.id for unit in own}, work.settings)
-    finished, reused = _finished(
-        [(unit, origins.of(unit)) for unit in in_table_order(own, conditions)], folder, work.reuse_code
-    )
+    finished, reused = _finished(in_table_order(own, conditions), origins, folder, work.reuse_code)
     if work.shard is not None:
         write_errors(folder, finished)
         return
@@ -119,31 +116,37 @@ def run_work(
     keep_ground(folder)
 
 
-def _missing(tasks: list[Task], folder: Path, reuse_code: bool, say: Say) -> list[Task]:
+def _run_in(here: Path, folder: Path, unit: Unit, origin: Origin, settings: Settings) -> None:
+    with chdir(here):
+        run_unit(unit, folder, origin, settings)
+
+
+def _missing(
+    own: list[Unit], origins: Origins, folder: Path, reuse_code: bool, say: Say
+) -> list[tuple[Unit, Origin]]:
     """What is to be run: units that are not finished, or not recorded as they are now to be."""
-    missing, again, other = [], 0, dict[str, None]()
-    unused = 0
-    for unit, origin in tasks:
-        known = find_units(folder, unit)
+    missing, again, unused = [], 0, 0
+    other: dict[str, None] = {}
+    for unit in own:
+        origin, known = origins.of(unit), find_units(folder, unit)
         counts = _counting(known, unit, origin, reuse_code)
-        if counts is not None and counts.has(unit):
-            continue
-        if counts is not None:
+        if counts is None:
+            missing.append((unit, origin))
+            if known:
+                unused += 1
+                other |= dict.fromkeys(_differences(known[0], origin))
+        elif not counts.has(unit):
             again += 1
             # With what it has kept, so that a run is never the poorer for being asked for more.
             record = max(unit.record, counts.about["record"], key=RECORDS.index)
-            unit = replace(unit, record=record)
-        elif known:
-            unused += 1
-            other |= dict.fromkeys(_differences(known[0], origin))
-        missing.append((unit, origin))
-    if done := len(tasks) - len(missing):
-        say(f"{done} of {len(tasks)} units were there already")
+            missing.append((replace(unit, record=record), origin))
+    if done := len(own) - len(missing):
+        say(f"{done} of {len(own)} units were there already")
     if again:
-        say(f"run again for recordings or steps that were not asked for: {again} of {len(tasks)} units")
+        say(f"run again for recordings or steps that were not asked for: {again} of {len(own)} units")
     if unused:
         say(
-            f"finished by other code or maps ({'; '.join(other)}), so not used: {unused} of {len(tasks)} units; "
+            f"finished by other code or maps ({'; '.join(other)}), so not used: {unused} of {len(own)} units; "
             "--reuse-code takes those of other code"
         )
     return missing
@@ -151,9 +154,13 @@ def _missing(tasks: list[Task], folder: Path, reuse_code: bool, say: Say) -> lis
 
 def _counting(known: list[Finished], unit: Unit, origin: Origin, reuse_code: bool) -> Finished | None:
     """The making of a unit that counts: that of the code and maps of now, else, if asked for, of other code."""
-    own = [finished for finished in known if finished.about["key"] == origin.key(unit)]
-    others = [finished for finished in known if finished.about["digests"] == list(origin.maps)]
-    return next(iter([*own, *(others if reuse_code else [])]), None)
+    key, maps = origin.key(unit), list(origin.maps)
+    counting = [
+        finished
+        for finished in known
+        if finished.about["key"] == key or (reuse_code and finished.about["digests"] == maps)
+    ]
+    return max(counting, key=lambda finished: finished.about["key"] == key, default=None)
 
 
 def _differences(finished: Finished, origin: Origin) -> list[str]:
@@ -162,35 +169,18 @@ def _differences(finished: Finished, origin: Origin) -> list[str]:
     return [*code_differences(finished.about["code"], origin.code), *maps]
 
 
-def _run(missing: list[Task], folder: Path, settings: Settings, jobs: int, scheduler: str) -> Iterator[None]:
-    """Runs units, here or on a cluster, yielding as each is in the run folder."""
-    here, place = Path.cwd(), folder.resolve()
-    if scheduler:
-        calls: list[Any] = [partial(run_on_worker, here, *task, settings) for task in missing]
-        for unit, files in run_calls(calls, scheduler=scheduler):
-            store_files(folder, unit, files)
-            yield
-        return
-    # Workers may be older than this call, so that they are told where names of files begin.
-    yield from run_calls(
-        [partial(_run_at, here, unit, place, origin, settings) for unit, origin in missing], jobs
-    )
-
-
-def _run_at(here: Path, unit: Unit, folder: Path, origin: Origin, settings: Settings) -> None:
-    with chdir(here):
-        run_unit(unit, folder, origin, settings)
-
-
-def _finished(tasks: list[Task], folder: Path, reuse_code: bool) -> tuple[list[tuple[Unit, Finished]], str]:
-    """The makings of all units that count, and a line on those of other code.
+def _finished(
+    own: list[Unit], origins: Origins, folder: Path, reuse_code: bool
+) -> tuple[list[tuple[Unit, Finished]], str]:
+    """The makings of all units that count, and a line on those of other code; empty where there are none.
 
     Raises:
         ConfigError: one is not there any more.
     """
-    found, differing = [], list[str]()
-    reused = 0
-    for unit, origin in tasks:
+    found, reused = [], 0
+    other: dict[str, None] = {}
+    for unit in own:
+        origin = origins.of(unit)
         counts = _counting(find_units(folder, unit), unit, origin, reuse_code)
         if counts is None:
             raise ConfigError(
@@ -200,11 +190,8 @@ def _finished(tasks: list[Task], folder: Path, reuse_code: bool) -> tuple[list[t
         found.append((unit, counts))
         if counts.about["key"] != origin.key(unit):
             reused += 1
-            differing += _differences(counts, origin)
-    if not reused:
-        return found, ""
-    names = "; ".join(dict.fromkeys(differing))
-    return (
-        found,
-        f"{reused} of {len(tasks)} units are of other code ({names}); column `code` tells which rows",
+            other |= dict.fromkeys(_differences(counts, origin))
+    line = (
+        f"{reused} of {len(own)} units are of other code ({'; '.join(other)}); column `code` tells which rows"
     )
+    return found, line if reused else ""

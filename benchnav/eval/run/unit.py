@@ -7,7 +7,7 @@ of its block that a process runs one after another.
 import json
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.core import rng
+from benchnav.core import registry, rng
 from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
@@ -174,7 +174,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
     simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
         mixture = _predict(unit, origin, device, simulation.field)
-        risk_map = risk.apply(condition.make_risk(), mixture)
+        risk_map = risk.apply(registry.make("risk", condition.risk), mixture)
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
@@ -209,11 +209,6 @@ def noise_key(seed: int, split: str, realisation: int) -> int:
     return rng.stream_key(seed, "simulation", *_draw(split, realisation))
 
 
-def planner_generator(unit: Unit) -> torch.Generator:
-    """The planner's randomness: keyed by seed and split, never by the batch."""
-    return rng.generator(rng.stream_key(unit.seed, "planner", *_draw(unit.condition.split, unit.realisation)))
-
-
 def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
     return (split, realisation) if realisation else (split,)
 
@@ -243,12 +238,14 @@ def simulate(
     with ExitStack() as stack:
         try:
             if settings.planner_limit_s:
-                planner = stack.enter_context(IsolatedPlanner(condition, settings.planner_limit_s))
+                planner = stack.enter_context(closing(IsolatedPlanner(condition, settings.planner_limit_s)))
             else:
                 planner = condition.make_planner()
         except (Exception, SystemExit) as error:
             planner = _Unmade(error)
-        generator = planner_generator(unit)
+        # Keyed by seed and split, never by the batch.
+        key = rng.stream_key(unit.seed, "planner", *_draw(condition.split, unit.realisation))
+        generator = rng.generator(key)
         episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every, **options)
     return episodes, bool(planner.compiled)
 

@@ -16,9 +16,14 @@ import pandas as pd
 from scipy.stats import norm
 
 from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import sign_flips, standard_deviation, success_interval
-from benchnav.eval.stats.power import smallest_difference
+from benchnav.eval.stats.difference import (
+    sign_flips,
+    smallest_difference,
+    standard_deviation,
+    success_interval,
+)
 from benchnav.eval.stats.summary import units_of
 
 # Conditions of a block met the same maps and the same noise, and were asked the same.
@@ -26,19 +31,10 @@ BLOCK = ("data", "scenario", "world", "robot", "objective")
 # Privileged models, the one that knows most first.
 PRIVILEGED = ("clairvoyant", "oracle", "ideal")
 
-_DRAW = ["seed", "realisation", "map"]
-_OF_BLOCK = ("best", "best_rivals", "best_episodes", "best_maps")
-_COLUMNS = [
-    "condition",
-    *_OF_BLOCK,
-    "best_difference",
-    "best_low",
-    "best_high",
-    "best_p",
-    "best_shown",
-    "best_alike",
-    "best_marked",
-]
+_COLUMNS = (
+    *("condition", "best", "best_rivals", "best_episodes", "best_maps", "best_difference", "best_low"),
+    *("best_high", "best_p", "best_shown", "best_alike", "best_marked"),
+)
 
 
 def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
@@ -139,22 +135,25 @@ def against_best(
     summary = summary.assign(privileged=summary["condition"].map(told or {}).fillna(""))
     found: list[dict[str, Any]] = []
     for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False):
-        compared = _compare(
+        about, compared = _compare(
             {condition: groups[condition] for condition in rows.loc[competing(rows), "condition"]}
         )
         some_worse = not all(one["best_alike"] for one in compared.values())
-        about = {name: value for name, value in next(iter(compared.values())).items() if name in _OF_BLOCK}
         for condition in rows["condition"]:
-            one = compared.get(condition, about | {"best_alike": False})
-            found.append({"condition": condition, **one, "best_marked": one["best_alike"] and some_worse})
+            one = compared.get(condition, {"best_alike": False})
+            marked = {"best_marked": one["best_alike"] and some_worse}
+            found.append({"condition": condition, **about, **one, **marked})
     table = pd.DataFrame(found).reindex(columns=_COLUMNS)
     return summary[["condition", "privileged"]].merge(table, on="condition", how="left", validate="1:1")
 
 
-def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
-    """By condition its columns of `against_best`."""
-    common = _in_common(rivals)
-    judged = common or rivals
+def _compare(rivals: Mapping[str, pd.DataFrame]) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Columns of `against_best` that are those of the block, and by condition its own."""
+    met = [set(rows[DRAW].itertuples(index=False, name=None)) for rows in rivals.values()]
+    common = pd.DataFrame(sorted(set.intersection(*met)), columns=DRAW)
+    judged = rivals
+    if len(common):
+        judged = {condition: common.merge(rows, on=DRAW) for condition, rows in rivals.items()}
     best, *others = sorted(
         judged,
         key=lambda condition: (
@@ -163,23 +162,17 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
         ),
     )
     episodes, maps = len(judged[best]), units_of(judged[best]).nunique()
-    about = {
-        "best": best,
-        "best_rivals": len(others),
-        "best_episodes": episodes,
-        "best_maps": maps,
-        "best_alike": True,
-    }
-    if not common:  # nothing to compare
-        return {condition: about | ({"best_p": 1.0} if condition != best else {}) for condition in rivals}
-    wins = {condition: rows["success"].groupby(units_of(rows)).sum() for condition, rows in common.items()}
-    values = np.stack([wins[condition].to_numpy(dtype=float) for condition in (best, *others)], axis=1)
+    about = {"best": best, "best_rivals": len(others), "best_episodes": episodes, "best_maps": maps}
+    made: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
+    if common.empty:  # nothing to compare
+        return about, made | {condition: {"best_alike": True, "best_p": 1.0} for condition in others}
+    wins = [judged[one]["success"].groupby(units_of(judged[one])).sum() for one in (best, *others)]
+    values = np.stack([won.to_numpy(dtype=float) for won in wins], axis=1)
     draws = episodes / maps
     p, critical = best_set_p(values, sign_flips(maps))
-    made = {best: about}
     for place, condition in enumerate(others, start=1):
         gain = values[:, 0] - values[:, place]
-        entry = about | {"best_p": p[place], "best_alike": bool(p[place] >= ALPHA)}
+        entry = {"best_p": p[place], "best_alike": bool(p[place] >= ALPHA)}
         entry["best_difference"] = gain.sum() / episodes
         if maps > 1:
             _, entry["best_low"], entry["best_high"] = map(float, success_interval(gain, draws))
@@ -188,13 +181,4 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> dict[str, dict[str, Any]]:
             few = 2.0 ** (1 - maps) >= ALPHA
             entry["best_shown"] = np.inf if few else smallest_difference(std, maps, 2 * norm.sf(critical))
         made[condition] = entry
-    return made
-
-
-def _in_common(conditions: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
-    """Episodes of conditions under the draws that all of them met, in one order; none where there is no such draw."""
-    met = [set(rows[_DRAW].itertuples(index=False, name=None)) for rows in conditions.values()]
-    common = pd.DataFrame(sorted(set.intersection(*met)), columns=_DRAW)
-    if common.empty:
-        return {}
-    return {condition: common.merge(rows, on=_DRAW) for condition, rows in conditions.items()}
+    return about, made

@@ -9,15 +9,16 @@ from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.stats.difference import (
     by_map,
+    maps_needed,
     mean_interval,
     sign_flip_p,
     signed_rank_p,
+    smallest_difference,
     standard_deviation,
     success_interval,
     total_time_interval,
 )
 from benchnav.eval.stats.pairing import Pair
-from benchnav.eval.stats.power import maps_needed, smallest_difference
 from benchnav.eval.stats.summary import units_of
 
 ALPHA = 0.05
@@ -45,11 +46,12 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     table = pd.DataFrame([_compare_success(pair, alpha, difference) for pair in pairs])
     unit = "share" if any(map(budgets_differ, pairs)) else "s"
     rows = [_in_shares(pair.episodes) if unit == "share" else pair.episodes for pair in pairs]
-    late = [_late(one) for one in rows]
+    late = [mean_differences(one) for one in rows]
     table = table.join(_columns("time", unit, [time_difference(one) for one in rows]))
     table["time_p"] = [signed_rank_p(values) for values in late]
     arrived = [
-        _late(pair.episodes[pair.episodes["success"] & pair.episodes["success_other"]]) for pair in pairs
+        mean_differences(pair.episodes[pair.episodes["success"] & pair.episodes["success_other"]])
+        for pair in pairs
     ]
     table = table.join(_columns("arrival_time", "s", [mean_interval(values) for values in arrived]))
     table["arrival_time_n_maps"] = [len(values) for values in arrived]
@@ -77,20 +79,20 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float
     arrivals = pd.concat(arrival_s)
     # No arrival takes less than nothing, where there is none to go by.
     arrival = arrivals.mean() if len(arrivals) else 0.0
-    gain, draws = _gain(rows)
+    gain, draws = gain_by_map(rows)
     _, low, high = success_interval(gain, draws, confidence)
     mean, low_s, high_s = total_time_interval(
-        _late(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - arrival,
+        mean_differences(rows), -gain / draws, (-high, -low), pd.concat(budget_s).mean() - arrival,
         len(set.intersection(*arrived)), confidence,
     )  # fmt: skip
     return float(mean), float(low_s), float(high_s)
 
 
-def _gain(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
+def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
     """Successes of the one less those of the other by map, shape [M], and the mean number of episodes on a map."""
     gain = rows["success"].astype(int) - rows["success_other"].astype(int)
     by_unit = gain.groupby(units_of(rows)).sum().to_numpy()
-    return by_unit, len(rows) / len(by_unit)
+    return by_unit, len(rows) / max(len(by_unit), 1)
 
 
 def budgets_differ(pair: Pair) -> bool:
@@ -102,8 +104,7 @@ def budgets_differ(pair: Pair) -> bool:
 
 def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, object]:
     rows = pair.episodes
-    one, other = rows["success"].astype(int), rows["success_other"].astype(int)
-    gain, draws = _gain(rows)
+    gain, draws = gain_by_map(rows)
     mean, low, high = success_interval(gain, draws)
     std = float(standard_deviation(gain, draws))
     return {
@@ -113,21 +114,21 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
         "n_maps": rows["map"].nunique(),
         "n_groups": len(gain),
         "n_episodes": len(rows),
-        "success_one": one.mean(),
-        "success_other": other.mean(),
-        "success_difference": float(mean),
-        "success_low": float(low),
-        "success_high": float(high),
+        "success_one": rows["success"].mean(),
+        "success_other": rows["success_other"].mean(),
+        "success_difference": mean,
+        "success_low": low,
+        "success_high": high,
         "success_p": sign_flip_p(gain),
         "success_detectable": smallest_difference(std, len(gain), alpha),
         "maps_needed": maps_needed(std, difference, alpha),
     }
 
 
-def _late(rows: pd.DataFrame) -> np.ndarray:
-    """By how much longer one condition took, by map or group of maps, shape [M]."""
-    late = (rows["total_time_s"] - rows["total_time_s_other"]).to_numpy()
-    return by_map(late, units_of(rows).to_numpy())
+def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
+    """By how much one condition has more of a column, such as time, by map or group of maps, shape [M]."""
+    more = (rows[column] - rows[f"{column}_other"]).to_numpy(dtype=float)
+    return by_map(more, units_of(rows).to_numpy())
 
 
 def _in_shares(rows: pd.DataFrame) -> pd.DataFrame:

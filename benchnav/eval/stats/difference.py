@@ -5,9 +5,12 @@ groups of maps, all episodes of a group do, and "map" means group in what follow
 Letters in shapes: N episodes; M maps; a leading `...` is any number of comparisons.
 """
 
-import numpy as np
-from scipy.stats import binom, rankdata, t, wilcoxon
+import math
 
+import numpy as np
+from scipy.stats import binom, norm, rankdata, t, wilcoxon
+
+POWER = 0.8
 LEAST_MAPS = 8  # for an interval of a time
 
 # Up to so many maps signs are flipped in all ways, beyond in so many drawn ones.
@@ -104,12 +107,11 @@ def sign_flip_p(gain: np.ndarray, direction: str = "") -> float:
     return min(float(chances[far].sum()), 1.0)
 
 
-def sign_flips(maps: int, seed: int = 0) -> np.ndarray:
+def sign_flips(maps: int) -> np.ndarray:
     """Ways to flip the sign of each map's differences: all of them on few maps, else as they are and 9 999 draws.
 
     Args:
         maps: M.
-        seed: of the draws.
 
     Returns:
         ±1, shape [ways, M].
@@ -117,7 +119,7 @@ def sign_flips(maps: int, seed: int = 0) -> np.ndarray:
     if maps <= _ALL_FLIPPED:
         bits = np.arange(2**maps)[:, None] >> np.arange(maps) & 1
         return 1.0 - 2.0 * bits
-    drawn = np.random.default_rng(seed).integers(0, 2, (_FLIPS, maps), dtype=np.int8)
+    drawn = np.random.default_rng(0).integers(0, 2, (_FLIPS, maps), dtype=np.int8)
     return np.concatenate([np.ones((1, maps)), 1.0 - 2.0 * drawn])
 
 
@@ -191,7 +193,43 @@ def signed_rank_p(late: np.ndarray) -> float:
     if len(late) > _ALL_FLIPPED:
         return float(wilcoxon(late).pvalue) if np.any(late) else 1.0
     differing = late[late != 0]
-    twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(
-        differing
-    )  # whole numbers, those of ties too
+    # Whole numbers, those of ties too.
+    twice_ranks = np.rint(2 * rankdata(np.abs(differing))) * np.sign(differing)
     return sign_flip_p(twice_ranks.astype(np.int64))
+
+
+# --- what a number of maps can show -----------------------------------------------------------------
+# For a mean of differences over maps that is nearly normal, which from some twenty maps on it is: a difference d with
+# standard deviation σ is shown with a chance of `POWER` where d·√M/σ is the quantile of 1 − α/2 and that of `POWER`
+# together. Source: Chow, Shao and Wang (2008), "Sample Size Calculations in Clinical Research", 3.1.
+
+
+def smallest_difference(std: float, maps: int, alpha: float) -> float:
+    """Difference that a study of so many maps would show, with a chance of `POWER`.
+
+    Args:
+        std: standard deviation over maps of the difference, in its unit.
+        maps: number of maps.
+        alpha: p under which a difference counts as shown; after a correction over K pairs, that of the first, 0.05/K.
+
+    Returns:
+        In the unit of `std`; infinite where no sign-flip test of so many maps can reach `alpha`, whatever they show.
+    """
+    if 2.0 ** (1 - maps) >= alpha:
+        return math.inf
+    return _quantiles(alpha) * std / math.sqrt(maps)
+
+
+def maps_needed(std: float, difference: float, alpha: float) -> int:
+    """Smallest number of maps that would show a difference with a chance of `POWER`.
+
+    Args:
+        std: as in `smallest_difference`.
+        difference: above 0, in the unit of `std`.
+        alpha: as there.
+    """
+    return math.ceil((_quantiles(alpha) * std / difference) ** 2)
+
+
+def _quantiles(alpha: float) -> float:
+    return float(norm.ppf(1 - alpha / 2) + norm.ppf(POWER))

@@ -16,17 +16,11 @@ from scipy.optimize import brentq
 from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
-from benchnav.eval.stats.comparison import ALPHA, time_difference
-from benchnav.eval.stats.difference import (
-    by_map,
-    mean_interval,
-    sign_flip_p,
-    sign_flips,
-    success_interval,
-)
+from benchnav.eval.stats.comparison import ALPHA, gain_by_map, mean_differences, time_difference
+from benchnav.eval.stats.difference import mean_interval, sign_flip_p, sign_flips, success_interval
+from benchnav.eval.stats.pairing import side_by_side
 from benchnav.eval.stats.summary import time_budgets, units_of
 
-_DRAW = ["seed", "realisation", "map"]
 # Confidence at which a p-value of a margin is looked for, but for what rounds to 0 and 1.
 _MOST = 1 - 1e-12
 
@@ -51,27 +45,22 @@ def test_hypotheses(
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []
     for plain in about["tests"]:
-        fields = {name: value for name, value in plain.items() if name != "claim"}
-        test = Hypothesis(**{**fields, "names": tuple(plain["names"])})
+        test = Hypothesis(**{name: value for name, value in plain.items() if name not in ("names", "claim")})
         one, other = (
             rows[condition].assign(time_budget_s=time_budgets(rows[condition], worlds[condition]))
             for condition in (test.one, test.other)
         )
-        made.append({**plain, **_test(test, _side_by_side(one, other, test.metric))})
+        # Episodes of which the metric is known; of a path, where both arrived.
+        column = METRICS[test.metric].column
+        both = side_by_side(
+            one, other, [*dict.fromkeys(["success", "total_time_s", "time_budget_s", column])]
+        )
+        if test.metric == "path_length":
+            both = both[both["success"] & both["success_other"]]
+        made.append({**plain, **_test(test, both.dropna(subset=[column, f"{column}_other"]))})
     table = pd.DataFrame(made)
     table["p_holm"] = multipletests(table["p"], ALPHA, method="holm")[1]
     return table.assign(supported=table["p_holm"] < ALPHA)
-
-
-def _side_by_side(one: pd.DataFrame, other: pd.DataFrame, metric: str) -> pd.DataFrame:
-    """Episodes that both conditions have, and of which the metric is known; of a path, where both arrived."""
-    column = METRICS[metric].column
-    wanted = list(dict.fromkeys(["success", "total_time_s", "time_budget_s", column]))
-    left = [*_DRAW, *(["group"] if "group" in one else []), *wanted]
-    both = one[left].merge(other[[*_DRAW, *wanted]], on=_DRAW, suffixes=("", "_other"))
-    if metric == "path_length":
-        both = both[both["success"] & both["success_other"]]
-    return both.dropna(subset=[column, f"{column}_other"])
 
 
 def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
@@ -91,30 +80,17 @@ def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
 
 def _interval(rows: pd.DataFrame, metric: str, confidence: float) -> tuple[float, float, float]:
     """Difference in the metric's unit, with its interval; NaN where there are too few maps."""
-    units = units_of(rows).to_numpy()
     if metric == "T_total" and len(rows):
         return time_difference(rows, confidence)
-    scale = METRICS[metric].scale
     if metric == "success":
-        gain = _sums(rows, metric)
+        gain, draws = gain_by_map(rows)
         if len(gain) < 2:
             return float(100 * gain.sum() / max(len(rows), 1)), np.nan, np.nan
-        found = success_interval(gain, len(rows) / len(gain), confidence)
+        found = success_interval(gain, draws, confidence)
     else:
-        late = _late(rows, metric)
-        found = mean_interval(by_map(late, units) if len(late) else late, confidence)
-    difference, low, high = (scale * float(value) for value in found)
+        found = mean_interval(mean_differences(rows, METRICS[metric].column), confidence)
+    difference, low, high = (METRICS[metric].scale * float(value) for value in found)
     return difference, low, high
-
-
-def _late(rows: pd.DataFrame, metric: str) -> np.ndarray:
-    column = METRICS[metric].column
-    return rows[column].to_numpy(dtype=float) - rows[f"{column}_other"].to_numpy(dtype=float)
-
-
-def _sums(rows: pd.DataFrame, metric: str) -> np.ndarray:
-    """Sum of differences by map, shape [M]."""
-    return pd.Series(_late(rows, metric)).groupby(units_of(rows).to_numpy()).sum().to_numpy()
 
 
 def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
@@ -131,21 +107,18 @@ def p_of(test: Hypothesis, rows: pd.DataFrame) -> float:
 
 
 def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
-    sums = _sums(rows, test.metric)
-    if not len(sums):
+    if not len(rows):
         return 1.0
     if test.metric == "success":
-        return sign_flip_p(np.round(sums).astype(int), test.direction)
-    flipped = sign_flips(len(sums)) @ sums
-    seen = sums.sum()
-    slack = (
-        1e-9 * np.abs(sums).sum()
-    )  # sums are exact to rounding, and ways that tie with what was seen count
-    if test.direction == "higher":
-        return float(np.mean(flipped >= seen - slack))
-    if test.direction == "lower":
-        return float(np.mean(flipped <= seen + slack))
-    return float(np.mean(np.abs(flipped) >= abs(seen) - slack))
+        return sign_flip_p(gain_by_map(rows)[0].astype(int), test.direction)
+    column = METRICS[test.metric].column
+    more = rows[column] - rows[f"{column}_other"]
+    sums = more.groupby(units_of(rows).to_numpy()).sum().to_numpy()
+    flipped, seen = sign_flips(len(sums)) @ sums, sums.sum()
+    # Sums are exact to rounding, and ways that tie with what was seen count.
+    slack = 1e-9 * np.abs(sums).sum()
+    far = {"higher": flipped >= seen - slack, "lower": flipped <= seen + slack}
+    return float(np.mean(far.get(test.direction, np.abs(flipped) >= abs(seen) - slack)))
 
 
 def _margin_p(test: Hypothesis, rows: pd.DataFrame, side: float) -> float:
@@ -157,7 +130,7 @@ def _margin_p(test: Hypothesis, rows: pd.DataFrame, side: float) -> float:
     def end(signed: float) -> float:
         """Of the confidence the end on the margin's side; of a negative one the other end."""
         _, low, high = _interval(rows, test.metric, abs(signed))
-        return side * ((high if side > 0 else low) if signed >= 0 else (low if side > 0 else high))
+        return side * (high if (side > 0) == (signed >= 0) else low)
 
     if np.isnan(end(0.5)):
         return 1.0

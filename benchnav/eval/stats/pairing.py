@@ -7,9 +7,10 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav.core import registry
 from benchnav.core.errors import ConfigError
-from benchnav.eval.experiment.condition import LABELS, NOT_USED
+from benchnav.core.settings import check_known
+from benchnav.eval.experiment.condition import LABELS, NOT_USED, differences
+from benchnav.eval.experiment.unit import DRAW
 
 # By what conditions may differ, each with its keys in a condition's value. Other data or scenarios are other maps.
 _KEYS: Mapping[str, tuple[str, ...]] = {
@@ -17,8 +18,6 @@ _KEYS: Mapping[str, tuple[str, ...]] = {
     "world": ("world", "rules"),
     "run": (),
 }
-COMPARED = tuple(_KEYS)
-DRAW = ["seed", "realisation", "map"]
 # Of an episode, what pairs hold of both sides, where the tables have it.
 _MEASURES = ("success", "total_time_s", "time_budget_s", "score", "traversability", "path_length_m")
 
@@ -53,7 +52,6 @@ class Pair:
         episodes: of both, paired by seed, realisation and map, on all maps that both met: one's `success`,
             `total_time_s`, `time_budget_s` and other measures, the other's with `_other`; and `group`, the statistical
             unit, where the tables have it. Maps may have unequally many.
-        left_out: episodes of either condition that the other does not have.
         members: the conditions.
     """
 
@@ -61,7 +59,6 @@ class Pair:
     other: str
     shared: Mapping[str, str]
     episodes: pd.DataFrame
-    left_out: int
     members: tuple[Compared, ...] = ()
 
 
@@ -72,7 +69,7 @@ def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") 
 
     Args:
         conditions: conditions of one run or several, each once unless runs are compared with each other.
-        by: what differs, of `COMPARED`; see `by_what`.
+        by: what differs, see `by_what`.
         against: a label, which all others are compared with; all pairs when not given.
 
     Returns:
@@ -85,12 +82,11 @@ def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") 
     values = list(
         dict.fromkeys(condition.labels[by] for condition in conditions if condition.labels[by] != NOT_USED)
     )
-    if against and against not in values:
-        raise ConfigError(
-            f"Expected `against` among {', '.join(values)}, got {against!r}.{registry.hint(against, values)}"
-        )
+    if against:
+        check_known("`against`", against, values)
     pairs = [
-        _pair(*_ordered(a, b, by, against), by)
+        # What is compared first: the later of the two, unless the earlier is compared with a named one.
+        _pair(a, b, by) if against and b.labels[by] == against else _pair(b, a, by)
         for a, b in combinations(conditions, 2)
         if _differ_in(a, b, by) and (not against or against in (a.labels[by], b.labels[by]))
     ]
@@ -104,7 +100,7 @@ def find_pairs(conditions: Sequence[Compared], by: str = "", against: str = "") 
 
 
 def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> str:
-    """By what conditions are compared, of `COMPARED`.
+    """By what conditions are compared, of the keys of `_KEYS`.
 
     Args:
         conditions: the conditions.
@@ -116,20 +112,13 @@ def by_what(conditions: Sequence[Compared], by: str = "", against: str = "") -> 
         ConfigError: `by` is none, or `against` is found nowhere or in several.
     """
     if by:
-        if by not in COMPARED:
-            why = " Other data or scenarios are other maps." if by in ("data", "scenario") else ""
-            raise ConfigError(
-                f"Expected `by` among {', '.join(COMPARED)}, got {by!r}.{registry.hint(by, COMPARED)}{why}"
-            )
+        check_known("`by` (other data or scenarios are other maps)", by, _KEYS)
         return by
     if not against:
         return "run" if any(condition.labels["run"] != NOT_USED for condition in conditions) else "risk"
-    found = [name for name in COMPARED if any(condition.labels[name] == against for condition in conditions)]
-    if not found:
-        known = sorted({condition.labels[name] for condition in conditions for name in COMPARED} - {NOT_USED})
-        raise ConfigError(
-            f"Expected `against` among {', '.join(known)}, got {against!r}.{registry.hint(against, known)}"
-        )
+    labels = [(name, condition.labels[name]) for condition in conditions for name in _KEYS]
+    check_known("`against`", against, sorted({label for _, label in labels} - {NOT_USED}))
+    found = list(dict.fromkeys(name for name, label in labels if label == against))
     if len(found) > 1:
         raise ConfigError(f"Expected `by` {' or '.join(found)}: both have {against!r}.")
     return found[0]
@@ -151,18 +140,14 @@ def check_one_value_each(conditions: Iterable[Compared]) -> None:
                 runs = " and ".join(dict.fromkeys([*first.code, *condition.code]))
                 raise ConfigError(
                     f"Expected one {name} under each label, got two that {runs} call {label!r}: "
-                    f"{', '.join(differences(earlier, value))}. Leave one of the runs out, or run one again under "
+                    f"{_in_words(earlier, value)}. Leave one of the runs out, or run one again under "
                     "another label."
                 )
 
 
-def differences(one: Any, other: Any, name: str = "") -> list[str]:
-    """Names what differs between two values of plain data, with both, such as `options.level 0.5 and 0.9`."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        keys = dict.fromkeys([*one, *other])
-        inner = ((one.get(key), other.get(key), f"{name}.{key}".removeprefix(".")) for key in keys)
-        return [line for values in inner for line in differences(*values)]
-    return [] if one == other else [f"{name} {one} and {other}"]
+def _in_words(one: Any, other: Any) -> str:
+    """What differs between two values of plain data, with both, such as `options.level 0.5 and 0.9`."""
+    return ", ".join(f"{name} {first} and {second}" for name, first, second in differences(one, other))
 
 
 def _others(conditions: Sequence[Compared], by: str) -> str:
@@ -170,10 +155,10 @@ def _others(conditions: Sequence[Compared], by: str) -> str:
     fields = {repr(field): field for condition in conditions if (field := _field(condition))}
     if by == "world" and len(fields) > 1:
         first, second, *_ = fields.values()
-        return f" λ itself differs between their worlds: {', '.join(differences(first, second))}."
+        return f" λ itself differs between their worlds: {_in_words(first, second)}."
     several = {
         name: labels
-        for name in COMPARED
+        for name in _KEYS
         if name != by and len(labels := {condition.labels[name] for condition in conditions} - {NOT_USED}) > 1
     }
     if not several:
@@ -186,7 +171,7 @@ def _differ_in(one: Compared, other: Compared, by: str) -> bool:
     """Tells whether two values are alike in all but one thing, which both use, and met the same λ."""
     if by == "run":
         return one.value == other.value and one.labels["run"] != other.labels["run"]
-    unused = [name for name in COMPARED if NOT_USED in (one.labels[name], other.labels[name])]
+    unused = [name for name in _KEYS if NOT_USED in (one.labels[name], other.labels[name])]
     keys = _KEYS[by]
     alike = all(
         one.value.get(key) == other.value.get(key) for key in {*one.value, *other.value} - {*keys, *unused}
@@ -204,24 +189,15 @@ def _field(condition: Compared) -> dict[str, Any]:
     return {"noise": "frozen", "correlation_m": world.get("correlation_m"), "immobile.below": below}
 
 
-def _ordered(a: Compared, b: Compared, by: str, against: str) -> tuple[Compared, Compared]:
-    """What is compared first: the later of the two, unless the earlier is compared with a named one."""
-    return (a, b) if against and b.labels[by] == against else (b, a)
-
-
 def _pair(one: Compared, other: Compared, by: str) -> Pair:
     names = f"{one.labels[by]!r} and {other.labels[by]!r}"
     check_maps(one, other, names)
-    columns = [name for name in (*DRAW, *_MEASURES) if name in one.episodes and name in other.episodes]
-    both = one.episodes[columns].merge(other.episodes[columns], on=DRAW, suffixes=("", "_other"))
+    measures = [name for name in _MEASURES if name in one.episodes and name in other.episodes]
+    both = side_by_side(one.episodes, other.episodes, measures)
     if both.empty:
         raise ConfigError(
             f"Expected conditions with episodes in common, got {names} with {_draws(one)} and {_draws(other)}."
         )
-    grouped = next((condition.episodes for condition in (one, other) if "group" in condition.episodes), None)
-    if grouped is not None:
-        known = grouped.dropna(subset=["group"]).drop_duplicates("map").set_index("map")["group"]
-        both["group"] = both["map"].map(known).fillna(both["map"]).astype("int64")
     shared = {
         name: other.labels[name] if one.labels[name] == NOT_USED else one.labels[name]
         for name in (*LABELS, "run")
@@ -232,9 +208,28 @@ def _pair(one: Compared, other: Compared, by: str) -> Pair:
         other=other.labels[by],
         shared=shared,
         episodes=both,
-        left_out=len(one.episodes) + len(other.episodes) - 2 * len(both),
         members=(one, other),
     )
+
+
+def side_by_side(one: pd.DataFrame, other: pd.DataFrame, measures: Sequence[str]) -> pd.DataFrame:
+    """Episodes that two conditions have in common, a row each.
+
+    Args:
+        one: rows of a condition.
+        other: rows of the other.
+        measures: columns that are taken of both, the other's with `_other`.
+
+    Returns:
+        `DRAW`, the measures, and `group` where either of them has it.
+    """
+    columns = [*DRAW, *measures]
+    both = one[columns].merge(other[columns], on=DRAW, suffixes=("", "_other"))
+    grouped = next((rows for rows in (one, other) if "group" in rows), None)
+    if grouped is not None:
+        known = grouped.dropna(subset=["group"]).drop_duplicates("map").set_index("map")["group"]
+        both["group"] = both["map"].map(known).fillna(both["map"]).astype("int64")
+    return both
 
 
 def check_maps(one: Compared, other: Compared, names: str) -> None:
@@ -251,8 +246,6 @@ def check_maps(one: Compared, other: Compared, names: str) -> None:
 
 
 def _draws(condition: Compared) -> str:
-    def listed(values: Iterable[Any]) -> str:
-        return ", ".join(str(value) for value in sorted(set(values)))
-
     rows = condition.episodes
-    return f"seeds {listed(rows['seed'])}, realisations {listed(rows['realisation'])}"
+    numbers = {name: ", ".join(map(str, sorted(rows[name].unique()))) for name in ("seed", "realisation")}
+    return ", ".join(f"{name}s {listed}" for name, listed in numbers.items())

@@ -29,18 +29,17 @@ _QUANTITIES = {
 }
 
 
-def wilson_interval(rate: float, n: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval for a rate. Source: Wilson (1927).
+def wilson_interval(rate: float, n: float) -> tuple[float, float]:
+    """Wilson's 95 % score interval for a rate. Source: Wilson (1927).
 
     Args:
         rate: share of successes, in [0, 1].
         n: number of independent conditions, > 0; an effective number need not be whole.
-        confidence: coverage asked for.
 
     Returns:
         Lower and upper end, in [0, 1].
     """
-    z = float(norm.ppf((1 + confidence) / 2))
+    z = float(norm.ppf((1 + 0.95) / 2))
     centre = rate + z**2 / (2 * n)
     half = z * (rate * (1 - rate) / n + z**2 / (4 * n**2)) ** 0.5
     low, high = (centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)
@@ -65,13 +64,20 @@ def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     Returns:
         At least 1, at most N.
     """
-    _, member = np.unique(maps, return_inverse=True)
-    size = np.bincount(member).astype(float)
-    episodes, count = len(success), len(size)
+    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
+    value, episodes, count = success.astype(float), len(success), len(size)
     if episodes == count:
         return 1.0
     weighted = float((size**2).sum()) / episodes
-    return 1 + (weighted - 1) * _correlation_within(success.astype(float), member, size, weighted)
+    within_maps = 1.0
+    if count > 1:
+        mean = np.bincount(member, weights=value) / size
+        between = float((size * (mean - value.mean()) ** 2).sum()) / (count - 1)
+        within = float(((value - mean[member]) ** 2).sum()) / (episodes - count)
+        if between or within:
+            typical = (episodes - weighted) / (count - 1)
+            within_maps = min(max((between - within) / (between + (typical - 1) * within), 0.0), 1.0)
+    return 1 + (weighted - 1) * within_maps
 
 
 def cautious_design_effect(success: np.ndarray, maps: np.ndarray) -> float:
@@ -88,11 +94,10 @@ def cautious_design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     Returns:
         At least 1.
     """
-    _, size = np.unique(maps, return_counts=True)
+    _, member, size = np.unique(maps, return_inverse=True, return_counts=True)
     each = round(size.mean())
     if each == 1:
         return design_effect(success, maps)
-    _, member = np.unique(maps, return_inverse=True)
     added = np.repeat([len(size), len(size) + 1], each)
     ends = np.repeat([True, False], each)
     effect = design_effect(np.concatenate([success, ends]), np.concatenate([member, added]))
@@ -170,20 +175,6 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
     """
     groups = episodes.groupby("condition", sort=False)
     return pd.DataFrame([_summarise_condition(group, worlds[str(condition)]) for condition, group in groups])
-
-
-def _correlation_within(value: np.ndarray, member: np.ndarray, size: np.ndarray, weighted: float) -> float:
-    """Intra-class correlation by the analysis of variance, in [0, 1]."""
-    episodes, count = len(value), len(size)
-    if count == 1:
-        return 1.0
-    mean = np.bincount(member, weights=value) / size
-    between = float((size * (mean - value.mean()) ** 2).sum()) / (count - 1)
-    within = float(((value - mean[member]) ** 2).sum()) / (episodes - count)
-    if between == within == 0:
-        return 1.0
-    typical = (episodes - weighted) / (count - 1)
-    return min(max((between - within) / (between + (typical - 1) * within), 0.0), 1.0)
 
 
 def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:

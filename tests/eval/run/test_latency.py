@@ -27,8 +27,8 @@ def whole(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def suite_on(dataset: Path, *planners: Any, **changes: Any) -> Suite:
     given: dict[str, Any] = {
-        "data": str(dataset), "model": "oracle", "planners": planners, "risks": ("mean",), "record": "none",
-        "scenarios": ("std",), "maps": MAPS - 1, "steps": "none", "time_budget_s": 4.0,
+        "data": str(dataset), "model": "oracle", "planners": planners, "risks": ("mean",),
+        "scenarios": ("std",), "maps": MAPS - 1, "record": "none", "time_budget_s": 4.0,
     }  # fmt: skip
     return Suite(**(given | changes))
 

@@ -5,7 +5,6 @@ from typing import Any
 import pytest
 import torch
 
-from benchnav.eval.run import clock as clock_module
 from benchnav.eval.run import rollout
 from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.planners.straight import steer_toward
@@ -49,7 +48,7 @@ class Slow(Planner[int]):
 
 def run(monkeypatch: pytest.MonkeyPatch, **options: int) -> rollout.Episodes:
     clock = Clock()
-    monkeypatch.setattr(clock_module, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=clock.perf_counter))
     ground, world = torch.full((BATCH, 16, 16), 0.8), World(time_budget_s=0.4)
     problem = factories.problem(ground, time_budget_s=0.4)
     goal = torch.tensor([[6.75, 6.75]] * BATCH)
@@ -191,3 +190,47 @@ def test_a_planner_that_cannot_be_left_is_blamed() -> None:
     assert episodes.outcome[0] == Outcome.PLANNER_ERROR
     assert episodes.errors[0] == "RuntimeError: all or none"
     assert episodes.outcome[1] == Outcome.SUCCESS
+
+
+def test_calls_are_timed_one_by_one_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = iter([0.0, 2.0, 10.0, 11.5])
+    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
+    timer = rollout.Clock(torch.device("cpu"))
+    for _ in range(2):
+        with timer.timed():
+            pass
+    assert timer.seconds() == [2.0, 1.5]
+
+
+def test_a_gpu_is_waited_for_once_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events as those of a GPU, whose times are known only after it was waited for."""
+    told: list[str] = []
+
+    class Event:
+        def __init__(self, enable_timing: bool) -> None:
+            assert enable_timing
+
+        def record(self) -> None:
+            self.place = len(told)
+            told.append("record")
+
+        def elapsed_time(self, end: "Event") -> float:
+            assert "synchronize" in told
+            return 1000.0 * (end.place - self.place)
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: told.append("synchronize"))
+    timer = rollout.Clock(torch.device("cuda"))
+    with timer.timed():
+        told.append("work")
+    with timer.timed():
+        pass
+    assert told == ["record", "work", "record", "record", "record"]
+    assert timer.seconds() == [2.0, 1.0]
+
+
+def test_what_raises_is_not_counted() -> None:
+    timer = rollout.Clock(torch.device("cpu"))
+    with pytest.raises(RuntimeError, match="no"), timer.timed():
+        raise RuntimeError("no")
+    assert timer.seconds() == []

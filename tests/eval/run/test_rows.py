@@ -39,11 +39,15 @@ def made(**changes: object) -> tuple:  # type: ignore[type-arg]
     return problem, episodes
 
 
+GROUPS = np.array([4, 4])
+
+
 def test_metrics_are_those_of_the_episodes_own_steps() -> None:
     problem, episodes = made(time_budget_s=torch.tensor([50.0, 70.0]))
-    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
+    table = episode_rows(unit(), GROUPS, problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
     first, second = table.to_dict("records")
     assert (first["map"], first["outcome"], first["success"]) == (4, "success", True)
+    assert (first["group"], second["group"]) == (4, 4)
     assert (first["seed"], first["realisation"], first["condition"]) == (7, 2, unit().condition.id)
     assert (first["risk"], first["scenario"], first["robot"]) == ("cvar", "std", "unicycle")
     assert first["total_time_s"] == pytest.approx(0.2)
@@ -71,7 +75,7 @@ def test_metrics_are_those_of_the_episodes_own_steps() -> None:
 
 def test_times_are_measured_by_the_robots_top_speed() -> None:
     problem, episodes = made(robot=Unicycle(speed_mps=(0.0, 2.0)))
-    first = episode_rows(unit(), problem, episodes, np.array([0.4, 20.0]), [0, 0], False).iloc[0]
+    first = episode_rows(unit(), GROUPS, problem, episodes, np.array([0.4, 20.0]), [0, 0], False).iloc[0]
     assert first["reference_time_s"] == pytest.approx(0.4)
     assert first["time_ratio"] == pytest.approx(1.0)
     assert first["score"] == pytest.approx(0.5)
@@ -80,7 +84,7 @@ def test_times_are_measured_by_the_robots_top_speed() -> None:
 def test_an_episode_that_ends_at_once_has_no_flattering_zeros() -> None:
     problem, episodes = made()
     at_once = Episodes(**{**vars(episodes), "steps": torch.tensor([0, 1])})
-    table = episode_rows(unit(), problem, at_once, np.array([0.1, 20.0]), [0, 0], False)
+    table = episode_rows(unit(), GROUPS, problem, at_once, np.array([0.1, 20.0]), [0, 0], False)
     nothing = table.iloc[0][["traversability", "path_length_m", "stuck_share", "roughness_radps2"]]
     assert nothing.isna().all()
     assert np.isnan(table.iloc[1]["roughness_radps2"])
@@ -89,8 +93,8 @@ def test_an_episode_that_ends_at_once_has_no_flattering_zeros() -> None:
 
 def test_rows_of_a_failed_model_have_the_columns_of_all_rows() -> None:
     problem, episodes = made()
-    table = episode_rows(unit(), problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
-    failed = error_rows(unit(), torch.tensor([50.0, 60.0]), "ValueError: no idea")
+    table = episode_rows(unit(), GROUPS, problem, episodes, np.array([0.1, 20.0]), [0, 3], True)
+    failed = error_rows(unit(), GROUPS, torch.tensor([50.0, 60.0]), "ValueError: no idea")
     assert list(failed.columns) == list(table.columns)
     assert [str(t) for t in failed.dtypes] == [str(t) for t in table.dtypes]
     assert set(failed["outcome"]) == {"model_error"}

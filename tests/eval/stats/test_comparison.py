@@ -6,9 +6,13 @@ import pytest
 from scipy.stats import binomtest, wilcoxon
 
 from benchnav.eval.stats.comparison import compare, time_difference
-from benchnav.eval.stats.difference import standard_deviation, success_interval
+from benchnav.eval.stats.difference import (
+    maps_needed,
+    smallest_difference,
+    standard_deviation,
+    success_interval,
+)
 from benchnav.eval.stats.pairing import Pair
-from benchnav.eval.stats.power import maps_needed, smallest_difference
 
 
 def pair(
@@ -24,7 +28,7 @@ def pair(
         episodes[f"success{suffix}"] = np.array(times) < budget_s
         episodes[f"total_time_s{suffix}"] = times
         episodes[f"time_budget_s{suffix}"] = budget_s
-    return Pair(one=names[0], other=names[1], shared={"planner": "mppi"}, episodes=episodes, left_out=0)
+    return Pair(one=names[0], other=names[1], shared={"planner": "mppi"}, episodes=episodes)
 
 
 A = [30.0, 35, 100, 40, 31, 100, 33, 36]

@@ -9,6 +9,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.condition import Condition, conditions_of
 from benchnav.eval.experiment.hypotheses import Hypothesis, fix_hypotheses
 from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.stats.difference import success_interval
 from benchnav.eval.stats.hypotheses import p_of
 from benchnav.eval.stats.hypotheses import test_hypotheses as run_tests
@@ -25,13 +26,13 @@ def conditions(**changes: Any) -> dict[str, Condition]:
 
 
 def fixed(*given: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    known = conditions(**changes)
-    return fix_hypotheses(given, known, dict.fromkeys(known, 20))
+    extent = Extent.product((0,), 1, 20)
+    return fix_hypotheses(given, {i: (condition, extent) for i, condition in conditions(**changes).items()})
 
 
 def hypothesis(**changes: Any) -> Hypothesis:
     given = {"metric": "success", "kind": "difference", "direction": "", "margin": 0.0}
-    return Hypothesis(**{"one": "a", "other": "b", "names": ("A", "B"), **given, **changes})
+    return Hypothesis(**{"one": "a", "other": "b", **given, **changes})
 
 
 def beside(one: np.ndarray, other: np.ndarray, column: str = "score") -> pd.DataFrame:
@@ -80,19 +81,19 @@ def test_the_digest_is_that_of_all_that_is_claimed(change: dict[str, Any]) -> No
     [
         (
             {"metric": "sucess"},
-            r"Expected `metric` of hypothesis 1 among success, .*Did you mean 'success'\?",
+            r"Expected `metric` of hypothesis 1 as 'success' or .*Did you mean 'success'\?",
         ),
-        ({"kind": "equal"}, "`kind` of hypothesis 1 among difference, non-inferiority, equivalence"),
-        ({"direction": "up"}, "`direction` of hypothesis 1 among higher, lower"),
+        ({"kind": "equal"}, "`kind` of hypothesis 1 as 'difference' or 'non-inferiority' or 'equivalence'"),
+        ({"direction": "up"}, "`direction` of hypothesis 1 as '' or 'higher' or 'lower'"),
         ({"one": {"planner": "mpi"}}, r"`planner` of `one` of hypothesis 1 .*Did you mean 'mppi'\?"),
         ({"one": {"plannner": "mppi"}}, r"labels in `one` of hypothesis 1 .*Did you mean 'planner'\?"),
         ({"one": "mppi"}, "name a condition by labels"),
         ({"one": {"planner": "mppi", "risk": "cvar"}}, r"`risk` .*Did you mean 'cvar:0\.9'\?"),
         ({"metrics": "score"}, r"keys of hypothesis 1 .*Did you mean 'metric'\?"),
-        ({3: 4}, "keys of hypothesis 1 .*got 3"),
+        ({3: 4}, "keys of hypothesis 1 .*got '3'"),
         ({"margin": 1}, "Leave it out"),
-        ({"kind": "equivalence"}, "above 0 in points, got 0 for equivalence. Give one"),
-        ({"kind": "equivalence", "margin": -1}, "number ≥ 0, got -1"),
+        ({"kind": "equivalence"}, "test of equivalence, above 0 and below 100 points, got 0"),
+        ({"kind": "equivalence", "margin": -1}, "above 0 .*got -1"),
         ({"kind": "equivalence", "margin": 100}, "below 100 points, got 100"),
         ({"kind": "equivalence", "margin": 1, "direction": "lower"}, "no `direction`"),
         ({"one": MEAN}, "two conditions that are the same in"),
