@@ -8,7 +8,6 @@ import pytest
 from benchnav.core.errors import ConfigError
 from benchnav.eval.folder.folder import write_run
 from benchnav.eval.report import write
-from benchnav.eval.report.playback.files import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
 from tests.eval.forged import forge_run
 from tests.eval.report import made
@@ -128,7 +127,7 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
             "realisation": "0",
             "outcome": "stuck",
         }
-        write_playback(folder, labels["planner"], made.recording(20, about=about))
+        made.recording(20, about=about).save(folder / "playback" / f"{labels['planner']}.npz")
     write_report(folder)
     assert (folder / "figures" / "trajectories.png").stat().st_size > 10_000
     text = (folder / "summary.md").read_text()
@@ -143,7 +142,7 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
     )
     folder = run_folder(tmp_path / "run", rows)
     about = {**made.held_recording().about, "condition": rows["condition"][0]}
-    write_playback(folder, "a", made.held_recording(about=about))
+    made.held_recording(about=about).save(folder / "playback" / "a.npz")
     write_report(folder)
     text = (folder / "summary.md").read_text()
     assert "Below, the whole driven path on λ as it was. 1 of 1 recorded episodes." in text
