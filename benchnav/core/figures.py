@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
@@ -152,7 +153,7 @@ def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **s
 
 
 def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) -> Any:
-    """Draws a map with its first row at the bottom and its axes in metres; gives the image.
+    """Draws a map with its first row at the bottom and its axes in metres, which end where it ends; gives the image.
 
     Args:
         panel: where.
@@ -161,7 +162,31 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
         **style: as in `Axes.imshow`.
     """
     width, height = map(float, extent_m)
+    panel.set(xlim=(0, width), ylim=(0, height))
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+
+
+def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **shared: Any) -> list[Any]:
+    """Divides a figure into places, row by row, each with panels under each other; what is left over is removed.
+
+    Args:
+        figure: empty.
+        count: number of places.
+        across: places side by side, at most `count`.
+        layers: panels of a place.
+        **shared: as in `Figure.subplots`.
+
+    Returns:
+        Of each place its panels, downward.
+    """
+    down = -(-count // across)
+    panels = figure.subplots(layers * down, across, squeeze=False, **shared)
+    stacks = [stack for row in np.split(panels, down) for stack in row.T]
+    for place in range(count, len(stacks)):
+        for panel in stacks[place]:
+            panel.remove()
+        stacks[place - across][-1].tick_params(labelbottom=True)
+    return stacks[:count]
 
 
 def legend_outside(

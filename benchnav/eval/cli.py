@@ -4,6 +4,7 @@ import json
 import os
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -131,11 +132,11 @@ def report(folder: str, out: str = "") -> None:
         folder: Run folder.
         out: Folder that they are written to, such as for a run that cannot be written; the run's own when not given.
     """
-    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import write_report
+    from benchnav.eval.run.again import record_failures
 
     run, place = Path(folder), other_folder(folder, out)
-    _print(write_report(run, ground_of_run(run), place), place)
+    _print(write_report(run, partial(record_failures, run), place), place)
 
 
 def compare(
@@ -215,12 +216,12 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
 
 def _finish(folder: Path) -> int:
     """Reports on a finished run; gives the exit status."""
-    from benchnav.eval.failed_ground import ground_of_run
-    from benchnav.eval.report.playback.files import write_viewer_files
+    from benchnav.eval.report.playback.rerun_file import write_viewer_files
     from benchnav.eval.report.write import write_report
+    from benchnav.eval.run.again import record_failures
 
     write_viewer_files(folder)
-    _print(write_report(folder, ground_of_run(folder)), folder)
+    _print(write_report(folder, partial(record_failures, folder)), folder)
     _print_recorded(folder)
     _print_replay(folder)
     return _failed(folder)

@@ -14,26 +14,26 @@ from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
+from benchnav.eval.recording import read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
     forest_figure,
     outcome_figure,
     success_figure,
 )
-from benchnav.eval.report.charts.driven import read_driven
 from benchnav.eval.report.charts.maps import (
-    choose_snapshots,
+    choose_recordings,
     driven_figure,
     failure_figure,
+    read_driven,
     trajectory_figure,
 )
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
-from benchnav.eval.report.failure_choice import GroundOf, Sheets, collect_sheets
+from benchnav.eval.report.failure_choice import RecordFailures, Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.page import Drawn, write_page
-from benchnav.eval.report.recorded.recording import read_snapshots
 from benchnav.eval.report.tables import LATENCIES, is_grouped, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
 from benchnav.eval.stats.best import against_best, privileged_models
@@ -92,12 +92,13 @@ class Report:
     about: Mapping[str, Any]
 
 
-def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
+def read_report(folder: Path, record_failures: RecordFailures | None = None) -> Report:
     """Makes the report of a finished run, and writes nothing.
 
     Args:
         folder: a finished run.
-        ground_of: gives the ground of failures; without it they are not shown on maps.
+        record_failures: records failures again, as `run.again.record_failures` does of the folder; without it none is
+            shown on a map.
 
     Raises:
         ConfigError: the folder is no run folder, or its run is not finished.
@@ -114,11 +115,11 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
     summary = _with_latency(summary, about["conditions"])
     failures = failures_table(folder, episodes)
-    sheets = collect_sheets(folder, summary, failures, ground_of)
+    sheets = collect_sheets(summary, failures, record_failures)
     left_out = [sheets.left_out] if sheets.left_out else []
     return Report(
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
-        findings=_findings(findings(summary, failures, sheets.told), tests, about, grouped),
+        findings=_findings(findings(summary, failures, sheets.predicted), tests, about, grouped),
         table=result_table(summary, about["conditions"]),
         warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
         summary=summary,
@@ -130,18 +131,21 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     )
 
 
-def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | None = None) -> Report:
+def write_report(
+    folder: Path, record_failures: RecordFailures | None = None, out: Path | None = None
+) -> Report:
     """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
     Args:
         folder: a finished run.
-        ground_of: gives the ground of failures; without it they are not shown on maps.
+        record_failures: records failures again, as `run.again.record_failures` does of the folder; without it none is
+            shown on a map.
         out: where to; the run folder when not given.
 
     Returns:
         What was written of.
     """
-    report, out = read_report(folder, ground_of), out or folder
+    report, out = read_report(folder, record_failures), out or folder
     name = folder.resolve().name
     write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
@@ -211,10 +215,10 @@ def _charts(report: Report) -> Iterator[ToDraw]:
 
 def _trajectories(folder: Path, summary: pd.DataFrame) -> Iterator[ToDraw]:
     """The figure of recorded episodes; none where nothing was recorded."""
-    recorded = read_snapshots(folder)
-    chosen = choose_snapshots(recorded, list(summary["condition"]))
+    recorded = read_recordings(folder)
+    chosen = choose_recordings(recorded, list(summary["condition"]))
     if chosen:
-        whole = [_TO_THE_END] if any(snapshot.field is not None for snapshot in chosen) else []
+        whole = [_TO_THE_END] if any(recording.field is not None for recording in chosen) else []
         count = f"{len(chosen)} of {len(recorded)} recorded episodes."
         yield (
             "trajectories",

@@ -26,7 +26,7 @@ from benchnav.eval.folder.folder import (
 )
 from benchnav.eval.folder.sameness import differences
 from benchnav.eval.folder.steps import align_steps
-from benchnav.eval.run.driven_ground import keep_ground
+from benchnav.eval.run.again import keep_ground
 
 _COPIED = ("units", "steps", "playback")
 

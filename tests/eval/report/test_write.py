@@ -47,7 +47,8 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         for name, about in known.items()
     }
     commands = ["benchnav-eval run --seeds '[0,7]'"]
-    return forge_run(folder, rows, known, **({"commands": commands} | changes))
+    history = [{"commit": "abc", "benchnav": "0.8"}]
+    return forge_run(folder, rows, known, **({"commands": commands, "history": history} | changes))
 
 
 @pytest.mark.usefixtures("whole_fonts")

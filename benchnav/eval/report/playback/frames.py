@@ -17,10 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map, unit
-from benchnav.eval.report.charts.maps import plan_layer, soft_lines
-from benchnav.eval.report.recorded.drawn_plan import STYLES
-from benchnav.eval.report.recorded.ground import field_colours, immobilised_at
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.recording import Recording
+from benchnav.eval.report.layers import STYLES, field_colours, plan_layer, soft_lines
 from benchnav.eval.report.words import condition_name, contender_names
 
 # Red, green, blue of the robot, as no λ is coloured.
@@ -162,7 +160,7 @@ class _Column:
         self._time.set_text(f"t = {now * recording.dt_s:5.1f} s   observed λ = {met}")
         self._outcome.set_text(recording.outcome if has_ended else "")
         self._outcome.set_color("#00684a" if recording.about["outcome"] == "success" else "#a00000")
-        held = immobilised_at(recording.about, track) if has_ended else None
+        held = recording.immobilised_at if has_ended else None
         for cross in self._crosses:
             cross.set_data(*(([], []) if held is None else ([held[0]], [held[1]])))
 
@@ -182,7 +180,7 @@ def _draw_ground(panels: Sequence[Axes], recording: Recording) -> None:
     for panel, words in zip(panels, ("terrain and plan", title), strict=True):
         mark(panel, "start", recording.states[0, :2], _MARKS)
         mark(panel, "goal", recording.goal_m, _MARKS)
-        panel.set(xlim=(0, extent_m[0]), ylim=(0, extent_m[1]), aspect="auto", xticks=[], yticks=[])
+        panel.set(aspect="auto", xticks=[], yticks=[])
         panel.text(
             0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
             bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},

@@ -13,6 +13,7 @@ from benchnav.core.figures import bytes_of, condition_colours
 from benchnav.core.store import replacing
 from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.robot import (
     TIMELINE,
     Driver,
@@ -23,13 +24,23 @@ from benchnav.eval.report.playback.robot import (
     log_series,
 )
 from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
-from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
 
 _ALONE = (0, 170, 0)
 _ALL, _PLACES = "/map/overlay/**", "/map/places/**"
+
+
+def write_viewer_files(folder: Path) -> None:
+    """Writes the viewer's file of each recording in a run folder that has none.
+
+    Args:
+        folder: the run folder.
+    """
+    for path in sorted((folder / "playback").glob("*.npz")):
+        if not path.with_suffix(".rrd").exists():
+            write_rerun([Recording.load(path)], path.with_suffix(".rrd"))
 
 
 def write_rerun(recordings: Sequence[Recording], path: Path) -> None:

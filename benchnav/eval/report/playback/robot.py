@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground, shades
-from benchnav.eval.report.recorded.drawn_plan import STYLES, drawing_interval, thinned
-from benchnav.eval.report.recorded.ground import immobilised_at
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.recording import Recording, drawing_interval, thinned
+from benchnav.eval.report.layers import STYLES, shades
+from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground
 
 TIMELINE = "time"
 
@@ -165,7 +164,7 @@ def log_outcome(stream: Any, driver: Driver) -> None:
         ("map/overlay", rr.Points2D(flat, labels=words, show_labels=True, colors=[driver.colour], radii=0.1)),
     ):
         stream.log(driver.entity(root, "outcome"), mark)
-    place = immobilised_at(recording.about, recording.states[:, :2])
+    place = recording.immobilised_at
     if place is None:
         return
     cross = (place + _CROSS_M * _CROSS).astype(np.float32)

@@ -6,13 +6,12 @@ bottom.
 
 from typing import Any
 
-import matplotlib
 import numpy as np
 
-from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, bytes_of
+from benchnav.core.figures import MARKS, bytes_of
 from benchnav.core.grid import Grid
-from benchnav.eval.report.recorded.ground import SOFT, field_colours, hatching, outline
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.recording import Recording
+from benchnav.eval.report.layers import SOFT, field_colours, hatching, outline, shades
 
 _LIFT_M = 0.12
 _CLOSED = (240, 240, 240)
@@ -113,8 +112,3 @@ def cells_of(grid: Grid, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the cells that positions lie in, or of the nearest ones."""
     cell = np.floor(place / grid.resolution_m).astype(int)
     return cell[:, 1].clip(0, grid.height - 1), cell[:, 0].clip(0, grid.width - 1)
-
-
-def shades(values: np.ndarray) -> np.ndarray:
-    """Colours of λ, uint8, from any shape to [..., 3]."""
-    return np.round(255 * matplotlib.colormaps[TRAVERSABILITY_COLOURS](values)[..., :3]).astype(np.uint8)

@@ -8,17 +8,17 @@ from matplotlib.axes import Axes
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.figures import planner_colours, save_twice
+from benchnav.eval.recording import GROUND, Ground
 from benchnav.eval.report import write
-from benchnav.eval.report.charts.driven import GROUND, DrivenGround, read_driven, telling_map
-from benchnav.eval.report.charts.maps import driven_figure
-from benchnav.eval.report.recorded.ground import IMMOBILISING
+from benchnav.eval.report.charts.maps import driven_figure, read_driven
+from benchnav.eval.report.layers import IMMOBILISING
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
 
 RISKS = ("mean", "cvar:0.5", "cvar:0.9")
 
 
-def ground(**changes: Any) -> DrivenGround:
+def ground(**changes: Any) -> Ground:
     field = np.linspace(0, 1, 40 * 60, dtype=np.float32).reshape(40, 60)
     about = {
         "data": "paper-v1",
@@ -32,7 +32,7 @@ def ground(**changes: Any) -> DrivenGround:
         "about": about, "resolution_m": 0.5, "rgb": np.full((3, 40, 60), 100, np.uint8), "field": field,
         "immobilising": field < 0.1, "goal_m": np.array([24.0, 15.0], np.float32),
     }  # fmt: skip
-    return DrivenGround(**(given | changes))
+    return Ground(**(given | changes))
 
 
 def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
@@ -47,32 +47,6 @@ def episodes(ended: dict[int, list[bool]]) -> pd.DataFrame:
 def track(place: int) -> np.ndarray:
     x = np.linspace(2, 20, 30)
     return np.stack((x, 3 + 0.3 * x + place), axis=1).astype(np.float32)
-
-
-@pytest.mark.parametrize(
-    ("ended", "map_index"),
-    [
-        ({0: [True] * 3, 1: [True, False, True], 2: [False] * 3}, 1),
-        ({0: [True] * 3, 1: [False] * 3}, 0),
-        ({0: [True, False], 4: [False, False, True]}, 4),  # more conditions
-    ],
-)
-def test_the_map_is_one_on_which_outcomes_differ(ended: dict[int, list[bool]], map_index: int) -> None:
-    about = telling_map(episodes(ended))
-    assert about == {"data": "paper-v1", "scenario": "std", "world": "stakes", "seed": 0, "realisation": 0,
-                     "map": map_index}  # fmt: skip
-    assert type(about["seed"]) is int
-
-
-def test_noise_and_worlds_tell_maps_apart() -> None:
-    labels = [made.condition(risk=risk, world=world) for world in ("a", "b") for risk in RISKS]
-    rows = made.rows(
-        made.row(one, seed=seed, realisation=draw, time_s=None if (seed, draw, one["risk"], one["world"]) ==
-                 (7, 1, "mean", "b") else 9.0)
-        for one in labels for seed in (0, 7) for draw in (0, 1)
-    )  # fmt: skip
-    about = telling_map(rows)
-    assert (about["world"], about["seed"], about["realisation"]) == ("b", 7, 1)
 
 
 def drawn(figure: Any) -> tuple[Axes, dict[str, np.ndarray]]:
@@ -200,11 +174,11 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
     for one in (ground(), ground(field=None)):
         one.save(tmp_path / "a.npz")
-        again = DrivenGround.load(tmp_path / "a.npz")
+        again = Ground.load(tmp_path / "a.npz")
         assert (again.about, again.resolution_m) == (one.about, 0.5)
         assert (again.field is None) == (one.field is None)
         np.testing.assert_array_equal(again.immobilising, one.immobilising)
     path = tmp_path / "a.npz"
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(ConfigError, match=r"a\.npz is damaged"):
-        DrivenGround.load(path)
+        Ground.load(path)

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 from rerun.chunk import RrdReader
 
-from benchnav.eval.report.playback.files import write_viewer_files
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.recording import Recording
+from benchnav.eval.report.playback.rerun_file import write_viewer_files
 from tests.eval.report import made
 
 

@@ -5,10 +5,9 @@ import matplotlib
 import numpy as np
 import pytest
 
+from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
+from benchnav.eval.report.layers import IMMOBILISING, field_colours, hatching, outline
 from benchnav.eval.report.playback.rerun_file import arrange, describe, drivers_of, map_views, write_rerun
-from benchnav.eval.report.recorded.drawn_plan import MOST_POINTS, DrawnPlan, thinned
-from benchnav.eval.report.recorded.ground import IMMOBILISING, field_colours, hatching, outline
-from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
 

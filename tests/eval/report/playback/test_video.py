@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from benchnav.core.errors import ConfigError
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.frames import ROBOT, Frames
 from benchnav.eval.report.playback.video import FRAMES_A_SECOND, HOLD_S, SPEED, frame_times, write_video
-from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 
 

@@ -7,11 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from benchnav.eval.report.recorded.ground import (
+from benchnav.eval.report.layers import (
     IMMOBILISING,
     field_colours,
     hatching,
-    immobilised_at,
     outline,
 )
 
@@ -99,12 +98,3 @@ def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
         assert (row == line).sum() == 3
     starts = {tuple(point) for point in lines[:, 0]}
     assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)
-
-
-@pytest.mark.parametrize("outcome", ["immobilised", "stuck", "success"])
-def test_an_immobilised_robot_is_where_its_episode_ended(outcome: str) -> None:
-    place = immobilised_at({"outcome": outcome}, np.array([[1.0, 2.0], [3.0, 4.0]]))
-    if outcome == "immobilised":
-        np.testing.assert_array_equal(place, [3.0, 4.0])
-    else:
-        assert place is None
