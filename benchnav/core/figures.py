@@ -18,7 +18,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Bbox
 
 from benchnav.core.store import replacing
@@ -205,73 +204,6 @@ def legend_outside(
             labelled.setdefault(label, handle)
     loc: Any = f"outside {side} center"
     return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
-
-
-def legend_at(
-    figure: Figure,
-    handles: Sequence[Artist],
-    place: tuple[float, float],
-    columns: int,
-    loc: Any = "upper left",
-) -> None:
-    """Lays a legend with its corner `loc` at (left, top) in inches from the upper left corner of a figure."""
-    width, height = figure.get_size_inches()
-    legend = figure.legend(
-        handles=handles, loc=loc, ncols=columns, bbox_to_anchor=(place[0] / width, 1 - place[1] / height),
-        bbox_transform=figure.transFigure, fontsize=TEXT, frameon=False, borderpad=0, borderaxespad=0,
-        handlelength=1.1, handletextpad=0.4, columnspacing=1, labelspacing=0.3,
-    )  # fmt: skip
-    for text in legend.get_texts():
-        text.set_parse_math(False)
-
-
-def add_axes(figure: Figure, place: tuple[float, float, float, float], label: str) -> Axes:
-    """Adds a panel at (left, top, width, height) in inches from the upper left corner."""
-    left, top, wide, high = place
-    width, height = figure.get_size_inches()
-    return figure.add_axes(
-        (left / width, 1 - (top + high) / height, wide / width, high / height), label=label
-    )
-
-
-def add_bar(
-    figure: Figure,
-    image: Any,
-    place: tuple[float, float, float, float],
-    label: str,
-    extend: str = "neither",
-    most: int = 4,
-) -> Axes:
-    """Adds a colour bar that lies at (left, top, width, height) in inches, with at most so many intervals."""
-    bar = add_axes(figure, place, label)
-    drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
-    drawn.outline.set_linewidth(0.5)
-    bar.xaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
-    bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
-    return bar
-
-
-def number_map(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
-    """Numbers the axes of a map's panel.
-
-    Args:
-        panel: the map's.
-        size: width and height in inches.
-        left: whether the numbers of the y-axis are shown.
-        bottom: whether those of the x-axis are.
-    """
-    for axis, inches in zip((panel.xaxis, panel.yaxis), size, strict=True):
-        # A tick at the very end is left out, as its number would touch the next panel's first.
-        most = min(max(int(inches / 0.2), 1), 4)
-        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
-    thin_ticks(panel, labelleft=left, labelbottom=bottom)
-
-
-def write(figure: Figure, left: float, top: float, text: str, size: float = TEXT, **style: Any) -> None:
-    """Writes text at a place in inches from the upper left corner."""
-    width, height = figure.get_size_inches()
-    figure.text(left / width, 1 - top / height, text, size=size, parse_math=False, **style)
 
 
 def thin_ticks(panel: Axes, **style: Any) -> None:

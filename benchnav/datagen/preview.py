@@ -29,15 +29,12 @@ from benchnav.core.figures import (
     TITLE,
     TRAVERSABILITY_COLOURS,
     TWO_COLUMNS_IN,
-    add_axes,
-    add_bar,
-    legend_at,
     mark,
     mark_handle,
-    number_map,
     save,
     show_map,
-    write,
+    styled,
+    thin_ticks,
 )
 from benchnav.core.grid import Grid
 from benchnav.datagen.files.reader import TerrainDataset
@@ -55,8 +52,8 @@ TITLES = {
 STEEP_DEG = 30.0
 
 _PAGE, _DPI = 9.4, 300.0
-_LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.1, 0.42, 0.94, 0.12
-_LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.0
+_SIDES, _ENDS = 0.7, 1.5  # what is not maps of a sheet's width and height
+_LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.15
 _HATCH = "//////"
 _READ_MAPS = 20
 _MARK_SIZE = 0.75
@@ -137,7 +134,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     veils = _hillshade(maps["elevation_m"], maps["slope_deg"], grid.resolution_m)
     extent = (0.0, grid.extent_m[0], 0.0, grid.extent_m[1])
     for row in range(len(indices)):
-        show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m, aspect="auto")
+        show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m)
         _draw_contours(panels[f"elevation_m {row}"], maps["elevation_m"][row], levels, grid)
         _draw_soft_ground(panels[f"class_id {row}"], soft[row], extent, hatched=True)
         _draw_soft_ground(panels[f"traversability {row}"], soft[row], extent)
@@ -171,6 +168,7 @@ class SheetColumn:
     most: int = 4
 
 
+@styled()
 def sheet_of_maps(
     columns: Sequence[SheetColumn],
     rows: Sequence[str],
@@ -182,55 +180,53 @@ def sheet_of_maps(
     """Draws maps side by side, a row a map and a column a layer, for the page of a paper.
 
     Args:
-        columns: of R rows each; those without a colour bar first.
+        columns: of R rows each.
         rows: names of the R rows.
         extent_m: size of a map along x and y.
         heading: over everything.
-        classes: entries of the legend, which stands under the columns without a bar, or, where it is long, under
-            everything.
+        classes: entries of the legend under everything.
         marks: entries of a legend beside the heading.
 
     Returns:
         A figure as wide as a page; narrower where panels shrink to fit one, wider where columns are many.
     """
     ratio, across = extent_m[1] / extent_m[0], len(columns)
-    widest = max((TWO_COLUMNS_IN - _LEFT - _RIGHT + _GAP) / across - _GAP, _COLUMN)
-    high = min(widest * ratio, 2.0, max((_PAGE - _TOP - 1.1) / len(rows) - _GAP, 0.8))
-    wide = high / ratio
-    column_in, row_in = max(wide, _COLUMN), max(high, 0.5)
-    bottom = _TOP + len(rows) * (row_in + _GAP) - _GAP
-    width = _LEFT + across * (column_in + _GAP) - _GAP + _RIGHT
-    entry = 0.28 + _LETTER * max((len(str(patch.get_label())) for patch in classes), default=0)
-    beside = sum(column.unit is None for column in columns) * (column_in + _GAP) - _GAP
-    legend_columns, legend_top = max(1, int(beside / entry)), bottom + 0.34
-    if len(classes) > 6 * legend_columns:
-        legend_columns, legend_top = max(1, int((width - _LEFT) / entry)), bottom + _FOOT
-    legend_bottom = legend_top + _LINE * -(-len(classes) // legend_columns) + 0.03
-    figure = Figure(figsize=(width, max(bottom + _FOOT, legend_bottom)), dpi=_DPI)
-    middles = _TOP + row_in / 2 + np.arange(len(rows)) * (row_in + _GAP)
-    for number, column in enumerate(columns):
-        centre = _LEFT + column_in / 2 + number * (column_in + _GAP)
-        for row, middle in enumerate(middles):
-            place = (centre - wide / 2, middle - high / 2, wide, high)
-            panel = add_axes(figure, place, f"{column.name} {row}")
-            panel.set_facecolor(LACKING)
-            image = show_map(panel, column.layers[row], extent_m, aspect="auto", **column.shades)
-            number_map(panel, (wide, high), left=number == 0, bottom=row == len(rows) - 1)
-        write(figure, centre, _TOP - 0.05, column.title, size=TITLE, ha="center", va="bottom")
+    widest = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
+    high = min(widest * ratio, 2.0, max((_PAGE - _ENDS) / len(rows), 0.8))
+    width = across * max(high / ratio, _COLUMN) + _SIDES
+    letters = max((len(str(patch.get_label())) for patch in classes), default=0)
+    legend_columns = max(1, int(width / (0.4 + _LETTER * letters)))
+    ends = _ENDS + _LINE * -(-len(classes) // legend_columns)
+    height = len(rows) * max(high, 0.5) + ends
+    figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    panels = figure.subplots(len(rows), across, squeeze=False, sharex=True, sharey=True)
+    for column, below in zip(columns, panels.T, strict=True):
+        for row, panel in enumerate(below):
+            panel.set(label=f"{column.name} {row}", facecolor=LACKING)
+            image = show_map(panel, column.layers[row], extent_m, **column.shades)
+            thin_ticks(panel)
+        below[0].set_title(column.title)
         if column.unit is not None:
-            place = (centre - column_in / 2 + 0.06, bottom + 0.44, column_in - 0.12, 0.07)
-            bar = add_bar(figure, image, place, f"{column.name} bar", column.extend, column.most)
-            bar.set_xlabel(column.unit, size=TEXT, labelpad=1.5, linespacing=1.1)
-    for name, middle in zip(rows, middles, strict=True):
-        write(figure, 0.1, middle, name, rotation=90, ha="center", va="center")
-    write(figure, 0.25, middles.mean(), "y [m]", rotation=90, ha="center", va="center")
-    x_middle = _LEFT + column_in / 2 + across // 2 * (column_in + _GAP)
-    write(figure, x_middle, bottom + 0.2, "x [m]", ha="center", va="top")
-    write(figure, _LEFT, 0.06, heading, size=TITLE, va="top")
-    if marks:
-        legend_at(figure, marks, (width - _RIGHT, 0.06), len(marks), "upper right")
-    if classes:
-        legend_at(figure, classes, (_LEFT, legend_top), legend_columns)
+            bar = figure.colorbar(
+                image, ax=list(below), location="bottom", extend=column.extend, aspect=14, panchor=False,
+                ticks=MaxNLocator(column.most, steps=[1, 2, 2.5, 5, 10]), format="%g",
+            )  # fmt: skip
+            bar.set_label(column.unit, size=TEXT)
+            bar.ax.set_label(f"{column.name} bar")
+    for axis, inches in ((panels[0, 0].xaxis, high / ratio), (panels[0, 0].yaxis, high)):
+        # A tick at the very end is left out, as its number would touch the next panel's first.
+        most = min(max(int(inches / 0.2), 1), 4)
+        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
+    for panel, name in zip(panels[:, 0], rows, strict=True):
+        panel.set_ylabel(name, size=TEXT)
+    panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
+    figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
+    figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
+    for handles, count, side in ((marks, len(marks), "upper right"), (classes, legend_columns, "lower left")):
+        if handles:
+            legend = figure.legend(handles=handles, loc=f"outside {side}", ncols=count)
+            for text in legend.get_texts():
+                text.set_parse_math(False)
     return figure
 
 
@@ -270,8 +266,8 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     # A whole number of dots a cell keeps all cells of one size, unless that takes too many dots.
     dots = max(1, round(_DPI * wide / across)) * across / wide
     figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
-    write(figure, gap, 0.05, "\n".join(lines), size=TITLE, va="top")
-    sheet = add_axes(figure, (0, 0, width, height), "thumbnails")
+    figure.text(gap / width, 1 - 0.05 / height, "\n".join(lines), size=TITLE, va="top", parse_math=False)
+    sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
     outline: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]

@@ -49,7 +49,7 @@ def test_one_episode_is_shown_alone(folder: Path, capsys: pytest.CaptureFixture[
     assert call("replay", str(folder), *asked, "--view", "no") == 0
     printed = capsys.readouterr().out
     path = shown(printed)
-    assert path.name.startswith("Faulty-cvar_0-5-std")
+    assert path.name.startswith("Faulty-cvar-0-5-std")
     assert path.name.endswith("00001.rrd")
     assert "/world/robot" in entities(path)
     assert "rerun" in printed.splitlines()[-1]

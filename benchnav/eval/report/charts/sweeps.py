@@ -1,6 +1,6 @@
 """Sweeps of a run: conditions that are equal in all but one number, which takes three values or more, as curves."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from benchnav.core.figures import (
     condition_colours,
     legend_outside,
     planner_name,
+    stack_panels,
     styled,
 )
 from benchnav.datagen.recipe.scenario import find_series
@@ -71,15 +72,6 @@ class Sweep:
     lines: tuple[Line, ...]
 
 
-def flatten(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Names every entry of nested mappings by its path with dots; a list is an entry."""
-    flat: dict[str, Any] = {}
-    for name, inner in value.items():
-        path = f"{before}{name}"
-        flat |= flatten(inner, f"{path}.") if isinstance(inner, Mapping) else {path: inner}
-    return flat
-
-
 def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
     """Finds the sweeps of a run.
 
@@ -91,54 +83,37 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
     Returns:
         By name of the number.
     """
+    points = []
     flat = {
-        condition: flatten(about["value"])
+        condition: pd.json_normalize(dict(about["value"])).to_dict("records")[0]
         for condition, about in conditions.items()
         if "split" in about["value"]
     }
-    numbers = sorted({name for one in flat.values() for name, value in one.items() if _is_number(value)})
-    sweeps = [Sweep(number=name, lines=tuple(_lines(_along(flat, name)))) for name in numbers]
-    sweeps.append(Sweep(number=SEVERITY, lines=tuple(_lines(_along_severity(flat)))))
-    return [sweep for sweep in sweeps if sweep.lines]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-Found = Iterator[tuple[str, float, dict[str, Any]]]
-
-
-def _along(flat: Mapping[str, Mapping[str, Any]], name: str) -> Found:
-    """Conditions with their value of a number, and all else."""
-    for condition, one in flat.items():
-        if _is_number(one.get(name)):
-            yield condition, float(one[name]), {key: value for key, value in one.items() if key != name}
-
-
-def _along_severity(flat: Mapping[str, Mapping[str, Any]]) -> Found:
-    for scenario, pairs in find_series(dict.fromkeys(one["split"] for one in flat.values())).items():
+    for condition, value in flat.items():
+        for name, number in value.items():
+            if isinstance(number, int | float) and not isinstance(number, bool):
+                rest = {key: other for key, other in value.items() if key != name}
+                points.append((name, condition, float(number), rest))
+    points.sort(key=lambda point: point[0])
+    for scenario, pairs in find_series(dict.fromkeys(value["split"] for value in flat.values())).items():
         severities = {split: severity for severity, split in pairs}
-        for condition, one in flat.items():
-            if one["split"] in severities:
-                yield condition, severities[one["split"]], {**one, "split": scenario}
-
-
-def _lines(found: Found) -> Iterator[Line]:
-    table = pd.DataFrame(
-        [(condition, value, repr(sorted(rest.items())), rest) for condition, value, rest in found]
-    )
-    if table.empty:
-        return
-    table.columns = pd.Index(["condition", "value", "key", "rest"])
-    for _, group in table.groupby("key", sort=False):
+        for condition, value in flat.items():
+            if value["split"] in severities:
+                rest = {**value, "split": scenario}
+                points.append((SEVERITY, condition, severities[value["split"]], rest))
+    lines: dict[str, list[Line]] = {}
+    table = pd.DataFrame(points, columns=["number", "condition", "value", "rest"])
+    table["key"] = [repr(sorted(rest.items())) for rest in table["rest"]]
+    for (number, _), group in table.groupby(["number", "key"], sort=False):
         if group["value"].nunique() >= LEAST_VALUES:
             ordered = group.sort_values("value", kind="stable")
-            yield Line(
+            line = Line(
                 values=tuple(ordered["value"]),
                 conditions=tuple(ordered["condition"]),
                 rest=group["rest"].iloc[0],
             )
+            lines.setdefault(number, []).append(line)
+    return [Sweep(number=number, lines=tuple(own)) for number, own in lines.items()]
 
 
 def sweep_name(number: str) -> str:
@@ -178,28 +153,22 @@ class _Curves:
         down = -(-len(groups) // across)
         width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
         figure = Figure(figsize=(width, 3.3 * down + 0.5), layout="constrained")
-        axes = figure.subplots(2 * down, across, squeeze=False, sharex=True, sharey=False)
-        for panel in axes.flat:
-            panel.set_visible(False)
-        for place, (title, lines) in enumerate(groups):
-            row, column = divmod(place, across)
-            above, below = axes[2 * row : 2 * row + 2, column]
+        stacks = stack_panels(figure, len(groups), across, layers=2, sharex=True)
+        for place, ((above, below), (title, lines)) in enumerate(zip(stacks, groups, strict=True)):
             for panel, (label, columns) in zip((above, below), _MEASURES.items(), strict=True):
-                panel.set_visible(True)
                 self.draw_references(panel, lines, columns)
                 for line in lines:
                     self.draw_line(panel, line, columns)
                 panel.grid(axis="y", color="0.9")
-                if column == 0:
+                if place % across == 0:
                     panel.set_ylabel(label)
             above.set_title(title)
-            above.tick_params(labelbottom=False)
             below.tick_params(labelbottom=True)
             below.set_xlabel(_NAMES.get(self.sweep.number, sweep_name(self.sweep.number)))
             values = sorted({value for line in self.sweep.lines for value in line.values})
             below.set_xticks(self.places(values), [f"{value:g}" for value in values])
-        for first in range(2):
-            _share_heights(list(axes[first::2].flat))
+        for panels in zip(*stacks, strict=True):
+            _share_heights(panels)
         legend_outside(figure, list(self.references.values()), 2 if across == 1 else 4)
         return figure
 
@@ -213,11 +182,8 @@ class _Curves:
                 groups = _with_blind(groups)
             if max(map(len, groups.values())) <= _MOST_LINES:
                 break
-        differing = [len(set(labels)) > 1 for labels in zip(*groups, strict=True)]
-        return [
-            (joined(label for label, shown in zip(key, differing, strict=True) if shown) or key[0], lines)
-            for key, lines in groups.items()
-        ]
+        differing = [place for place, labels in enumerate(zip(*groups, strict=True)) if len(set(labels)) > 1]
+        return [(joined(key[place] for place in differing) or key[0], lines) for key, lines in groups.items()]
 
     def first(self, line: Line) -> Labels:
         """The labels of a line, of which all conditions have the same but for the number."""
@@ -310,8 +276,7 @@ def _style(place: int) -> Any:
 
 def _share_heights(panels: Sequence[Axes]) -> None:
     """Gives panels of one measure the same range, and numbers at the left alone."""
-    shown = [panel for panel in panels if panel.get_visible()]
-    ends = np.array([panel.get_ylim() for panel in shown])
-    for panel in shown:
+    ends = np.array([panel.get_ylim() for panel in panels])
+    for panel in panels:
         panel.set_ylim(ends[:, 0].min(), ends[:, 1].max())
         panel.tick_params(labelleft=bool(panel.get_ylabel()))

@@ -80,11 +80,6 @@ class Frames:
                     self._figure.draw_artist(artist)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def pixel_of(self, place: int, x_m: float, y_m: float) -> tuple[float, float]:
-        """Where a position on the terrain of an episode is in a frame: column and row from the top."""
-        x, y = self._columns[place].panels[0].transData.transform((x_m, y_m))
-        return float(x), float(self.size[1] - y)
-
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
         across, up = self.size
         return self._figure.add_axes((left / across, bottom / up, width / across, height / up))

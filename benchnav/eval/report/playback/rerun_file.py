@@ -148,36 +148,28 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
-    about = drivers[0].recording.about
-    lines = [f"# {about['data']}, {about['scenario']} {about['map']}", ""]
-    lines += [f"Seed {about['seed']}, realisation {about['realisation']}", ""]
+    recording = drivers[0].recording
+    about = recording.about
+    lines = [
+        f"# {about['data']}, {about['scenario']} {about['map']}",
+        f"Seed {about['seed']}, realisation {about['realisation']}",
+    ]
     if len(drivers) == 1:
-        recording = drivers[0].recording
-        lines += [
-            f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s",
-            "",
-        ]
-        lines += [
-            f"observed λ on average: {_mean_observed(recording)}",
-            "",
-            f"Free: {free_rule(recording)}",
-            "",
-        ]
+        ended = f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s"
+        met = f"observed λ on average: {_mean_observed(recording)}"
         used = tuple((name, about[name]) for name in NAMING if about.get(name, NOT_USED) != NOT_USED)
-        return "\n".join([*lines, to_markdown(Table(headings=("", ""), rows=used))])
-    rows = tuple(
-        (
-            driver.name,
-            driver.recording.outcome,
-            f"{driver.recording.end_s:.1f}",
-            _mean_observed(driver.recording),
-            free_rule(driver.recording),
-        )
-        for driver in drivers
+        table = Table(headings=("", ""), rows=used)
+        return "\n\n".join([*lines, ended, met, f"Free: {free_rule(recording)}", to_markdown(table)])
+    rows = []
+    for driver in drivers:
+        own = driver.recording
+        rows.append((driver.name, own.outcome, f"{own.end_s:.1f}", _mean_observed(own), free_rule(own)))
+    table = Table(
+        headings=("condition", "outcome", "time [s]", "observed λ", "free"),
+        rows=tuple(rows),
+        bold=frozenset((place, 1) for place in range(len(rows))),
     )
-    headings = ("condition", "outcome", "time [s]", "observed λ", "free")
-    table = Table(headings=headings, rows=rows, bold=frozenset((place, 1) for place in range(len(rows))))
-    return "\n".join([*lines, to_markdown(table)])
+    return "\n\n".join([*lines, to_markdown(table)])
 
 
 def free_rule(recording: Recording) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.eval.report.layers import STYLES, shades
-from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground
+from benchnav.eval.report.playback.scene import LIFT_M, cells_of, log_both, on_map, over_ground
 
 TIMELINE = "time"
 
@@ -43,6 +43,10 @@ class Driver:
         own = ["conditions", rr.escape_entity_path_part(self.name)] if self.name else []
         return "/".join([root, *own, *([leaf] if leaf else [])])
 
+    def entities(self, leaf: str) -> tuple[str, str]:
+        """Paths of what is its own over the ground and on the maps."""
+        return self.entity("world", leaf), self.entity("map/overlay", leaf)
+
 
 def log_robot(stream: Any, driver: Driver) -> None:
     """Logs where the robot is and where it heads, at every step."""
@@ -51,8 +55,7 @@ def log_robot(stream: Any, driver: Driver) -> None:
     recording = driver.recording
     states = recording.states
     times = rr.TimeColumn(TIMELINE, duration=np.arange(len(states)) * recording.dt_s)
-    place = states[:, :2].astype(np.float32)
-    lifted, flat = over_ground(recording, place), on_map(recording.grid, place)
+    lifted, flat = over_ground(recording, recording.track), on_map(recording.grid, recording.track)
     cos, sin, none = np.cos(states[:, 2]), np.sin(states[:, 2]), np.zeros(len(states))
     ahead = _HEADING_M * np.stack((cos, sin, none), axis=1)
     ahead_flat = _HEADING_M / recording.grid.resolution_m * np.stack((cos, -sin), axis=1)
@@ -72,7 +75,7 @@ def log_series(stream: Any, driver: Driver) -> None:
     import rerun as rr
 
     recording = driver.recording
-    place = recording.states[:-1, :2].astype(np.float32)
+    place = recording.track[:-1]
     times = rr.TimeColumn(TIMELINE, duration=np.arange(len(place)) * recording.dt_s)
     what = {
         "traversability": (recording.traversability, "met"),
@@ -97,7 +100,7 @@ def log_series(stream: Any, driver: Driver) -> None:
 def log_driven(stream: Any, driver: Driver) -> None:
     """Logs the path driven so far, coloured by the observed λ, or in the robot's colour where it is not alone."""
     recording = driver.recording
-    place = recording.states[:, :2].astype(np.float32)
+    place = recording.track
     count, every = len(recording.traversability), drawing_interval(recording.dt_s)
     colours = shades(recording.traversability)
     for piece, first in enumerate(range(0, count, _PIECE * every)):
@@ -138,11 +141,8 @@ def _log_strips(
     """Logs lines, each of shape [N, 2], over the ground and on the maps; the radii are in metres and in cells."""
     import rerun as rr
 
-    recording = driver.recording
-    lifted = [over_ground(recording, line) for line in lines]
-    flat = [on_map(recording.grid, line) for line in lines]
-    stream.log(driver.entity("world", leaf), rr.LineStrips3D(lifted, colors=colours, radii=radii[0]))
-    stream.log(driver.entity("map/overlay", leaf), rr.LineStrips2D(flat, colors=colours, radii=radii[1]))
+    kinds = (rr.LineStrips3D, rr.LineStrips2D)
+    log_both(stream, driver.recording, driver.entities(leaf), kinds, lines, radii, colors=colours)
 
 
 def _same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
@@ -154,31 +154,18 @@ def log_outcome(stream: Any, driver: Driver) -> None:
     import rerun as rr
 
     recording = driver.recording
-    end = recording.states[-1:, :2].astype(np.float32)
     words = [f"{driver.name}: {recording.outcome}" if driver.name else recording.outcome]
-    lifted, flat = over_ground(recording, end), on_map(recording.grid, end)
-    lifted[:, 2] += 0.6
     stream.set_time(TIMELINE, duration=recording.end_s)
-    for root, mark in (
-        ("world", rr.Points3D(lifted, labels=words, show_labels=True, colors=[driver.colour], radii=0.05)),
-        ("map/overlay", rr.Points2D(flat, labels=words, show_labels=True, colors=[driver.colour], radii=0.1)),
-    ):
-        stream.log(driver.entity(root, "outcome"), mark)
-    place = recording.immobilised_at
-    if place is None:
+    log_both(
+        stream, recording, driver.entities("outcome"), (rr.Points3D, rr.Points2D), recording.track[-1:],
+        (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[driver.colour],
+    )  # fmt: skip
+    if recording.immobilised_at is None:
         return
-    cross = (place + _CROSS_M * _CROSS).astype(np.float32)
-    lifted, flat = over_ground(recording, cross), on_map(recording.grid, cross)
-    lifted[:, 2] += 0.3
-    for entity, crossed in (
-        (driver.entity("world", "immobilised"), rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12)),
-        (
-            driver.entity("map/overlay", "immobilised/edge"),
-            rr.LineStrips2D([flat], colors=[_EDGE], radii=0.55, draw_order=40),
-        ),
-        (
-            driver.entity("map/overlay", "immobilised/cross"),
-            rr.LineStrips2D([flat], colors=[_MARK], radii=0.3, draw_order=41),
-        ),
-    ):
-        stream.log(entity, crossed)
+    cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
+    lifted, flat = over_ground(recording, cross, LIFT_M + 0.3), on_map(recording.grid, cross)
+    world, overlay = driver.entities("immobilised")
+    stream.log(world, rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12))
+    for name, colour, radius, order in (("edge", _EDGE, 0.55, 40), ("cross", _MARK, 0.3, 41)):
+        crossed = rr.LineStrips2D([flat], colors=[colour], radii=radius, draw_order=order)
+        stream.log(f"{overlay}/{name}", crossed)

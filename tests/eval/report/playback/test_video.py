@@ -58,7 +58,9 @@ def test_a_video_has_its_frames_size_and_duration_and_the_robot_where_the_path_s
     for number in (0, 5, 12, len(times) - 1):
         for place, recording in enumerate((first, second)):
             step = min(round(times[number] / recording.dt_s), len(recording.traversability))
-            expected = frames.pixel_of(place, *recording.states[step, :2])
+            panel = frames._columns[place].panels[0]
+            x, y = panel.transData.transform(recording.states[step, :2])
+            expected = (x, frames.size[1] - y)
             found = robot_at(decoded[number], ((0, half), (half, 2 * half))[place])
             np.testing.assert_allclose(found, expected, atol=5)
 
