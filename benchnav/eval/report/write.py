@@ -33,7 +33,7 @@ from benchnav.eval.report.failure_choice import RecordFailures, Sheets, collect_
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
-from benchnav.eval.report.page import Drawn, write_page
+from benchnav.eval.report.page import write_page
 from benchnav.eval.report.tables import LATENCIES, is_grouped, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
 from benchnav.eval.stats.best import against_best, privileged_models
@@ -154,7 +154,7 @@ def write_report(
         write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
         shown = hypothesis_table(report.tests, is_grouped(report.summary))
         write_text(out / "hypotheses.tex", to_latex([shown], _HYPOTHESES, f"{name}-hypotheses"))
-    figures = []
+    figures = {}
     for figure_name, caption, draw, trim in (
         *_charts(report),
         *_trajectories(folder, report.summary),
@@ -162,7 +162,7 @@ def write_report(
     ):
         path = out / "figures" / f"{figure_name}.png"
         save_twice(draw(), path, trim)
-        figures.append(Drawn(path=path, caption=caption))
+        figures[path] = caption
     write_text(out / "summary.md", _as_markdown(report, figures))
     page = write_page(
         name, report.header, report.warnings, report.findings, report.table, figures, report.about
@@ -313,7 +313,7 @@ def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:
     return [f"In {episodes} a planner or model failed; tracebacks: {folder / ERRORS}"]
 
 
-def _as_markdown(report: Report, figures: Sequence[Drawn]) -> str:
+def _as_markdown(report: Report, figures: Mapping[Path, str]) -> str:
     lines = ["# Run summary", "", "## What the run says", ""]
     for finding in report.findings:
         lines += [f"**{markdown(finding.title)}**", "", *_items(finding.sentences)]
@@ -322,8 +322,8 @@ def _as_markdown(report: Report, figures: Sequence[Drawn]) -> str:
         lines += ["## Hypotheses", "", to_markdown(shown), ""]
     lines += ["## Results", "", *_items(report.header), to_markdown(report.table)]
     lines += _items(report.warnings) if report.warnings else []
-    for drawn in figures:
-        lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", markdown(drawn.caption), ""]
+    for path, caption in figures.items():
+        lines += [f"![{path.stem}](figures/{path.name})", "", markdown(caption), ""]
     return "\n".join(
         [*lines, "Commands:", "", *(f"    {command}" for command in report.about["commands"]), ""]
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.recording import Recording, drawn_plan
 from benchnav.eval.stats.best import against_best, privileged_models
@@ -63,6 +64,16 @@ def _model(rows: pd.DataFrame) -> dict[str, Any]:
     """The model by its label; of planners that look at nothing, the stand-in."""
     label = rows["model"].iloc[0]
     return {"model": {"part": "oracle" if label == "–" else label, "options": {}}}
+
+
+def bold_cells(table: Table) -> set[tuple[int, int]]:
+    """Row and column of what is set in bold."""
+    return {
+        (place, column)
+        for place, row in enumerate(table.rows)
+        for column, cell in enumerate(row)
+        if isinstance(cell, Bold)
+    }
 
 
 def summarised(episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]) -> pd.DataFrame:

@@ -9,9 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import rerun as rr
+import rerun.blueprint as rrb
+
 from benchnav.core.figures import bytes_of, condition_colours
 from benchnav.core.store import replacing
-from benchnav.core.tables import Table, to_markdown
+from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.robot import (
@@ -50,8 +53,6 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         recordings: one, or several of one map.
         path: file to write; its name is what the viewer calls it.
     """
-    import rerun as rr
-
     drivers = drivers_of(recordings)
     first = recordings[0]
     # One chunk an entity, however slow the machine is: each has a header of more than a kilobyte.
@@ -95,8 +96,6 @@ def _title(drivers: Sequence[Driver]) -> str:
 
 def arrange(drivers: Sequence[Driver]) -> Any:
     """Arranges the views: the terrain and time series to the left, maps to the right."""
-    import rerun.blueprint as rrb
-
     series = [
         rrb.TimeSeriesView(
             name="Observed λ", origin="/series/traversability", axis_y=rrb.ScalarAxis(range=(0, 1))
@@ -163,11 +162,10 @@ def describe(drivers: Sequence[Driver]) -> str:
     rows = []
     for driver in drivers:
         own = driver.recording
-        rows.append((driver.name, own.outcome, f"{own.end_s:.1f}", _mean_observed(own), free_rule(own)))
+        rows.append((driver.name, Bold(own.outcome), f"{own.end_s:.1f}", _mean_observed(own), free_rule(own)))
     table = Table(
         headings=("condition", "outcome", "time [s]", "observed λ", "free"),
         rows=tuple(rows),
-        bold=frozenset((place, 1) for place in range(len(rows))),
     )
     return "\n\n".join([*lines, to_markdown(table)])
 

@@ -1,14 +1,22 @@
 """What belongs to one robot of a recording in the Rerun viewer: where it is, what it planned, drove and met."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.eval.report.layers import STYLES, shades
-from benchnav.eval.report.playback.scene import LIFT_M, cells_of, log_both, on_map, over_ground
+from benchnav.eval.report.playback.scene import (
+    LIFT_M,
+    POINTS,
+    STRIPS,
+    cells_of,
+    log_both,
+    on_map,
+    over_ground,
+)
 
 TIMELINE = "time"
 
@@ -36,12 +44,10 @@ class Driver:
     name: str
     colour: tuple[int, int, int]
 
-    def entity(self, root: str, leaf: str = "") -> str:
+    def entity(self, root: str, *leaf: str) -> str:
         """Path of what is the robot's own under a root."""
-        import rerun as rr
-
         own = ["conditions", rr.escape_entity_path_part(self.name)] if self.name else []
-        return "/".join([root, *own, *([leaf] if leaf else [])])
+        return "/".join([root, *own, *leaf])
 
     def entities(self, leaf: str) -> tuple[str, str]:
         """Paths of what is its own over the ground and on the maps."""
@@ -50,20 +56,16 @@ class Driver:
 
 def log_robot(stream: Any, driver: Driver) -> None:
     """Logs where the robot is and where it heads, at every step."""
-    import rerun as rr
-
     recording = driver.recording
-    states = recording.states
-    times = rr.TimeColumn(TIMELINE, duration=np.arange(len(states)) * recording.dt_s)
+    heading_rad = recording.states[:, 2]
+    times = rr.TimeColumn(TIMELINE, duration=np.arange(len(heading_rad)) * recording.dt_s)
     lifted, flat = over_ground(recording, recording.track), on_map(recording.grid, recording.track)
-    cos, sin, none = np.cos(states[:, 2]), np.sin(states[:, 2]), np.zeros(len(states))
-    ahead = _HEADING_M * np.stack((cos, sin, none), axis=1)
-    ahead_flat = _HEADING_M / recording.grid.resolution_m * np.stack((cos, -sin), axis=1)
-    for root, points, vectors, dots, arrows, radius in (
-        ("world", lifted, ahead, rr.Points3D, rr.Arrows3D, 0.3),
-        ("map/overlay", flat, ahead_flat, rr.Points2D, rr.Arrows2D, 0.7),
-    ):
-        robot, heading = driver.entity(root, "robot"), driver.entity(root, "heading")
+    ahead = _HEADING_M * np.stack((np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad), axis=1)
+    ahead_flat = ahead[:, :2] * (1, -1) / recording.resolution_m
+    for robot, heading, points, vectors, dots, arrows, radius in zip(
+        driver.entities("robot"), driver.entities("heading"), (lifted, flat), (ahead, ahead_flat), POINTS,
+        (rr.Arrows3D, rr.Arrows2D), (0.3, 0.7), strict=True,
+    ):  # fmt: skip
         stream.send_columns(robot, [times], dots.columns(positions=points))
         stream.send_columns(heading, [times], arrows.columns(origins=points, vectors=vectors))
         stream.log(robot, dots.from_fields(radii=[radius], colors=[driver.colour]), static=True)
@@ -72,16 +74,13 @@ def log_robot(stream: Any, driver: Driver) -> None:
 
 def log_series(stream: Any, driver: Driver) -> None:
     """Logs observed λ and predicted, the threshold of free ground, the distance to the goal, and commands."""
-    import rerun as rr
-
     recording = driver.recording
     place = recording.track[:-1]
     times = rr.TimeColumn(TIMELINE, duration=np.arange(len(place)) * recording.dt_s)
-    what = {
-        "traversability": (recording.traversability, "met"),
-        "goal": (np.linalg.norm(place - recording.goal_m, axis=1), "distance"),
+    lines = {
+        driver.entity("series/traversability", "met"): recording.traversability,
+        driver.entity("series/goal", "distance"): np.linalg.norm(place - recording.goal_m, axis=1),
     }
-    lines = {driver.entity(f"series/{kind}", name): values for kind, (values, name) in what.items()}
     if not driver.name:
         lines["series/traversability/predicted"] = recording.predicted[cells_of(recording.grid, place)]
         lines["series/traversability/threshold"] = np.full(len(place), recording.free_above)
@@ -111,7 +110,8 @@ def log_driven(stream: Any, driver: Driver) -> None:
             if not driver.name:
                 lines = [place[k : k + 2] for k in range(first, step)]
             shown = [driver.colour] if driver.name else colours[first:step]
-            _log_strips(stream, driver, f"driven/{piece:03}", lines, shown, (0.08, 0.25))
+            entities = driver.entities(f"driven/{piece:03}")
+            log_both(stream, recording, entities, STRIPS, lines, (0.08, 0.25), colors=shown)
 
 
 def log_plans(stream: Any, driver: Driver) -> None:
@@ -127,22 +127,8 @@ def log_plans(stream: Any, driver: Driver) -> None:
             known[name] = lines
             colours = [(*driver.colour, 160) if driver.name else style.colour]
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
-            _log_strips(stream, driver, f"plan/{name}", lines, colours, radii)
-
-
-def _log_strips(
-    stream: Any,
-    driver: Driver,
-    leaf: str,
-    lines: Sequence[np.ndarray],
-    colours: Any,
-    radii: tuple[float, float],
-) -> None:
-    """Logs lines, each of shape [N, 2], over the ground and on the maps; the radii are in metres and in cells."""
-    import rerun as rr
-
-    kinds = (rr.LineStrips3D, rr.LineStrips2D)
-    log_both(stream, driver.recording, driver.entities(leaf), kinds, lines, radii, colors=colours)
+            entities = driver.entities(f"plan/{name}")
+            log_both(stream, driver.recording, entities, STRIPS, lines, radii, colors=colours)
 
 
 def _same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
@@ -151,13 +137,11 @@ def _same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
 
 def log_outcome(stream: Any, driver: Driver) -> None:
     """Says how the episode ended where it ended, from that moment on, and marks a robot that was held."""
-    import rerun as rr
-
     recording = driver.recording
     words = [f"{driver.name}: {recording.outcome}" if driver.name else recording.outcome]
     stream.set_time(TIMELINE, duration=recording.end_s)
     log_both(
-        stream, recording, driver.entities("outcome"), (rr.Points3D, rr.Points2D), recording.track[-1:],
+        stream, recording, driver.entities("outcome"), POINTS, recording.track[-1:],
         (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[driver.colour],
     )  # fmt: skip
     if recording.immobilised_at is None:

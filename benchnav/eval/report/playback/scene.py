@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from benchnav.core.figures import MARKS, bytes_of
 from benchnav.core.grid import Grid
@@ -17,39 +18,29 @@ from benchnav.eval.report.layers import SOFT, field_colours, hatching, outline, 
 LIFT_M = 0.12
 _CLOSED = (240, 240, 240)
 
+# Archetypes over the ground and on the maps.
+POINTS, STRIPS = (rr.Points3D, rr.Points2D), (rr.LineStrips3D, rr.LineStrips2D)
+
 
 def log_terrain(stream: Any, recording: Recording) -> None:
     """Logs the ground as a mesh, once for all times."""
-    import rerun as rr
-
     grid = recording.grid
     rows, columns = np.mgrid[: grid.height, : grid.width]
-    vertices = np.stack(
-        ((columns + 0.5) * grid.resolution_m, (rows + 0.5) * grid.resolution_m, recording.elevation_m),
-        axis=-1,
-    )
+    x_m, y_m = ((cells + 0.5) * grid.resolution_m for cells in (columns, rows))
     corner = (rows * grid.width + columns)[:-1, :-1].ravel()
     right, above = corner + 1, corner + grid.width
-    triangles = np.concatenate(
-        (np.stack((corner, right, above), axis=1), np.stack((right, above + 1, above), axis=1))
-    )
-    image = np.moveaxis(recording.rgb, 0, -1)
+    triangles = np.stack((corner, right, above, right, above + 1, above), axis=1).reshape(-1, 3)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log(
-        "world/terrain",
-        rr.Mesh3D(
-            vertex_positions=vertices.reshape(-1, 3),
-            triangle_indices=triangles,
-            vertex_colors=image.reshape(-1, 3),
-        ),
-        static=True,
+    mesh = rr.Mesh3D(
+        vertex_positions=np.stack((x_m, y_m, recording.elevation_m), axis=-1).reshape(-1, 3),
+        triangle_indices=triangles,
+        vertex_colors=recording.rgb.reshape(3, -1).T,
     )
+    stream.log("world/terrain", mesh, static=True)
 
 
 def log_maps(stream: Any, recording: Recording) -> None:
     """Logs the maps that are no planner's own: colour, soft ground, λ in truth."""
-    import rerun as rr
-
     grid = recording.grid
     log_image(stream, "map/colour", np.moveaxis(recording.rgb, 0, -1))
     log_image(stream, "map/true_mean", shades(recording.true_mean))
@@ -61,8 +52,7 @@ def log_maps(stream: Any, recording: Recording) -> None:
             stream.log(f"map/soft/{name}", rr.LineStrips2D(flat, colors=[SOFT], radii=0.06), static=True)
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m)):
         entities, colour = (f"world/{name}", f"map/places/{name}"), bytes_of(MARKS[name]["color"])
-        kinds = (rr.Points3D, rr.Points2D)
-        log_both(stream, recording, entities, kinds, [place], (0.35, 0.7), static=True, colors=[colour])
+        log_both(stream, recording, entities, POINTS, [place], (0.35, 0.7), static=True, colors=[colour])
 
 
 def log_predicted(stream: Any, recording: Recording, risk: str, closed: str) -> None:
@@ -74,8 +64,6 @@ def log_predicted(stream: Any, recording: Recording, risk: str, closed: str) -> 
         risk: entity of the map.
         closed: entity of the edge.
     """
-    import rerun as rr
-
     image = shades(recording.predicted)
     image[~recording.free] = 64
     log_image(stream, risk, image)
@@ -85,8 +73,6 @@ def log_predicted(stream: Any, recording: Recording, risk: str, closed: str) -> 
 
 def log_image(stream: Any, entity: str, image: np.ndarray) -> None:
     """Logs a map, uint8 of shape [H, W, 3], as an image; images have their first row at the top."""
-    import rerun as rr
-
     stream.log(entity, rr.Image(np.ascontiguousarray(image[::-1])), static=True)
 
 
@@ -107,7 +93,7 @@ def log_both(
         stream: a recording stream of Rerun's.
         recording: whose ground it is.
         entities: over the ground, and on the maps.
-        kinds: archetypes of Rerun's, of three dimensions and of two.
+        kinds: `POINTS` or `STRIPS`.
         shapes: points, (x, y) of shape [2] each, or lines of shape [N, 2].
         radii: in metres, and in cells.
         lift_m: height over the ground.
