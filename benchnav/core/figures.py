@@ -14,7 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
@@ -106,15 +106,9 @@ def condition_colours(planners: Sequence[str], palette: Sequence[str] = COLOURS)
     return [own[planner] if not alike or own[planner] == BLIND else next(turn) for planner in planners]
 
 
-def bytes_of(colour: Any) -> tuple[int, int, int]:
-    """Red, green and blue of a colour, in [0, 255]."""
-    red, green, blue = (round(255 * value) for value in to_rgb(colour))
-    return red, green, blue
-
-
-def unit(colour: Sequence[int]) -> Any:
-    """A colour of bytes as Matplotlib takes it, in [0, 1]."""
-    return tuple(value / 255 for value in colour)
+def bytes_of(colour: Any, opacity: float | None = None) -> tuple[int, ...]:
+    """Red, green, blue and opacity of a colour, in [0, 255]; of another opacity in [0, 1] where that is given."""
+    return tuple(round(255 * value) for value in to_rgba(colour, opacity))
 
 
 def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> None:

@@ -225,9 +225,10 @@ def preview(
         contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
     from benchnav.core.errors import ConfigError
+    from benchnav.core.figures import save
     from benchnav.core.store import output_path, replacing
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-    from benchnav.datagen.preview import save_contact_sheet, save_preview
+    from benchnav.datagen.preview import contact_sheet_figure, preview_figure
 
     dataset = TerrainDataset(find_dataset(file))
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
@@ -238,12 +239,13 @@ def preview(
         raise ConfigError("Expected either `maps` or `contact-sheet`, got both.")
     if maps is not None and not maps:
         raise ConfigError("Expected `maps` with at least one index, got none.")
+    if contact_sheet:
+        figure = contact_sheet_figure(dataset, split)
+    else:
+        some = range(min(3, dataset.map_count(split))) if maps is None else sorted(set(maps))
+        figure = preview_figure(dataset, split, list(some))
     with replacing(path) as partial:
-        if contact_sheet:
-            save_contact_sheet(dataset, split, partial, path.suffix[1:])
-        else:
-            some = range(min(3, dataset.map_count(split))) if maps is None else sorted(set(maps))
-            save_preview(dataset, split, list(some), partial, path.suffix[1:])
+        save(figure, partial, path.suffix[1:])
     print(f"wrote {path}")
 
 

@@ -10,11 +10,11 @@ import matplotlib
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from benchnav.core.figures import TRAVERSABILITY_COLOURS, unit
+from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
-IMMOBILISING = (160, 0, 0)
-SOFT = (255, 255, 255)
+IMMOBILISING = "#a00000"
+SOFT = "white"
 
 _HATCH_CELLS = 4
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
@@ -26,23 +26,23 @@ class LayerStyle:
 
     Args:
         label: what a legend calls it.
-        colour: red, green, blue, opacity, in [0, 255].
+        colour: red, green, blue and opacity, in hexadecimal digits.
         width: over the thinnest line's.
         dashed: where lines can be.
     """
 
     label: str
-    colour: tuple[int, int, int, int]
+    colour: str
     width: float
     dashed: bool = False
 
 
 # From the undermost layer to the topmost.
 STYLES: Mapping[str, LayerStyle] = {
-    "tree": LayerStyle(label="tree", colour=(60, 60, 60, 140), width=1),
-    "samples": LayerStyle(label="samples", colour=(120, 180, 255, 110), width=1),
-    "reference": LayerStyle(label="reference path", colour=(40, 90, 255, 255), width=3, dashed=True),
-    "path": LayerStyle(label="planned", colour=(0, 0, 140, 255), width=3),
+    "tree": LayerStyle(label="tree", colour="#3c3c3c8c", width=1),
+    "samples": LayerStyle(label="samples", colour="#78b4ff6e", width=1),
+    "reference": LayerStyle(label="reference path", colour="#285affff", width=3, dashed=True),
+    "path": LayerStyle(label="planned", colour="#00008cff", width=3),
 }
 
 
@@ -50,17 +50,30 @@ def plan_layer(style: LayerStyle, lines: Sequence[np.ndarray] = ()) -> LineColle
     """A layer of a plan as lines that can be put on a map."""
     return LineCollection(
         list(lines),
-        colors=[unit(style.colour)],
+        colors=[style.colour],
         linewidths=_LINE_WIDTH * style.width,
         linestyles="dashed" if style.dashed else "solid",
         label=style.label,
     )
 
 
+def driven_path(width: float) -> LineCollection:
+    """A driven path that can be put on a map, empty as yet, of so many points width."""
+    path = LineCollection([], cmap=TRAVERSABILITY_COLOURS, linewidths=width, capstyle="round")
+    path.set_clim(0, 1)
+    return path
+
+
+def draw_driven(path: LineCollection, track: np.ndarray, traversability: np.ndarray) -> None:
+    """Draws a path, positions of shape [N + 1, 2], in the colours of observed λ, of shape [N] or longer."""
+    path.set_segments(list(np.stack((track[:-1], track[1:]), axis=1)))
+    path.set_array(traversability[: len(track) - 1])
+
+
 def soft_lines(soft: np.ndarray, resolution_m: float) -> Iterator[LineCollection]:
     """Outline and hatching of soft ground, bool of shape [H, W]."""
     for lines in (outline, hatching):
-        yield LineCollection(list(lines(soft, resolution_m)), colors=[unit(SOFT)], linewidths=0.4)
+        yield LineCollection(list(lines(soft, resolution_m)), colors=[SOFT], linewidths=0.4)
 
 
 def shades(values: np.ndarray) -> np.ndarray:
@@ -79,7 +92,7 @@ def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:
         Red, green and blue, uint8, shape [H, W, 3].
     """
     colours = shades(field)
-    colours[immobilising] = IMMOBILISING
+    colours[immobilising] = bytes_of(IMMOBILISING)[:3]
     return colours
 
 

@@ -1,9 +1,9 @@
 """The report of a run: what it says, its table, where its rows come from, and its figures."""
 
+import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,13 +155,11 @@ def write_report(
         shown = hypothesis_table(report.tests, is_grouped(report.summary))
         write_text(out / "hypotheses.tex", to_latex([shown], _HYPOTHESES, f"{name}-hypotheses"))
     figures = {}
-    for figure_name, caption, draw, trim in (
-        *_charts(report),
-        *_trajectories(folder, report.summary),
-        *_driven(folder),
-    ):
+    charts, maps = _charts(report), (_trajectories(folder, report.summary), _driven(folder))
+    for figure_name, caption, figure in itertools.chain(charts, *maps):
         path = out / "figures" / f"{figure_name}.png"
-        save_twice(draw(), path, trim)
+        # These are as wide as their maps: white borders are cut away.
+        save_twice(figure, path, trim=figure_name in ("trajectories", "driven"))
         figures[path] = caption
     write_text(out / "summary.md", _as_markdown(report, figures))
     page = write_page(
@@ -189,46 +187,40 @@ def _findings(
     return (hypothesis_finding(tests, about, grouped), *rest)
 
 
-# Name, caption, what draws it, and whether its white borders are cut away.
-ToDraw = tuple[str, str, Callable[[], Figure], bool]
+Drawn = Iterator[tuple[str, str, Figure]]  # name, caption and figure
 
 
-def _charts(report: Report) -> Iterator[ToDraw]:
+def _charts(report: Report) -> Drawn:
     """The figures at the width of a column or a page."""
     summary = report.summary
     marked = set(summary.loc[summary["best_marked"], "condition"])
     if not report.tests.empty:
-        yield "forest", _FOREST, partial(forest_figure, report.tests), False
-    yield "success", _SUCCESS, partial(success_figure, summary, marked), False
+        yield "forest", _FOREST, forest_figure(report.tests)
+    yield "success", _SUCCESS, success_figure(summary, marked)
     sweeps = find_sweeps(report.about["conditions"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
     for sweep in sweeps:
         short = sweep_name(sweep.number)
         name = short if names[short] == 1 else sweep.number.replace(".", "-")
-        yield f"over-{name}", _SWEEP.format(name), partial(curve_figure, sweep, summary), False
-    yield "outcomes", _OUTCOMES, partial(outcome_figure, summary), False
-    yield "distributions", _DISTRIBUTIONS, partial(distribution_figure, summary, report.episodes), False
+        yield f"over-{name}", _SWEEP.format(name), curve_figure(sweep, summary)
+    yield "outcomes", _OUTCOMES, outcome_figure(summary)
+    yield "distributions", _DISTRIBUTIONS, distribution_figure(summary, report.episodes)
     for place, (title, lines) in enumerate(report.sheets.shown, start=1):
         name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place}"
-        yield name, _FAILURES.format(title), partial(failure_figure, lines), False
+        yield name, _FAILURES.format(title), failure_figure(lines)
 
 
-def _trajectories(folder: Path, summary: pd.DataFrame) -> Iterator[ToDraw]:
+def _trajectories(folder: Path, summary: pd.DataFrame) -> Drawn:
     """The figure of recorded episodes; none where nothing was recorded."""
     recorded = read_recordings(folder)
     chosen = choose_recordings(recorded, list(summary["condition"]))
     if chosen:
         whole = [_TO_THE_END] if any(recording.field is not None for recording in chosen) else []
         count = f"{len(chosen)} of {len(recorded)} recorded episodes."
-        yield (
-            "trajectories",
-            " ".join([_TRAJECTORIES, *whole, count]),
-            partial(trajectory_figure, chosen),
-            True,
-        )
+        yield "trajectories", " ".join([_TRAJECTORIES, *whole, count]), trajectory_figure(chosen)
 
 
-def _driven(folder: Path) -> Iterator[ToDraw]:
+def _driven(folder: Path) -> Drawn:
     """The figure of whole driven paths; none where no steps were kept."""
     driven = read_driven(folder)
     if driven is None:
@@ -246,14 +238,13 @@ def _driven(folder: Path) -> Iterator[ToDraw]:
     ]
     if len(shown) < len(rows):
         words.append(f"{len(shown)} of {len(rows)} conditions.")
-    yield "driven", " ".join(words), partial(driven_figure, ground, shown, tracks[:_MOST_PATHS]), True
+    yield "driven", " ".join(words), driven_figure(ground, shown, tracks[:_MOST_PATHS])
 
 
 def _with_latency(summary: pd.DataFrame, conditions: Mapping[str, Any]) -> pd.DataFrame:
     """A summary with how long a step of one robot takes, where the run measured it."""
     known = [conditions[condition].get("latency", {}) for condition in summary["condition"]]
-    columns = {f"latency_{name}": [one.get(name, float("nan")) for one in known] for name in LATENCIES}
-    return summary.assign(**columns)
+    return summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:

@@ -11,9 +11,7 @@ import torch
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import EPISODES, Run, open_run, read_table
 from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
@@ -71,8 +69,13 @@ def _recorder(unit: Unit, settings: Settings, members: Sequence[int]) -> Recorde
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     """What a finished run holds of an episode."""
     rows = read_table(folder, EPISODES)
-    own = (rows["condition"] == unit.condition.id) & (rows["seed"] == unit.seed)
-    own &= (rows["realisation"] == unit.realisation) & (rows["map"] == map_index)
+    known = {
+        "condition": unit.condition.id,
+        "seed": unit.seed,
+        "realisation": unit.realisation,
+        "map": map_index,
+    }
+    own = (rows[list(known)] == pd.Series(known)).all(axis=1)
     if not own.any():
         raise ConfigError(
             f"Expected a finished run, got {folder} without that episode. Run the same command again to finish it."
@@ -116,13 +119,15 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
     first = rows.iloc[0]
     condition, _ = run.conditions[first["condition"]]
     maps = tuple(rows["map"].tolist())
-    _check_maps(run, condition, maps)
-    made = run.about["codes"][first["code"]]
-    for part, digest in provenance.describe_parts(condition)["parts"].items():
-        if made["parts"].get(part) != digest:
-            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
     seed, realisation = int(first["seed"]), int(first["realisation"])
     unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=maps)
+    origin, made = Settings().origins().of(unit), run.about["codes"][first["code"]]
+    digests = run.about["datasets"][condition.data]["maps"][condition.split]
+    if origin.maps[1:] != tuple(digests[i] for i in maps):
+        raise BenchnavError(f"Expected {condition.data} with the maps that {run.folder} was on, got others.")
+    for part, digest in origin.code["parts"].items():
+        if made["parts"].get(part) != digest:
+            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
     with one_thread():
         recorder = _recorder(unit, Settings(), ())
     kept = read_steps(run.folder, condition=condition.id, seed=seed, realisation=realisation, map=maps)
@@ -134,21 +139,6 @@ def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
         yield recorder.driven(
             member, outcome, states, steps[commands].to_numpy()[:-1], steps[LAST_COLUMN].to_numpy()[:-1]
         )
-
-
-def _check_maps(run: Run, condition: Condition, maps: Sequence[int]) -> None:
-    """Refuses other maps than those that the run was on."""
-    dataset = TerrainDataset(find_dataset(condition.data))
-    count = dataset.map_count(condition.split)
-    if count <= max(maps):
-        raise BenchnavError(
-            f"Expected {condition.data} with the {max(maps) + 1} maps of {condition.split} or more that the run was "
-            f"on, got {count}. Make them with `benchnav-datagen create`."
-        )
-    digests = run.about["datasets"][condition.data]["maps"][condition.split]
-    now = provenance.map_digests(dataset, condition.split, max(maps) + 1)
-    if any(now[i] != digests[i] for i in maps):
-        raise BenchnavError(f"Expected {condition.data} with the maps that {run.folder} was on, got others.")
 
 
 def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
@@ -179,8 +169,8 @@ def keep_ground(folder: Path) -> None:
         return
     rows = read_table(folder, EPISODES)
     about = telling_map(rows)
-    on_map = np.logical_and.reduce([rows[name] == about[name] for name in MAP])
-    condition, _ = open_run(folder).conditions[rows[on_map]["condition"].iloc[0]]
+    on_map = rows[(rows[list(about)] == pd.Series(about)).all(axis=1)]
+    condition, _ = open_run(folder).conditions[on_map["condition"].iloc[0]]
     block = read_maps(TerrainDataset(find_dataset(condition.data)), condition.split, [about["map"]])
     noise = noise_key(about["seed"], condition.split, about["realisation"])
     simulation = Simulation(

@@ -4,15 +4,15 @@ They are as wide as the two columns of a page, or narrower where panels are few.
 beside their colour. A figure has a panel a split, in the order given. Letters in shapes: C classes, G nodes.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 from scipy.stats import binom
 
 from benchnav.core.figures import (
@@ -166,7 +166,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
-        panel.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        panel.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
     figure.supxlabel("PIT of the realised λ")
     figure.supylabel("density")
     _explain(figure, most=5)
@@ -183,30 +183,37 @@ def severity_figure(
         all_series: by scenario, its pairs as (severity, split), ascending.
         qualities: of all these splits.
     """
-    shown = [qualities[split] for series in all_series.values() for _, split in series]
-    quantities = [*_CLASS_SEVERITY * all(bool(quality.classes) for quality in shown), *_LATENT_SEVERITY]
-    ensemble = not any(np.isnan(_quantity(quality, "mutual_information")) for quality in shown)
-    looks: list[dict[str, Any]] = [
-        {"ms": 3, "lw": 1, "color": colour, "marker": marker}
-        for colour, marker, _ in zip(itertools.cycle(LINE_COLOURS), itertools.cycle(MARKERS), all_series)
-    ]
+    rows = []
+    for scenario, series in all_series.items():
+        for severity, split in series:
+            values = {"scenario": scenario, "severity": severity, **vars(qualities[split].traversability)}
+            rows.append(
+                values | {name: v for own in qualities[split].classes for name, v in vars(own).items()}
+            )
+    table = pd.DataFrame(
+        rows, columns=sorted({name for row in rows for name in row} | {"mutual_information"})
+    )
+    quantities = [*_CLASS_SEVERITY * bool("accuracy" in table.dropna(axis=1)), *_LATENT_SEVERITY]
+    ensemble = table["mutual_information"].notna().all()
     figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
     for (panel,), (_, name, ideal) in zip(panels, quantities, strict=True):
-        for (scenario, series), look in zip(all_series.items(), looks, strict=True):
-            severities, splits = zip(*series, strict=True)
-            values = [_quantity(qualities[split], name) for split in splits]
-            panel.plot(severities, values, label=scenario, **look)
+        for place, (scenario, own) in enumerate(table.groupby("scenario", sort=False)):
+            look: dict[str, Any] = {
+                "color": LINE_COLOURS[place % len(LINE_COLOURS)], "marker": MARKERS[place % len(MARKERS)],
+                "ms": 3, "lw": 1,
+            }  # fmt: skip
+            panel.plot(own["severity"], own[name], label=scenario, **look)
             if name == "entropy_auroc" and ensemble:
-                others = [_quantity(qualities[split], "mutual_information_auroc") for split in splits]
                 words = "of mutual information; solid: of entropy"
-                panel.plot(severities, others, ls=":", mfc="white", **look, label=words)
+                others = own["mutual_information_auroc"]
+                panel.plot(own["severity"], others, ls=":", mfc="white", **look, label=words)
         panel.margins(x=0.05, y=0.12)
         if ideal is not None:
             panel.axhline(ideal, color="0.4", lw=0.8, ls="--", label="calibrated")
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
         panel.grid(alpha=0.3)
-        panel.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        panel.locator_params(axis="y", nbins=4, steps=[1, 2, 5, 10])
     figure.supxlabel("severity of the shift")
     _explain(figure)
     return figure
@@ -285,11 +292,6 @@ def _steeper_than(cells: Sequence[int], share: float) -> float:
     """The whole degree of slope that at most `share` of the cells are steeper than."""
     steeper = np.cumsum(cells[::-1])[::-1]
     return float(np.sum(steeper > share * steeper[0]))
-
-
-def _quantity(quality: Quality, name: str) -> float:
-    sources = [*quality.classes, quality.traversability]
-    return next((float(getattr(source, name)) for source in sources if hasattr(source, name)), float("nan"))
 
 
 def _grid(

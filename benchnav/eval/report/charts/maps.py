@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, to_rgb, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -27,14 +27,22 @@ from benchnav.core.figures import (
     stack_panels,
     styled,
     thin_ticks,
-    unit,
 )
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failure_choice import FailedLine
-from benchnav.eval.report.layers import IMMOBILISING, SOFT, STYLES, field_colours, plan_layer, soft_lines
+from benchnav.eval.report.layers import (
+    IMMOBILISING,
+    SOFT,
+    STYLES,
+    draw_driven,
+    driven_path,
+    field_colours,
+    plan_layer,
+    soft_lines,
+)
 from benchnav.eval.report.words import NAMING, condition_name, contender_names, differ, outcome_in_words
 
 MOST_PANELS = 8
@@ -45,7 +53,7 @@ _SAME_MAP = ["data", "scenario", "map", "seed", "realisation"]
 _PATH_STYLES = ("solid", "dashed")
 _DARKEST = 0.35  # grey of λ = 0
 _LAMBDA: dict[str, Any] = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
-_HOLDS = Patch(color=unit(IMMOBILISING), label="immobilises a robot")
+_HOLDS = Patch(color=IMMOBILISING, label="immobilises a robot")
 
 
 def choose_recordings(recordings: Sequence[Recording], conditions: Sequence[str]) -> list[Recording]:
@@ -143,10 +151,8 @@ def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
         for lines in soft_lines(recording.soft, recording.resolution_m):
             panel.add_collection(lines)
     driven = recording.track[: recording.now + 1]
-    segments = np.stack((driven[:-1], driven[1:]), axis=1)
-    coloured = LineCollection(list(segments), cmap=TRAVERSABILITY_COLOURS, linewidths=2, capstyle="round")
-    coloured.set_array(recording.traversability[: recording.now])
-    coloured.set_clim(0, 1)
+    coloured = driven_path(2)
+    draw_driven(coloured, driven, recording.traversability)
     coloured.set_zorder(2.5)
     panel.plot(*driven.T, color="white", lw=3.2, solid_capstyle="round")
     panel.add_collection(coloured)
@@ -190,9 +196,7 @@ def _ground_entries(recordings: Sequence[Recording]) -> list[Artist]:
     if not all(recording.free.all() for recording in recordings):
         entries.append(Patch(color=_CLOSED, label="not free"))
     if any(recording.soft.any() for recording in known):
-        entries.append(
-            Patch(fc="0.45", ec=unit(SOFT), hatch="////", label="soft ground, which does not show")
-        )
+        entries.append(Patch(fc="0.45", ec=SOFT, hatch="////", label="soft ground, which does not show"))
     if any(recording.immobilising.any() for recording in known):
         entries.append(_HOLDS)
     return entries
@@ -211,7 +215,7 @@ def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] |
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
     ground, rows = Ground.load(path), read_table(folder, EPISODES)
-    rows = rows[np.logical_and.reduce([rows[name] == value for name, value in ground.about.items()])]
+    rows = rows[(rows[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
     place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
     steps = [read_steps(folder, condition=condition, **place) for condition in rows["condition"]]
     kept = [len(own) > 0 for own in steps]
@@ -262,7 +266,7 @@ def _backdrop(ground: Ground) -> np.ndarray:
     if ground.field is None:
         return 0.4 * np.moveaxis(ground.rgb, 0, -1) / 255 + 0.6
     grey = _DARKEST + (1 - _DARKEST) * np.repeat(ground.field[..., None], 3, axis=-1)
-    grey[ground.immobilising] = unit(IMMOBILISING)
+    grey[ground.immobilising] = to_rgb(IMMOBILISING)
     return grey
 
 
@@ -304,7 +308,7 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
     show_map(panel, recording.predicted, recording.grid.extent_m, **_LAMBDA)
     if recording.immobilising.any():
         colours = np.zeros((*recording.grid.shape, 4))
-        colours[recording.immobilising] = [*unit(IMMOBILISING), 0.75]
+        colours[recording.immobilising] = to_rgba(IMMOBILISING, 0.75)
         show_map(panel, colours, recording.grid.extent_m)
     track = recording.track
     draw_edged(panel, track, 1.1, label="driven")

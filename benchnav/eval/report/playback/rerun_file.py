@@ -12,7 +12,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from benchnav.core.figures import bytes_of, condition_colours
+from benchnav.core.figures import condition_colours
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
@@ -31,7 +31,7 @@ from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
 
-_ALONE = (0, 170, 0)
+_ALONE = "#00aa00"
 _ALL, _PLACES = "/map/overlay/**", "/map/places/**"
 
 
@@ -82,7 +82,7 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     abouts = [recording.about for recording in recordings]
     colours = condition_colours([about["planner"] for about in abouts])
     return [
-        Driver(recording=recording, name=name, colour=bytes_of(colour))
+        Driver(recording=recording, name=name, colour=colour)
         for recording, name, colour in zip(recordings, contender_names(abouts), colours, strict=True)
     ]
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from benchnav.core.figures import bytes_of
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.eval.report.layers import STYLES, shades
 from benchnav.eval.report.playback.scene import (
@@ -37,12 +38,12 @@ class Driver:
     Args:
         recording: its episode.
         name: unlike those of the others; empty where it is alone.
-        colour: red, green, blue, in [0, 255].
+        colour: as Matplotlib takes it.
     """
 
     recording: Recording
     name: str
-    colour: tuple[int, int, int]
+    colour: str
 
     def entity(self, root: str, *leaf: str) -> str:
         """Path of what is the robot's own under a root."""
@@ -68,8 +69,10 @@ def log_robot(stream: Any, driver: Driver) -> None:
     ):  # fmt: skip
         stream.send_columns(robot, [times], dots.columns(positions=points))
         stream.send_columns(heading, [times], arrows.columns(origins=points, vectors=vectors))
-        stream.log(robot, dots.from_fields(radii=[radius], colors=[driver.colour]), static=True)
-        stream.log(heading, arrows.from_fields(radii=[radius / 3], colors=[driver.colour]), static=True)
+        stream.log(robot, dots.from_fields(radii=[radius], colors=[bytes_of(driver.colour)]), static=True)
+        stream.log(
+            heading, arrows.from_fields(radii=[radius / 3], colors=[bytes_of(driver.colour)]), static=True
+        )
 
 
 def log_series(stream: Any, driver: Driver) -> None:
@@ -92,7 +95,7 @@ def log_series(stream: Any, driver: Driver) -> None:
     for entity, values in lines.items():
         stream.send_columns(entity, [times], rr.Scalars.columns(scalars=values.astype(np.float64)))
         if driver.name:
-            style = rr.SeriesLines(colors=[driver.colour], names=[driver.name])
+            style = rr.SeriesLines(colors=[bytes_of(driver.colour)], names=[driver.name])
             stream.log(entity, style, static=True)
 
 
@@ -109,7 +112,7 @@ def log_driven(stream: Any, driver: Driver) -> None:
             lines = [place[first : step + 1]]
             if not driver.name:
                 lines = [place[k : k + 2] for k in range(first, step)]
-            shown = [driver.colour] if driver.name else colours[first:step]
+            shown = [bytes_of(driver.colour)] if driver.name else colours[first:step]
             entities = driver.entities(f"driven/{piece:03}")
             log_both(stream, recording, entities, STRIPS, lines, (0.08, 0.25), colors=shown)
 
@@ -122,17 +125,17 @@ def log_plans(stream: Any, driver: Driver) -> None:
         for name, style in STYLES.items():
             lines = list(plan.lines.get(name, ()))
             # A layer without lines is logged too: it wipes out the earlier plan's. One that stays is not.
-            if (driver.name and name != "path") or (name in known and _same(known[name], lines)):
+            if (driver.name and name != "path") or _same(known.get(name), lines):
                 continue
             known[name] = lines
-            colours = [(*driver.colour, 160) if driver.name else style.colour]
+            colours = [bytes_of(driver.colour, 0.628) if driver.name else bytes_of(style.colour)]
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
             entities = driver.entities(f"plan/{name}")
             log_both(stream, driver.recording, entities, STRIPS, lines, radii, colors=colours)
 
 
-def _same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
-    return len(first) == len(second) and all(map(np.array_equal, first, second))
+def _same(known: list[np.ndarray] | None, lines: list[np.ndarray]) -> bool:
+    return known is not None and len(known) == len(lines) and all(map(np.array_equal, known, lines))
 
 
 def log_outcome(stream: Any, driver: Driver) -> None:
@@ -141,8 +144,8 @@ def log_outcome(stream: Any, driver: Driver) -> None:
     words = [f"{driver.name}: {recording.outcome}" if driver.name else recording.outcome]
     stream.set_time(TIMELINE, duration=recording.end_s)
     log_both(
-        stream, recording, driver.entities("outcome"), POINTS, recording.track[-1:],
-        (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[driver.colour],
+        stream, recording, driver.entities("outcome"), POINTS, [recording.track[-1]],
+        (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[bytes_of(driver.colour)],
     )  # fmt: skip
     if recording.immobilised_at is None:
         return

@@ -49,7 +49,9 @@ def log_maps(stream: Any, recording: Recording) -> None:
     if recording.soft.any():
         for name, lines in (("outline", outline), ("hatching", hatching)):
             flat = on_map(grid, lines(recording.soft, grid.resolution_m))
-            stream.log(f"map/soft/{name}", rr.LineStrips2D(flat, colors=[SOFT], radii=0.06), static=True)
+            stream.log(
+                f"map/soft/{name}", rr.LineStrips2D(flat, colors=[bytes_of(SOFT)], radii=0.06), static=True
+            )
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m)):
         entities, colour = (f"world/{name}", f"map/places/{name}"), bytes_of(MARKS[name]["color"])
         log_both(stream, recording, entities, POINTS, [place], (0.35, 0.7), static=True, colors=[colour])

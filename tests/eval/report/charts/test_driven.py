@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.figures import planner_colours, save_twice
@@ -96,7 +97,7 @@ def test_what_immobilises_a_robot_stands_out_and_resampled_ground_is_faded_terra
     rows = episodes({1: [True]})
     panel, _ = drawn(driven_figure(ground(), rows, [track(0)]))
     shown = np.asarray(panel.images[0].get_array())
-    red = np.isclose(shown, np.array(IMMOBILISING) / 255).all(axis=-1)
+    red = np.isclose(shown, np.array(to_rgb(IMMOBILISING))).all(axis=-1)
     np.testing.assert_array_equal(red, ground().immobilising)
     greys = shown[~ground().immobilising]
     assert (np.diff(greys[:, 0]) >= 0).all()
@@ -127,14 +128,14 @@ def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     with_steps(folder, rows)
     assert read_driven(folder) is None
     ground().save(folder / GROUND)
-    ((name, caption, draw, _),) = write._driven(folder)
+    ((name, caption, figure),) = write._driven(folder)
     assert name == "driven"
     assert "std 1, seed 0, realisation 0: of all maps" in caption
-    _, own, tracks = draw.args  # type: ignore[attr-defined]
+    _, own, tracks = read_driven(folder) or ((), (), ())
     assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
-    save_twice(draw(), tmp_path / "driven.png")
+    save_twice(figure, tmp_path / "driven.png")
     assert (tmp_path / "driven.png").stat().st_size > 5000
 
 
@@ -147,9 +148,9 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
-    ((_, caption, draw, _),) = write._driven(folder)
+    ((_, caption, _),) = write._driven(folder)
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
-    _, own, tracks = draw.args  # type: ignore[attr-defined]
+    _, own, tracks = read_driven(folder) or ((), (), ())
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
     for place, positions in enumerate(tracks):
@@ -166,9 +167,9 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    ((_, caption, draw, _),) = write._driven(folder)
+    ((_, caption, figure),) = write._driven(folder)
     assert f"on no map did outcomes differ. {most} of {most + 2} conditions." in caption
-    assert len(draw().axes[0].lines) >= most
+    assert len(figure.axes[0].lines) >= most
 
 
 def test_the_map_comes_back_as_it_was(tmp_path: Path) -> None:
