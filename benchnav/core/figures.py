@@ -200,10 +200,10 @@ def legend_outside(
     return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
 
 
-def thin_ticks(panel: Axes, **style: Any) -> None:
-    """Gives a map's panel the small ticks and the thin frame of a printed page."""
-    panel.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5, **style)
-    panel.spines[:].set(linewidth=0.5, visible=True)
+def frame_map(panel: Axes) -> None:
+    """Gives a map's panel a frame all around, and numbers that are close to it."""
+    panel.tick_params(pad=1.5)
+    panel.spines[:].set_visible(True)
 
 
 def save(

@@ -27,11 +27,11 @@ from benchnav.core.figures import (
     TITLE,
     TRAVERSABILITY_COLOURS,
     TWO_COLUMNS_IN,
+    frame_map,
     mark,
     mark_handle,
     show_map,
     styled,
-    thin_ticks,
 )
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
@@ -192,7 +192,7 @@ def sheet_of_maps(
         for row, panel in enumerate(below):
             panel.set(label=f"{column.name} {row}", facecolor=LACKING)
             image = show_map(panel, column.layers[row], extent_m, **column.shades)
-            thin_ticks(panel)
+            frame_map(panel)
         below[0].set_title(column.title)
         if column.unit is not None:
             bar = figure.colorbar(

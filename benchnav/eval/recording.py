@@ -20,6 +20,8 @@ from benchnav.planning.world.outcome import Outcome
 
 # The ground that whole driven paths of a run are shown on, in its folder.
 GROUND = "ground.npz"
+# What one map under one draw of λ is known by.
+MAP = ["data", "scenario", "world", "seed", "realisation", "map"]
 # The moment that figures show: about half-way for most episodes; the paper shows 25 s, when robots here have mostly
 # arrived.
 MOMENT_S = 15.0

@@ -14,7 +14,7 @@ from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
-from benchnav.eval.recording import read_recordings
+from benchnav.eval.recording import MAP, read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
     forest_figure,
@@ -271,15 +271,14 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     episodes = episodes[episodes["condition"].isin(frozen)]
     if not episodes["rejected_draws"].any():
         return []
-    draws = ["data", "scenario", "world", "seed", "realisation", "map"]
     # All conditions met the same; where a model failed nothing was drawn.
-    again = episodes.groupby(draws)["rejected_draws"].max()
+    again = episodes.groupby(MAP)["rejected_draws"].max()
     share = again.sum() / (again + 1).sum()
     return [f"Of the draws of λ {100 * share:.1f} % joined start and goal by no ground and were drawn again."]
 
 
 def _world(value: Mapping[str, Any]) -> str:
-    world, rules = value["world"], value.get("rules")
+    world, free = value["world"], value["rules"]["free_space"]
     words = [f"λ {world['noise']}"]
     if "correlation_m" in world:
         words[0] += f", correlated over {world['correlation_m']:g} m"
@@ -290,10 +289,7 @@ def _world(value: Mapping[str, Any]) -> str:
         words.append(f"T = {world['time_budget_ratio']:g} × the reference time at the robot's top speed")
     else:
         words.append(f"T = {world['time_budget_s']:g} s")
-    if rules:
-        free = rules["free_space"]
-        words.append(f"free where the {free['by']} map is above {free['above']:g}")
-    return ", ".join(words)
+    return ", ".join([*words, f"free where the {free['by']} map is above {free['above']:g}"])
 
 
 def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:

@@ -14,14 +14,11 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.folder.folder import EPISODES, Run, open_run, read_table
 from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
-from benchnav.eval.recording import GROUND, Ground, Recording
+from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import path_length_m
 from benchnav.eval.run.unit import Settings, build, noise_key, one_thread, read_block, read_maps, simulate
 from benchnav.planning.world.simulation import Simulation
-
-# What one map under one draw of λ is known by.
-MAP = ("data", "scenario", "world", "seed", "realisation", "map")
 
 
 def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = None) -> Recording:
@@ -152,11 +149,11 @@ def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
     Returns:
         What the map is known by, by the names of `MAP`.
     """
-    groups = episodes.groupby(list(MAP), sort=False)["success"]
+    groups = episodes.groupby(MAP, sort=False)["success"]
     counted = groups.agg(conditions="size", successes="sum").reset_index()
     counted["differing"] = np.minimum(counted["successes"], counted["conditions"] - counted["successes"])
     best = counted.sort_values(["differing", "conditions"], ascending=False, kind="stable")
-    return best[list(MAP)].head(1).to_dict("records")[0]
+    return best[MAP].head(1).to_dict("records")[0]
 
 
 def keep_ground(folder: Path) -> None:

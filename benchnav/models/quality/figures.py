@@ -23,10 +23,10 @@ from benchnav.core.figures import (
     SKY,
     TEXT,
     TWO_COLUMNS_IN,
+    frame_map,
     legend_outside,
     stack_panels,
     styled,
-    thin_ticks,
 )
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
@@ -83,7 +83,7 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
             panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
         panel.set_xticks(range(len(names)), labels, rotation=90, parse_math=False)
         panel.set_yticks(range(len(names)), labels, parse_math=False)
-        thin_ticks(panel)
+        frame_map(panel)
     figure.supxlabel("most likely class")
     figure.supylabel("true class")
     # Beside the upper right panel, and as high as its square, which is less than the room that it is given.

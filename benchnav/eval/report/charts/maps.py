@@ -20,13 +20,13 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     condition_colours,
     draw_edged,
+    frame_map,
     legend_outside,
     mark,
     mark_handle,
     show_map,
     stack_panels,
     styled,
-    thin_ticks,
 )
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.folder import EPISODES, read_table
@@ -186,7 +186,7 @@ def _mark_places(panel: Axes, recording: Recording, robot: np.ndarray) -> None:
     """Marks start, goal and robot."""
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m), ("robot", robot)):
         mark(panel, name, place, label=name)
-    thin_ticks(panel)
+    frame_map(panel)
 
 
 def _ground_entries(recordings: Sequence[Recording]) -> list[Artist]:
@@ -256,7 +256,7 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         more.append(_HOLDS)
     title = "terrain, faded" if ground.field is None else "λ as it was: the lighter the faster"
     panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
-    thin_ticks(panel)
+    frame_map(panel)
     figure.legend(handles=[*panel.get_legend_handles_labels()[0], *more], loc="outside right upper")
     return figure
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -144,6 +143,9 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     figure = Figure(figsize=(width, 3.3 * down + 0.5), layout="constrained")
     stacks = stack_panels(figure, len(groups), across, layers=2, sharex=True)
+    for above, below in stacks[1:]:
+        above.sharey(stacks[0][0])
+        below.sharey(stacks[0][1])
     values = sorted({value for line in sweep.lines for value in line.values})
     swept = [condition for line in sweep.lines for condition in line.conditions]
     others = rows.drop(swept).to_dict("records") if sweep.number.startswith("risk.") else []
@@ -165,14 +167,12 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
                 panel.fill_between(places, low, high, color=colours[name], alpha=0.15, lw=0)
                 panel.plot(places, rate, color=colours[name], marker=marker, ms=3.5, lw=1.2, label=name)
             panel.grid(axis="y", color="0.9")
-            if place % across == 0:
-                panel.set_ylabel(measure)
+            panel.tick_params(labelleft=place % across == 0)
+            panel.set_ylabel("" if place % across else measure)
         above.set_title(title)
         below.tick_params(labelbottom=True)
         below.set_xlabel(_NAMES.get(sweep.number, sweep_name(sweep.number)))
         below.set_xticks(_places(sweep, values), [f"{value:g}" for value in values])
-    for panels in zip(*stacks, strict=True):
-        _share_heights(panels)
     # Matplotlib names every pattern of dashes "--", so that a style cannot be read back from a line.
     handles = [
         Line2D([], [], color=colour, lw=1, ls=_style(place), label=label)
@@ -263,11 +263,3 @@ def _style(place: int) -> Any:
     """A pattern of dashes for each setting: those of `_STYLES`, then dashes with more and more dots between."""
     more = place - len(_STYLES) + 3
     return _STYLES[place] if place < len(_STYLES) else (0, (8, 2, *(1, 1.5) * more))
-
-
-def _share_heights(panels: Sequence[Axes]) -> None:
-    """Gives panels of one measure the same range, and numbers at the left alone."""
-    ends = np.array([panel.get_ylim() for panel in panels])
-    for panel in panels:
-        panel.set_ylim(ends[:, 0].min(), ends[:, 1].max())
-        panel.tick_params(labelleft=bool(panel.get_ylabel()))
