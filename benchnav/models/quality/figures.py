@@ -190,11 +190,9 @@ def severity_figure(
             rows.append(
                 values | {name: v for own in qualities[split].classes for name, v in vars(own).items()}
             )
-    table = pd.DataFrame(
-        rows, columns=sorted({name for row in rows for name in row} | {"mutual_information"})
-    )
-    quantities = [*_CLASS_SEVERITY * bool("accuracy" in table.dropna(axis=1)), *_LATENT_SEVERITY]
-    ensemble = table["mutual_information"].notna().all()
+    table = pd.DataFrame(rows)
+    measured = table.dropna(axis=1)
+    quantities = [*_CLASS_SEVERITY * ("accuracy" in measured), *_LATENT_SEVERITY]
     figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
     for (panel,), (_, name, ideal) in zip(panels, quantities, strict=True):
         for place, (scenario, own) in enumerate(table.groupby("scenario", sort=False)):
@@ -203,7 +201,7 @@ def severity_figure(
                 "ms": 3, "lw": 1,
             }  # fmt: skip
             panel.plot(own["severity"], own[name], label=scenario, **look)
-            if name == "entropy_auroc" and ensemble:
+            if name == "entropy_auroc" and "mutual_information" in measured:
                 words = "of mutual information; solid: of entropy"
                 others = own["mutual_information_auroc"]
                 panel.plot(own["severity"], others, ls=":", mfc="white", **look, label=words)

@@ -130,7 +130,25 @@ class _Column:
         for panel, body in zip(panels, self._robots, strict=True):
             panel.add_patch(body)
         self._crosses = [panel.plot([], [], **MARKS["end"] | {"ms": 13})[0] for panel in panels]
-        _draw_ground(panels, recording)
+        extent_m = recording.grid.extent_m
+        show_map(panels[0], np.moveaxis(recording.rgb, 0, -1), extent_m)
+        for lines in soft_lines(recording.soft, recording.grid.resolution_m):
+            panels[0].add_collection(lines)
+        if recording.field is not None:
+            shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
+        else:
+            shown = field_colours(recording.predicted, np.zeros_like(recording.free))
+            shown[~recording.free] = round(255 * _CLOSED)
+            title = "λ̂ given to the planner"
+        show_map(panels[1], shown, extent_m)
+        for panel, words in zip(panels, ("terrain and plan", title), strict=True):
+            mark(panel, "start", recording.states[0, :2], _MARKS)
+            mark(panel, "goal", recording.goal_m, _MARKS)
+            panel.set(aspect="auto", xticks=[], yticks=[])
+            panel.text(
+                0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
+                bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},
+            )  # fmt: skip
         self.moving: list[Artist] = [
             *self._layers.values(), *self._edges, self._driven, *self._robots, *self._crosses, self._time,
             self._outcome,
@@ -162,25 +180,3 @@ class _Column:
         held = recording.immobilised_at if has_ended else None
         for cross in self._crosses:
             cross.set_data(*(([], []) if held is None else ([held[0]], [held[1]])))
-
-
-def _draw_ground(panels: Sequence[Axes], recording: Recording) -> None:
-    extent_m = recording.grid.extent_m
-    show_map(panels[0], np.moveaxis(recording.rgb, 0, -1), extent_m)
-    for lines in soft_lines(recording.soft, recording.grid.resolution_m):
-        panels[0].add_collection(lines)
-    if recording.field is not None:
-        shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
-    else:
-        shown = field_colours(recording.predicted, np.zeros_like(recording.free))
-        shown[~recording.free] = round(255 * _CLOSED)
-        title = "λ̂ given to the planner"
-    show_map(panels[1], shown, extent_m)
-    for panel, words in zip(panels, ("terrain and plan", title), strict=True):
-        mark(panel, "start", recording.states[0, :2], _MARKS)
-        mark(panel, "goal", recording.goal_m, _MARKS)
-        panel.set(aspect="auto", xticks=[], yticks=[])
-        panel.text(
-            0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
-            bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},
-        )  # fmt: skip
