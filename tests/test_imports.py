@@ -16,9 +16,9 @@ MODELS = tuple(
     f"models.{name}"
     for name in ("base", "slope_gp", "nets", "checkpoint", "config", "fused", "predictor", "probabilities")
 )
-# Of reports, how an episode is recorded and the map that a figure shows is kept.
-RECORDED = ("eval.report.recorded", "eval.report.playback.files", "eval.report.charts.driven")
 VALUES_OF_EVAL = ("eval.experiment",)
+# What running writes and reports read.
+WRITTEN = ("eval.folder", "eval.recording")
 
 # What the modules of a drawer may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -44,13 +44,10 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "eval": ("eval", "models", "planning", "datagen"),
     "eval/experiment": ("eval.experiment", "models", "planning", "datagen"),
     "eval/folder": ("eval.folder", *VALUES_OF_EVAL, "models", "planning", "datagen"),
-    "eval/run": ("eval.run", "eval.folder", *RECORDED, *VALUES_OF_EVAL, "models", "planning", "datagen"),
+    "eval/recording.py": ("eval.folder", "planning"),
+    "eval/run": ("eval.run", *WRITTEN, *VALUES_OF_EVAL, "models", "planning", "datagen"),
     "eval/stats": ("eval.stats", "eval.experiment", "planning"),
-    "eval/report": (
-        *("eval.report", "eval.stats", "eval.folder", *VALUES_OF_EVAL),
-        "planning",
-        "datagen.recipe.scenario",  # how scenarios are named that make a series
-    ),
+    "eval/report": ("eval.report", "eval.stats", *WRITTEN, *VALUES_OF_EVAL, "planning", "datagen"),
 }
 
 
@@ -134,7 +131,10 @@ def test_imports_go_one_way(place: Path) -> None:
         ("eval/report/tables.py", "benchnav.models.predictor", False),
         ("eval/run/runner.py", "benchnav.eval.report.write", False),
         ("eval/run/runner.py", "benchnav.eval.cli", False),
-        ("eval/run/recorder.py", "benchnav.eval.report.recorded.recording", True),
+        ("eval/run/recorder.py", "benchnav.eval.recording", True),
+        ("eval/run/recorder.py", "benchnav.eval.report.layers", False),
+        ("eval/recording.py", "benchnav.eval.report.layers", False),
+        ("eval/recording.py", "benchnav.eval.run.recorder", False),
         ("eval/folder/folder.py", "benchnav.eval.run.runner", False),
         ("datagen/recipe/recipe.py", "benchnav.datagen.synth.generate", False),
         ("datagen/synth/generate.py", "benchnav.datagen.files.reader", False),

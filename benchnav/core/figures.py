@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Bbox
 
 from benchnav.core.store import replacing
@@ -106,15 +106,9 @@ def condition_colours(planners: Sequence[str], palette: Sequence[str] = COLOURS)
     return [own[planner] if not alike or own[planner] == BLIND else next(turn) for planner in planners]
 
 
-def bytes_of(colour: Any) -> tuple[int, int, int]:
-    """Red, green and blue of a colour, in [0, 255]."""
-    red, green, blue = (round(255 * value) for value in to_rgb(colour))
-    return red, green, blue
-
-
-def unit(colour: Sequence[int]) -> Any:
-    """A colour of bytes as Matplotlib takes it, in [0, 1]."""
-    return tuple(value / 255 for value in colour)
+def bytes_of(colour: Any, opacity: float | None = None) -> tuple[int, ...]:
+    """Red, green, blue and opacity of a colour, in [0, 255]; of another opacity in [0, 1] where that is given."""
+    return tuple(round(255 * value) for value in to_rgba(colour, opacity))
 
 
 def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> None:
@@ -152,7 +146,7 @@ def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **s
 
 
 def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) -> Any:
-    """Draws a map with its first row at the bottom and its axes in metres; gives the image.
+    """Draws a map with its first row at the bottom and its axes in metres, which end where it ends; gives the image.
 
     Args:
         panel: where.
@@ -161,7 +155,31 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
         **style: as in `Axes.imshow`.
     """
     width, height = map(float, extent_m)
+    panel.set(xlim=(0, width), ylim=(0, height))
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+
+
+def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **shared: Any) -> list[Any]:
+    """Divides a figure into places, row by row, each with panels under each other; what is left over is removed.
+
+    Args:
+        figure: empty.
+        count: number of places.
+        across: places side by side, at most `count`.
+        layers: panels of a place.
+        **shared: as in `Figure.subplots`.
+
+    Returns:
+        Of each place its panels, downward.
+    """
+    down = -(-count // across)
+    panels = figure.subplots(layers * down, across, squeeze=False, **shared)
+    stacks = [stack for row in np.split(panels, down) for stack in row.T]
+    for place in range(count, len(stacks)):
+        for panel in stacks[place]:
+            panel.remove()
+        stacks[place - across][-1].tick_params(labelbottom=True)
+    return stacks[:count]
 
 
 def legend_outside(
@@ -182,77 +200,10 @@ def legend_outside(
     return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
 
 
-def legend_at(
-    figure: Figure,
-    handles: Sequence[Artist],
-    place: tuple[float, float],
-    columns: int,
-    loc: Any = "upper left",
-) -> None:
-    """Lays a legend with its corner `loc` at (left, top) in inches from the upper left corner of a figure."""
-    width, height = figure.get_size_inches()
-    legend = figure.legend(
-        handles=handles, loc=loc, ncols=columns, bbox_to_anchor=(place[0] / width, 1 - place[1] / height),
-        bbox_transform=figure.transFigure, fontsize=TEXT, frameon=False, borderpad=0, borderaxespad=0,
-        handlelength=1.1, handletextpad=0.4, columnspacing=1, labelspacing=0.3,
-    )  # fmt: skip
-    for text in legend.get_texts():
-        text.set_parse_math(False)
-
-
-def add_axes(figure: Figure, place: tuple[float, float, float, float], label: str) -> Axes:
-    """Adds a panel at (left, top, width, height) in inches from the upper left corner."""
-    left, top, wide, high = place
-    width, height = figure.get_size_inches()
-    return figure.add_axes(
-        (left / width, 1 - (top + high) / height, wide / width, high / height), label=label
-    )
-
-
-def add_bar(
-    figure: Figure,
-    image: Any,
-    place: tuple[float, float, float, float],
-    label: str,
-    extend: str = "neither",
-    most: int = 4,
-) -> Axes:
-    """Adds a colour bar that lies at (left, top, width, height) in inches, with at most so many intervals."""
-    bar = add_axes(figure, place, label)
-    drawn = figure.colorbar(image, cax=bar, orientation="horizontal", extend=extend)
-    drawn.outline.set_linewidth(0.5)
-    bar.xaxis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
-    bar.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    bar.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5)
-    return bar
-
-
-def number_map(panel: Axes, size: tuple[float, float], left: bool, bottom: bool) -> None:
-    """Numbers the axes of a map's panel.
-
-    Args:
-        panel: the map's.
-        size: width and height in inches.
-        left: whether the numbers of the y-axis are shown.
-        bottom: whether those of the x-axis are.
-    """
-    for axis, inches in zip((panel.xaxis, panel.yaxis), size, strict=True):
-        # A tick at the very end is left out, as its number would touch the next panel's first.
-        most = min(max(int(inches / 0.2), 1), 4)
-        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
-    thin_ticks(panel, labelleft=left, labelbottom=bottom)
-
-
-def write(figure: Figure, left: float, top: float, text: str, size: float = TEXT, **style: Any) -> None:
-    """Writes text at a place in inches from the upper left corner."""
-    width, height = figure.get_size_inches()
-    figure.text(left / width, 1 - top / height, text, size=size, parse_math=False, **style)
-
-
-def thin_ticks(panel: Axes, **style: Any) -> None:
-    """Gives a map's panel the small ticks and the thin frame of a printed page."""
-    panel.tick_params(labelsize=TEXT, length=2, width=0.5, pad=1.5, **style)
-    panel.spines[:].set(linewidth=0.5, visible=True)
+def frame_map(panel: Axes) -> None:
+    """Gives a map's panel a frame all around, and numbers that are close to it."""
+    panel.tick_params(pad=1.5)
+    panel.spines[:].set_visible(True)
 
 
 def save(

@@ -32,6 +32,12 @@ _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 
 
+class Bold(str):
+    """A cell of a table that is set in bold."""
+
+    bold = True
+
+
 @dataclass(frozen=True, kw_only=True)
 class Table:
     """A table as text.
@@ -43,7 +49,6 @@ class Table:
         numbers: whether the other columns hold a number each, which is set right.
         title: over the table, in a terminal alone.
         notes: lines under the table.
-        bold: cells (row, column) that are set in bold.
         bold_note: what bold means.
         explained: what columns hold, (heading, sentence).
         groups: titles over the columns that are no labels, each over as many, in LaTeX alone.
@@ -56,7 +61,6 @@ class Table:
     numbers: bool = False
     title: str = ""
     notes: tuple[str, ...] = ()
-    bold: frozenset[tuple[int, int]] = frozenset()
     bold_note: str = ""
     explained: tuple[tuple[str, str], ...] = ()
     groups: tuple[str, ...] = ()
@@ -70,13 +74,9 @@ def to_markdown(table: Table) -> str:
         _markdown_row(markdown(_one_line(heading)) for heading in table.headings),
         "|" + "---|" * table.labels + f"{right}|" * (len(table.headings) - table.labels),
     ]
-    for place, row in enumerate(table.rows):
-        cells = map(markdown, row)
-        lines.append(
-            _markdown_row(
-                f"**{cell}**" if (place, column) in table.bold else cell for column, cell in enumerate(cells)
-            )
-        )
+    for row in table.rows:
+        cells = (f"**{markdown(cell)}**" if isinstance(cell, Bold) else markdown(cell) for cell in row)
+        lines.append(_markdown_row(cells))
     notes = [*table.notes, *([f"Bold: {table.bold_note}"] if table.bold_note else [])]
     lines += [f"\n{markdown(note)}" for note in notes]
     if table.explained:
@@ -126,16 +126,14 @@ def _tabular(table: Table) -> str:
     lines += [_latex_row(latex(_one_line(heading)) for heading in table.headings), r"    \midrule"]
     for place, row in enumerate(table.rows):
         lines += [r"    \midrule"] if place in table.rules else []
-        lines.append(
-            _latex_row(_latex_cell(cell, (place, column) in table.bold) for column, cell in enumerate(row))
-        )
+        lines.append(_latex_row(map(_latex_cell, row)))
     return "\n".join([*lines, r"    \bottomrule", r"  \end{tabular}"])
 
 
-def _latex_cell(cell: str, bold: bool) -> str:
+def _latex_cell(cell: str) -> str:
     """A cell whose brackets at its end, such as of an interval, are set smaller and never in bold."""
     value, space, bracket = cell.rpartition(" (") if cell.endswith(")") else (cell, "", "")
-    written = rf"\textbf{{{latex(value)}}}" if bold else latex(value)
+    written = rf"\textbf{{{latex(value)}}}" if isinstance(cell, Bold) else latex(value)
     return rf"{written} {{\scriptsize ({latex(bracket)}}}" if space else written
 
 
@@ -217,13 +215,13 @@ def _drawn(table: Table, styled: bool) -> Any:
             overflow="fold",
         )
 
-    def cell(place: int, column: int, text: str) -> str:
-        if (place, column) in table.bold:
+    def drawn_cell(text: str) -> str:
+        if isinstance(text, Bold):
             return f"[bold]{escape(text)}[/bold]" if styled else f"{escape(text)}*"
         return f"[on {text}]  [/] {text}" if styled and _COLOUR.fullmatch(text) else escape(text)
 
-    for place, row in enumerate(table.rows):
-        drawn.add_row(*(cell(place, column, text) for column, text in enumerate(row)))
+    for row in table.rows:
+        drawn.add_row(*map(drawn_cell, row))
     return drawn
 
 

@@ -344,7 +344,8 @@ def preview(
         out: Picture to write; preview-SPLIT.png or contact-SPLIT.png when not given.
         contact_sheet: Thumbnails of the split's maps instead; of a large one, of its first 100.
     """
-    from benchnav.datagen.preview import save_contact_sheet, save_preview
+    from benchnav.core.figures import save
+    from benchnav.datagen.preview import contact_sheet_figure, preview_figure
 
     dataset = _opened(file)
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
@@ -353,12 +354,13 @@ def preview(
     expect(is_picture, f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
     expect(maps is None or not contact_sheet, "either `maps` or `contact-sheet`, got both.")
     expect(maps is None or maps, "`maps` with at least one index, got none.")
+    if contact_sheet:
+        figure = contact_sheet_figure(dataset, split)
+    else:
+        some = range(min(3, dataset.map_count(split))) if maps is None else sorted(set(maps))
+        figure = preview_figure(dataset, split, list(some))
     with replacing(path) as partial:
-        if contact_sheet:
-            save_contact_sheet(dataset, split, partial, path.suffix[1:])
-        else:
-            some = range(min(3, dataset.map_count(split))) if maps is None else sorted(set(maps))
-            save_preview(dataset, split, list(some), partial, path.suffix[1:])
+        save(figure, partial, path.suffix[1:])
     print(f"wrote {path}")
 
 

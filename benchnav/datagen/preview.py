@@ -8,8 +8,7 @@ Where the classes have soft spots, the ground that may hide them is hatched and 
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib
@@ -22,55 +21,34 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 
-from benchnav.core.errors import ConfigError
 from benchnav.core.figures import (
     LACKING,
     TEXT,
     TITLE,
     TRAVERSABILITY_COLOURS,
     TWO_COLUMNS_IN,
-    add_axes,
-    add_bar,
-    legend_at,
+    frame_map,
     mark,
     mark_handle,
-    number_map,
-    save,
     show_map,
-    write,
+    styled,
 )
-from benchnav.core.grid import Grid
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
 
-TITLES = {
-    "rgb": "RGB",
-    "class_id": "Class",
-    "elevation_m": "Elevation [m]",
-    "slope_deg": "Slope [°]",
-    "traversability": "Traversability λ",
-}
+FIELDS = ("rgb", "class_id", "elevation_m", "slope_deg", "traversability")
 STEEP_DEG = 30.0
 
 _PAGE, _DPI = 9.4, 300.0
-_LEFT, _RIGHT, _TOP, _FOOT, _GAP = 0.6, 0.1, 0.42, 0.94, 0.12
-_LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.0
+_SIDES, _ENDS = 0.7, 1.5  # what is not maps of a sheet's width and height
+_LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.15
 _HATCH = "//////"
-_READ_MAPS = 20
+_READ_MAPS, _MOST_THUMBNAILS = 20, 100
 _MARK_SIZE = 0.75
+_SHADES = matplotlib.colormaps[TRAVERSABILITY_COLOURS].with_extremes(bad=LACKING)
 LACKING_PATCH = Patch(facecolor=LACKING, label="not known")
-
-
-def save_preview(dataset: TerrainDataset, split: str, indices: Sequence[int], path: Path, kind: str) -> None:
-    """Writes a `preview_figure` to the file `path` in the format `kind`, such as png or pdf."""
-    save(preview_figure(dataset, split, indices), path, kind)
-
-
-def save_contact_sheet(dataset: TerrainDataset, split: str, path: Path, kind: str, most: int = 100) -> None:
-    """Writes a `contact_sheet_figure` to the file `path` in the format `kind`, such as png or pdf."""
-    save(contact_sheet_figure(dataset, split, most), path, kind)
 
 
 def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) -> Figure:
@@ -85,12 +63,9 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         A figure as wide as a page; narrower where panels shrink to fit a page.
 
     Raises:
-        ConfigError: no map is asked for.
         DatasetError: there is no such split or map, or its data are damaged.
     """
-    if not len(indices):
-        raise ConfigError("Expected `indices` of at least one map, got none. Pass for example [0].")
-    maps = dataset.read(split, indices, (*TITLES, "start_m", "goal_m"))
+    maps = dataset.read(split, indices, (*FIELDS, "start_m", "goal_m"))
     maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
     # Heights over each map's lowest point compare between maps; heights over a datum seldom do.
     maps["elevation_m"] = maps["elevation_m"] - maps["elevation_m"].min((1, 2), keepdims=True)
@@ -100,25 +75,30 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     maps["class_id"] = np.ma.masked_array(maps["class_id"], unlabelled)
     soft = soft_ground(maps["class_id"], classes)
     relief_m = float(maps["elevation_m"].max()) or 1.0
-    shades = {
-        "class_id": {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5},
-        "elevation_m": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
-        "slope_deg": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
-        "traversability": {"cmap": _shades_of_traversability(), "vmin": 0, "vmax": 1},
-    }
     levels = np.array(MaxNLocator(9, steps=[1, 2, 2.5, 5, 10]).tick_values(0, relief_m))
     levels = levels[levels <= relief_m]
-    units = {
-        "elevation_m": f"above the lowest point,\ncontours every {levels[1]:g} m", "slope_deg": "",
-        "traversability": "",
-    }  # fmt: skip
-    columns = [
-        SheetColumn(
-            name=name, title=title, layers=maps[name], shades=shades.get(name, {}), unit=units.get(name),
-            extend="max" if name == "slope_deg" else "neither",
-        )
-        for name, title in TITLES.items()
-    ]  # fmt: skip
+    kinds = {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
+    looks: dict[str, dict[str, Any]] = {
+        "rgb": {"title": "RGB"},
+        "class_id": {"title": "Class", "shades": kinds},
+        "elevation_m": {
+            "title": "Elevation [m]",
+            "shades": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
+            "unit": f"above the lowest point,\ncontours every {levels[1]:g} m",
+        },
+        "slope_deg": {
+            "title": "Slope [°]",
+            "shades": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
+            "unit": "",
+            "extend": "max",
+        },
+        "traversability": {
+            "title": "Traversability λ",
+            "shades": {"cmap": _SHADES, "vmin": 0, "vmax": 1},
+            "unit": "",
+        },
+    }
+    columns = [SheetColumn(name=name, layers=maps[name], **look) for name, look in looks.items()]
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
     marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
     if unlabelled.any() or np.isnan(maps["traversability"]).any():
@@ -136,14 +116,19 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     panels = {str(panel.get_label()): panel for panel in figure.axes}
     veils = _hillshade(maps["elevation_m"], maps["slope_deg"], grid.resolution_m)
     extent = (0.0, grid.extent_m[0], 0.0, grid.extent_m[1])
+    y, x = ((np.arange(cells) + 0.5) * grid.resolution_m for cells in grid.shape)
     for row in range(len(indices)):
-        show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m, aspect="auto")
-        _draw_contours(panels[f"elevation_m {row}"], maps["elevation_m"][row], levels, grid)
+        show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m)
+        heights = maps["elevation_m"][row]
+        crossed = levels[(levels > heights.min()) & (levels < heights.max())]
+        if len(crossed):
+            looks_of = {"colors": "black", "linewidths": 0.35, "alpha": 0.7}
+            panels[f"elevation_m {row}"].contour(x, y, heights, levels=crossed, **looks_of)
         _draw_soft_ground(panels[f"class_id {row}"], soft[row], extent, hatched=True)
         _draw_soft_ground(panels[f"traversability {row}"], soft[row], extent)
-        for field in TITLES:
+        for column in columns:
             for name in ("start", "goal"):
-                mark(panels[f"{field} {row}"], name, maps[f"{name}_m"][row], _MARK_SIZE, clip_on=False)
+                mark(panels[f"{column.name} {row}"], name, maps[f"{name}_m"][row], _MARK_SIZE, clip_on=False)
     panels["elevation_m bar"].vlines(levels, 0, 1, color="black", lw=0.35, alpha=0.7)
     return figure
 
@@ -165,12 +150,13 @@ class SheetColumn:
     name: str
     title: str
     layers: np.ndarray
-    shades: Mapping[str, Any]
+    shades: Mapping[str, Any] = field(default_factory=dict)
     unit: str | None = None
     extend: str = "neither"
     most: int = 4
 
 
+@styled()
 def sheet_of_maps(
     columns: Sequence[SheetColumn],
     rows: Sequence[str],
@@ -182,60 +168,58 @@ def sheet_of_maps(
     """Draws maps side by side, a row a map and a column a layer, for the page of a paper.
 
     Args:
-        columns: of R rows each; those without a colour bar first.
+        columns: of R rows each.
         rows: names of the R rows.
         extent_m: size of a map along x and y.
         heading: over everything.
-        classes: entries of the legend, which stands under the columns without a bar, or, where it is long, under
-            everything.
+        classes: entries of the legend under everything.
         marks: entries of a legend beside the heading.
 
     Returns:
         A figure as wide as a page; narrower where panels shrink to fit one, wider where columns are many.
     """
     ratio, across = extent_m[1] / extent_m[0], len(columns)
-    widest = max((TWO_COLUMNS_IN - _LEFT - _RIGHT + _GAP) / across - _GAP, _COLUMN)
-    high = min(widest * ratio, 2.0, max((_PAGE - _TOP - 1.1) / len(rows) - _GAP, 0.8))
-    wide = high / ratio
-    column_in, row_in = max(wide, _COLUMN), max(high, 0.5)
-    bottom = _TOP + len(rows) * (row_in + _GAP) - _GAP
-    width = _LEFT + across * (column_in + _GAP) - _GAP + _RIGHT
-    entry = 0.28 + _LETTER * max((len(str(patch.get_label())) for patch in classes), default=0)
-    beside = sum(column.unit is None for column in columns) * (column_in + _GAP) - _GAP
-    legend_columns, legend_top = max(1, int(beside / entry)), bottom + 0.34
-    if len(classes) > 6 * legend_columns:
-        legend_columns, legend_top = max(1, int((width - _LEFT) / entry)), bottom + _FOOT
-    legend_bottom = legend_top + _LINE * -(-len(classes) // legend_columns) + 0.03
-    figure = Figure(figsize=(width, max(bottom + _FOOT, legend_bottom)), dpi=_DPI)
-    middles = _TOP + row_in / 2 + np.arange(len(rows)) * (row_in + _GAP)
-    for number, column in enumerate(columns):
-        centre = _LEFT + column_in / 2 + number * (column_in + _GAP)
-        for row, middle in enumerate(middles):
-            place = (centre - wide / 2, middle - high / 2, wide, high)
-            panel = add_axes(figure, place, f"{column.name} {row}")
-            panel.set_facecolor(LACKING)
-            image = show_map(panel, column.layers[row], extent_m, aspect="auto", **column.shades)
-            number_map(panel, (wide, high), left=number == 0, bottom=row == len(rows) - 1)
-        write(figure, centre, _TOP - 0.05, column.title, size=TITLE, ha="center", va="bottom")
+    widest = max((TWO_COLUMNS_IN - _SIDES) / across, _COLUMN)
+    high = min(widest * ratio, 2.0, max((_PAGE - _ENDS) / len(rows), 0.8))
+    width = across * max(high / ratio, _COLUMN) + _SIDES
+    letters = max((len(str(patch.get_label())) for patch in classes), default=0)
+    legend_columns = max(1, int(width / (0.4 + _LETTER * letters)))
+    ends = _ENDS + _LINE * -(-len(classes) // legend_columns)
+    height = len(rows) * max(high, 0.5) + ends
+    figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    panels = figure.subplots(len(rows), across, squeeze=False, sharex=True, sharey=True)
+    for column, below in zip(columns, panels.T, strict=True):
+        for row, panel in enumerate(below):
+            panel.set(label=f"{column.name} {row}", facecolor=LACKING)
+            image = show_map(panel, column.layers[row], extent_m, **column.shades)
+            frame_map(panel)
+        below[0].set_title(column.title)
         if column.unit is not None:
-            place = (centre - column_in / 2 + 0.06, bottom + 0.44, column_in - 0.12, 0.07)
-            bar = add_bar(figure, image, place, f"{column.name} bar", column.extend, column.most)
-            bar.set_xlabel(column.unit, size=TEXT, labelpad=1.5, linespacing=1.1)
-    for name, middle in zip(rows, middles, strict=True):
-        write(figure, 0.1, middle, name, rotation=90, ha="center", va="center")
-    write(figure, 0.25, middles.mean(), "y [m]", rotation=90, ha="center", va="center")
-    x_middle = _LEFT + column_in / 2 + across // 2 * (column_in + _GAP)
-    write(figure, x_middle, bottom + 0.2, "x [m]", ha="center", va="top")
-    write(figure, _LEFT, 0.06, heading, size=TITLE, va="top")
-    if marks:
-        legend_at(figure, marks, (width - _RIGHT, 0.06), len(marks), "upper right")
-    if classes:
-        legend_at(figure, classes, (_LEFT, legend_top), legend_columns)
+            bar = figure.colorbar(
+                image, ax=list(below), location="bottom", extend=column.extend, aspect=14, panchor=False,
+                ticks=MaxNLocator(column.most, steps=[1, 2, 2.5, 5, 10]), format="%g",
+            )  # fmt: skip
+            bar.set_label(column.unit, size=TEXT)
+            bar.ax.set_label(f"{column.name} bar")
+    for axis, inches in ((panels[0, 0].xaxis, high / ratio), (panels[0, 0].yaxis, high)):
+        # A tick at the very end is left out, as its number would touch the next panel's first.
+        most = min(max(int(inches / 0.2), 1), 4)
+        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="upper"))
+    for panel, name in zip(panels[:, 0], rows, strict=True):
+        panel.set_ylabel(name, size=TEXT)
+    panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
+    figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
+    figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
+    sides: Any = ((marks, len(marks), "outside upper right"), (classes, legend_columns, "outside lower left"))
+    for handles, count, loc in sides:
+        if handles:
+            for text in figure.legend(handles=handles, loc=loc, ncols=count).get_texts():
+                text.set_parse_math(False)
     return figure
 
 
-def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -> Figure:
-    """Draws a thumbnail of the colour image of every map of a split, in order, row by row.
+def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
+    """Draws a thumbnail of the colour image of every map of a split, of its first hundred, in order, row by row.
 
     Where the classes have soft spots, the ground that may hide them is outlined, and the stored λ stands
     to the right of each image.
@@ -243,22 +227,18 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     Args:
         dataset: where the maps are.
         split: name of a split.
-        most: of a larger split, the first so many maps are drawn.
 
     Returns:
         A figure about as wide as high; the thumbnails are the images of its one axes.
 
     Raises:
-        ConfigError: `most` is less than 1.
         DatasetError: there is no such split, or its data are damaged.
     """
-    if most < 1:
-        raise ConfigError(f"Expected `most` ≥ 1, got {most}.")
     held, grid = dataset.map_count(split), dataset.grid
     classes = dataset.recipe.classes
     paired = any(item.soft for item in classes)
     across = grid.width * (2 if paired else 1)
-    count, ratio, gap = min(held, most), grid.height / across, 0.05
+    count, ratio, gap = min(held, _MOST_THUMBNAILS), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
     wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
     high, width = wide * ratio, columns * (wide + gap) + gap
@@ -270,8 +250,8 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
     # A whole number of dots a cell keeps all cells of one size, unless that takes too many dots.
     dots = max(1, round(_DPI * wide / across)) * across / wide
     figure = Figure(figsize=(width, height), dpi=dots if dots <= 2 * _DPI else _DPI)
-    write(figure, gap, 0.05, "\n".join(lines), size=TITLE, va="top")
-    sheet = add_axes(figure, (0, 0, width, height), "thumbnails")
+    figure.text(gap / width, 1 - 0.05 / height, "\n".join(lines), size=TITLE, va="top", parse_math=False)
+    sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
     outline: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
@@ -281,8 +261,12 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str, most: int = 100) -
         for place, rgb in enumerate(np.moveaxis(block["rgb"], 1, -1)):
             index = first + place
             x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
-            image = np.concatenate([rgb, _coloured(block["traversability"][place])], 1) if paired else rgb
-            _draw_image(sheet, image, (x, x + wide, y + high, y))
+            image = rgb
+            if paired:
+                values = np.ma.masked_invalid(block["traversability"][place])
+                image = np.concatenate([rgb, _SHADES(values, bytes=True)[..., :3]], axis=1)
+            box = (x, x + wide, y + high, y)
+            sheet.imshow(image, origin="lower", extent=box, aspect="auto", interpolation="none")
             if paired:
                 soft = soft_ground(block["class_id"][place], classes)
                 _draw_soft_ground(sheet, soft, (x, x + wide / 2, y + high, y), line=0.2)
@@ -318,15 +302,6 @@ def class_shades(colours: np.ndarray) -> Colormap:
     return ListedColormap(list(colours)).with_extremes(bad=LACKING)
 
 
-def _shades_of_traversability() -> Colormap:
-    return matplotlib.colormaps[TRAVERSABILITY_COLOURS].with_extremes(bad=LACKING)
-
-
-def _coloured(traversability: np.ndarray) -> np.ndarray:
-    """λ in the colours of the sheets, from [H, W] to uint8 [H, W, 3]."""
-    return _shades_of_traversability()(np.ma.masked_invalid(traversability), bytes=True)[..., :3]
-
-
 def contact_columns(count: int, ratio: float) -> int:
     """Number of columns that makes a grid about as wide as high, with few places left empty.
 
@@ -351,19 +326,6 @@ def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: flo
     lit = shade(lift * elevation_m.astype(np.float64), resolution_m, light, 0.0) - light[0, 2]
     colour = np.repeat((lit > 0).astype(np.float64)[..., None], 3, axis=-1)
     return np.concatenate([colour, 0.7 * np.abs(lit)[..., None]], axis=-1)
-
-
-def _draw_image(
-    panel: Axes, values: np.ndarray, extent: tuple[float, float, float, float], **style: Any
-) -> None:
-    panel.imshow(values, origin="lower", extent=extent, aspect="auto", interpolation="none", **style)
-
-
-def _draw_contours(panel: Axes, elevation_m: np.ndarray, levels: np.ndarray, grid: Grid) -> None:
-    crossed = levels[(levels > elevation_m.min()) & (levels < elevation_m.max())]
-    if len(crossed):
-        y, x = ((np.arange(cells) + 0.5) * grid.resolution_m for cells in grid.shape)
-        panel.contour(x, y, elevation_m, levels=crossed, colors="black", linewidths=0.35, alpha=0.7)
 
 
 def _draw_soft_ground(

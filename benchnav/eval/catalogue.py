@@ -12,7 +12,7 @@ from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.registry import Option
 from benchnav.core.settings import check_known, dataclass_in, list_options, plain
-from benchnav.core.tables import Table, print_table
+from benchnav.core.tables import Bold, Table, print_table
 
 TITLES = {
     "planner": "planners",
@@ -82,12 +82,12 @@ def plain_lines(kind: str) -> list[str]:
 
 def make_table(kind: str) -> Table:
     """The catalogue of a kind as a table."""
-    entries = list_entries(kind)
     return Table(
         title=TITLES[kind],
         headings=("name", "purpose", "options"),
-        rows=tuple((entry.name, entry.purpose, "\n".join(entry.options)) for entry in entries),
-        bold=frozenset((place, 0) for place in range(len(entries))),
+        rows=tuple(
+            (Bold(entry.name), entry.purpose, "\n".join(entry.options)) for entry in list_entries(kind)
+        ),
     )
 
 

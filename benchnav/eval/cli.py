@@ -4,6 +4,7 @@ import json
 import os
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -198,7 +199,7 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
 
 def _finish(folder: Path) -> int:
     """Reports on a finished run; gives the exit status."""
-    from benchnav.eval.report.playback.files import write_viewer_files
+    from benchnav.eval.report.playback.rerun_file import write_viewer_files
 
     write_viewer_files(folder)
     _report(folder, folder)
@@ -212,10 +213,10 @@ def _say(line: str) -> None:
 
 
 def _report(folder: Path, place: Path) -> None:
-    from benchnav.eval.failed_ground import ground_of_run
     from benchnav.eval.report.write import PAGE, print_report, write_report
+    from benchnav.eval.run.again import record_failures
 
-    print_report(write_report(folder, ground_of_run(folder), place))
+    print_report(write_report(folder, partial(record_failures, folder), place))
     print(f"report:  {place / PAGE}")
 
 

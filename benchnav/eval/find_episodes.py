@@ -6,9 +6,9 @@ from pathlib import Path
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
-from benchnav.eval.experiment.condition import NOT_USED, Condition
-from benchnav.eval.experiment.unit import Extent, Unit, units
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.unit import Unit, units
+from benchnav.eval.folder.folder import Run, open_run
 
 _COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
 
@@ -34,18 +34,28 @@ def find_episodes(
     """
     run = open_run(folder)
     known = {
-        name: {condition.labels[name] for condition, _ in run.conditions.values()} - {NOT_USED}
-        for name in labels
+        name: list(dict.fromkeys(condition.labels[name] for condition, _ in run.conditions.values()))
+        for name in _COLUMNS
     }
     found: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         asked = dict(zip(labels, values, strict=True))
-        unit = _find(run.conditions, asked, seed, realisation, map_index)
+        unit = _find(run, asked, (seed, realisation, map_index))
         # A blind planner has no risk setting and fits any, but not one that no planner of the run has.
-        strange = [name for name, label in asked.items() if known[name] and label not in known[name]]
+        strange = [
+            name
+            for name, label in asked.items()
+            if known[name] != [NOT_USED] and label not in {*known[name]} - {NOT_USED}
+        ]
         if unit is None or strange:
-            near = "".join(hint(asked[name], known[name]) for name in strange[:1])
-            raise ConfigError(_refusal(run.conditions, asked, seed, realisation, map_index) + near)
+            words = [f"{name} {label!r}" for name, label in asked.items()]
+            words += [f"realisation {realisation}", f"map {map_index}"]
+            words += [] if seed is None else [f"seed {seed}"]
+            near = "".join(hint(asked[name], {*known[name]} - {NOT_USED}) for name in strange[:1])
+            raise ConfigError(
+                f"Expected an episode of the run, got {', '.join(words)}. "
+                f"It has {', '.join(f'{name}s {values}' for name, values in known.items())}.{near}"
+            )
         seed = unit.seed
         found.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))
     episodes = list(found.values())
@@ -55,38 +65,20 @@ def find_episodes(
     return episodes
 
 
-def _find(
-    conditions: Mapping[str, tuple[Condition, Extent]],
-    asked: Mapping[str, str],
-    seed: int | None,
-    realisation: int,
-    map_index: int,
-) -> Unit | None:
-    """The unit of the first condition that fits; one that does not use a part fits any label where no other does."""
-    for unused_fits in (False, True):
-        for condition_id, entry in conditions.items():
-            labels = entry[0].labels
-            if any(labels[n] != v and not (unused_fits and labels[n] == NOT_USED) for n, v in asked.items()):
-                continue
-            wanted = entry[1].seeds[0] if seed is None else seed
-            for unit in units({condition_id: entry}):
+def _find(run: Run, asked: Mapping[str, str], episode: tuple[int | None, int, int]) -> Unit | None:
+    """The unit of the first condition that fits; one that does not use a part fits any label where no other does.
+
+    Args:
+        run: where.
+        asked: labels.
+        episode: seed, realisation and map.
+    """
+    seed, realisation, map_index = episode
+    for others in (set(), {NOT_USED}):
+        for condition, extent in run.conditions.values():
+            own = {condition.labels[name] for name, label in asked.items() if condition.labels[name] != label}
+            wanted = extent.seeds[0] if seed is None else seed
+            for unit in units({condition.id: (condition, extent)}) if own <= others else ():
                 if (unit.seed, unit.realisation) == (wanted, realisation) and map_index in unit.maps:
                     return unit
     return None
-
-
-def _refusal(
-    conditions: Mapping[str, tuple[Condition, Extent]],
-    asked: Mapping[str, str],
-    seed: int | None,
-    realisation: int,
-    map_index: int,
-) -> str:
-    words = [f"{name} {label!r}" for name, label in asked.items()]
-    words += [f"realisation {realisation}", f"map {map_index}"]
-    words += [] if seed is None else [f"seed {seed}"]
-    known = {name: list(dict.fromkeys(t.labels[name] for t, _ in conditions.values())) for name in _COLUMNS}
-    return (
-        f"Expected an episode of the run, got {', '.join(words)}. "
-        f"It has {', '.join(f'{name}s {values}' for name, values in known.items())}."
-    )

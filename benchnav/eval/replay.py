@@ -14,7 +14,7 @@ from benchnav.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from benchnav.eval.experiment.unit import Unit
-    from benchnav.eval.report.recorded.recording import Recording
+    from benchnav.eval.recording import Recording
 
 VIDEO = ".mp4"
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 from rich.cells import cell_len
 
-from benchnav.core.tables import Table, latex, to_latex, to_markdown, to_terminal
+from benchnav.core.tables import Bold, Table, latex, to_latex, to_markdown, to_terminal
 
 TABLE = Table(
     headings=("planner", "λ̄ [%]", "failures"),
@@ -13,7 +13,7 @@ TABLE = Table(
 )
 BOLD = replace(
     TABLE,
-    bold=frozenset({(1, 1)}),
+    rows=(TABLE.rows[0], ("[bold] a|b & 50%", Bold("–"), "–")),
     bold_note="the best | all",
     explained=(("failures", "how <it> ended."),),
 )

@@ -13,17 +13,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.core.figures import TWO_COLUMNS_IN
+from benchnav.core.errors import DatasetError
+from benchnav.core.figures import TWO_COLUMNS_IN, save
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.preview import (
-    TITLES,
+    FIELDS,
     class_colours,
     contact_columns,
     contact_sheet_figure,
     preview_figure,
-    save_contact_sheet,
-    save_preview,
     soft_ground,
 )
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe
@@ -82,11 +80,11 @@ def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset)
     indices = [1, 0]
     figure = preview_figure(dataset, "test/hg", indices)
     drawn, stored = panels(figure), dataset.read("test/hg", indices)
-    assert set(drawn) == {f"{field} {row}" for field in TITLES for row in (0, 1)} | {
+    assert set(drawn) == {f"{field} {row}" for field in FIELDS for row in (0, 1)} | {
         f"{field} bar" for field in BARS
     }
     for row in (0, 1):
-        for field in TITLES:
+        for field in FIELDS:
             panel, values = drawn[f"{field} {row}"], stored[field][row]
             if field == "rgb":
                 values = values.transpose(1, 2, 0)
@@ -102,7 +100,7 @@ def test_a_panel_per_field_and_row_shows_what_is_stored(dataset: TerrainDataset)
     texts = [text.get_text() for text in seen_texts(figure)]
     for once in ("tiny-v1, split test/hg", "map 1", "map 0", "x [m]", "y [m]", "start", "goal"):
         assert texts.count(once) == 1
-    for title in TITLES.values():
+    for title in ("RGB", "Class", "Elevation [m]", "Slope [°]", "Traversability λ"):
         assert texts.count(title) == 1
 
 
@@ -178,7 +176,7 @@ def test_grids_of_any_shape(tmp_path: Path, height: int, width: int) -> None:
     shaped = TerrainDataset(tiny_dataset(tmp_path / "shaped.h5", recipe))
     figure = preview_figure(shaped, "train", [0, 1])
     check_texts(figure)
-    for field in TITLES:
+    for field in FIELDS:
         panel = panels(figure)[f"{field} 1"]
         assert panel.images[0].get_array().shape[:2] == (height, width)
         box = panel.get_window_extent()
@@ -265,8 +263,8 @@ def test_hillshade_lights_the_north_west(dataset: TerrainDataset, monkeypatch: p
 )
 def test_pictures_are_written(dataset: TerrainDataset, tmp_path: Path, kind: str, magic: bytes) -> None:
     settings = dict(matplotlib.rcParams)
-    save_preview(dataset, "test/std", [0, 1], tmp_path / "sheet", kind)
-    save_contact_sheet(dataset, "test/std", tmp_path / "contact", kind)
+    save(preview_figure(dataset, "test/std", [0, 1]), tmp_path / "sheet", kind)
+    save(contact_sheet_figure(dataset, "test/std"), tmp_path / "contact", kind)
     assert dict(matplotlib.rcParams) == settings
     for name in ("sheet", "contact"):
         written = (tmp_path / name).read_bytes()
@@ -304,11 +302,12 @@ def test_a_contact_sheet_has_every_map_in_order(
     check_texts(figure)
 
 
-def test_a_contact_sheet_stops_at_most(dataset: TerrainDataset) -> None:
-    figure = contact_sheet_figure(dataset, "train", most=5)
+def test_a_contact_sheet_stops_at_most(dataset: TerrainDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "first" not in contact_sheet_figure(dataset, "train").texts[0].get_text()
+    monkeypatch.setattr("benchnav.datagen.preview._MOST_THUMBNAILS", 5)
+    figure = contact_sheet_figure(dataset, "train")
     assert len(figure.axes[0].images) == 5
     assert "first 5 of 8 maps" in figure.texts[0].get_text().replace("\n", " ")
-    assert "first" not in contact_sheet_figure(dataset, "train", most=8).texts[0].get_text()
 
 
 @pytest.mark.parametrize(("count", "ratio", "columns"), [(100, 1, 10), (20, 1, 5), (1, 1, 1), (16, 4, 8)])
@@ -335,11 +334,7 @@ def test_an_unknown_split_is_refused(
         draw(dataset)
 
 
-def test_nothing_to_draw_is_refused(dataset: TerrainDataset) -> None:
-    with pytest.raises(ConfigError, match="at least one map"):
-        preview_figure(dataset, "train", [])
-    with pytest.raises(ConfigError, match="`most` ≥ 1, got 0"):
-        contact_sheet_figure(dataset, "train", most=0)
+def test_a_map_that_is_not_there_is_refused(dataset: TerrainDataset) -> None:
     with pytest.raises(DatasetError, match="indices in 0–7"):
         preview_figure(dataset, "train", [8])
 

@@ -2,19 +2,18 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.charts.failure_sheet import FailedGround
-from benchnav.eval.report.failures import steps_of
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.words import blocks, condition_name, several_models
 from benchnav.eval.stats.best import competing
 
-GroundOf = Callable[[pd.DataFrame], FailedGround]
+# Gives a recording of each of some failures of one condition, rows of `failures.failures_table`.
+RecordFailures = Callable[[pd.DataFrame], Sequence[Recording]]
 
 ACROSS = 4  # failures of a condition that are shown
 _MOST_BLOCKS = 6
@@ -29,15 +28,13 @@ class FailedLine:
     Args:
         name: of the condition.
         failures: rows of `failures.failures_table`, at most `ACROSS`.
-        ground: of these.
-        tracks: driven positions of each, shape [steps, 2].
+        recordings: of each, with what was predicted and driven.
         among: number of failures that these were chosen of.
     """
 
     name: str
     failures: pd.DataFrame
-    ground: FailedGround
-    tracks: Sequence[np.ndarray]
+    recordings: Sequence[Recording]
     among: int
 
 
@@ -47,57 +44,58 @@ class Sheets:
 
     Args:
         shown: of each block its title and the lines of its sheet.
-        told: by condition λ̂ where its failed episodes ended, shape [N].
+        predicted: by condition λ̂ where its failed episodes ended, shape [N].
         left_out: why sheets are missing; empty where none is, or nothing failed.
     """
 
     shown: tuple[tuple[str, tuple[FailedLine, ...]], ...]
-    told: dict[str, np.ndarray]
+    predicted: dict[str, np.ndarray]
     left_out: str
 
 
 def collect_sheets(
-    folder: Path, summary: pd.DataFrame, failures: pd.DataFrame, ground_of: GroundOf | None
+    summary: pd.DataFrame, failures: pd.DataFrame, record_failures: RecordFailures | None
 ) -> Sheets:
     """Collects the sheets of a run.
 
     Args:
-        folder: the run folder.
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures.failures_table`.
-        ground_of: gives the ground of some failures of one condition; it may raise a `BenchnavError`. None where no
-            sheet is asked for.
+        record_failures: it may raise a `BenchnavError`. None where no sheet is asked for.
     """
     placed = failures[failures["x_m"].notna()]
-    if ground_of is None or placed.empty:
-        asked = ground_of is not None and not failures.empty
+    if record_failures is None or placed.empty:
+        asked = record_failures is not None and not failures.empty
         why = "No sheet of failures: the run kept no steps of them." if asked else ""
-        return Sheets(shown=(), told={}, left_out=why)
+        return Sheets(shown=(), predicted={}, left_out=why)
     several = several_models(summary)
-    shown, told, left_out = [], {}, []
+    shown, predicted, left_out = [], {}, []
     if len(every := blocks(summary)) > _MOST_BLOCKS:
         left_out.append(f"Sheets of failures are of the first {_MOST_BLOCKS} of {len(every)} blocks.")
     for title, rows in every[:_MOST_BLOCKS]:
         lines = []
         try:
             for row in _looked_at(rows):
-                own = (
-                    placed[placed["condition"] == row["condition"]]
-                    .head(_MOST_FAILURES)
-                    .reset_index(drop=True)
-                )
+                condition = row["condition"]
+                own = placed[placed["condition"] == condition].head(_MOST_FAILURES).reset_index(drop=True)
                 if own.empty:
                     continue
-                ground = ground_of(own)
-                told[row["condition"]] = ground.told(own[["x_m", "y_m"]].to_numpy())
-                count = int((failures["condition"] == row["condition"]).sum())
-                lines.append(_line(folder, condition_name(row, several), own, ground, count))
+                recordings, chosen = record_failures(own), choose_failures(own)
+                predicted[condition] = np.array([recording.predicted_at_end for recording in recordings])
+                lines.append(
+                    FailedLine(
+                        name=condition_name(row, several),
+                        failures=chosen.reset_index(drop=True),
+                        recordings=[recordings[place] for place in chosen.index],
+                        among=int((failures["condition"] == condition).sum()),
+                    )
+                )
         except (BenchnavError, OSError) as error:
             left_out.append(f"No sheet of failures: {error}")
             continue
         if lines:
             shown.append((title, tuple(lines)))
-    return Sheets(shown=tuple(shown), told=told, left_out=" ".join(dict.fromkeys(left_out)))
+    return Sheets(shown=tuple(shown), predicted=predicted, left_out=" ".join(dict.fromkeys(left_out)))
 
 
 def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
@@ -116,25 +114,3 @@ def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:
     turn = placed.groupby("outcome", sort=False).cumcount()
     often = -placed.groupby("outcome")["outcome"].transform("size")
     return placed.assign(turn=turn, often=often).sort_values(["turn", "often"], kind="stable").head(ACROSS)
-
-
-def _line(folder: Path, name: str, failures: pd.DataFrame, ground: FailedGround, among: int) -> FailedLine:
-    chosen = choose_failures(failures)
-    steps = steps_of(folder, [chosen["condition"].iloc[0]])
-    tracks = []
-    for row in chosen.to_dict("records"):
-        own = np.logical_and.reduce([steps[key] == row[key] for key in ("seed", "realisation", "map")])
-        tracks.append(steps.loc[own, ["x_m", "y_m"]].to_numpy())
-    places = chosen.index.to_numpy()
-    return FailedLine(
-        name=name,
-        failures=chosen.reset_index(drop=True),
-        ground=FailedGround(
-            predicted=ground.predicted[places],
-            immobilising=ground.immobilising[places],
-            resolution_m=ground.resolution_m,
-            goal_m=ground.goal_m[places],
-        ),
-        tracks=tracks,
-        among=among,
-    )

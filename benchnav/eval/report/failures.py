@@ -10,6 +10,7 @@ import pyarrow.dataset as ds
 from benchnav.eval.folder.steps import open_steps, rows_of
 
 _KEYS = ["condition", "seed", "realisation", "map"]
+_ENDS = ("x_m", "y_m", "end_traversability", "last_traversability")
 _LAST_S = 2.0
 
 
@@ -22,34 +23,19 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         A row a failure: `condition`, `planner`, `risk`, `model`, `scenario`, `world`, `seed`, `realisation`,
-        `map`, `outcome`, `end_time_s`; `x_m`, `y_m`, where it ended; `end_traversability`, the observed λ in the
-        last step; and `last_traversability`, the mean of observed λ in the last 2 s. The last four are NaN where
+        `map`, `outcome`, `end_time_s`, `code`; `x_m`, `y_m`, where it ended; `end_traversability`, the observed λ
+        in the last step; and `last_traversability`, the mean of observed λ in the last 2 s. The last four are NaN where
         steps were not kept.
     """
     labels = ["planner", "risk", "model", "scenario", "world"]
     columns = ["condition", *labels, *_KEYS[1:], "outcome", "end_time_s", "code"]
-    failed = episodes.loc[~episodes["success"].astype(bool), columns]
-    ends = _ends(steps_of(folder, list(failed["condition"].unique())))
-    return failed.merge(ends, on=_KEYS, how="left").reset_index(drop=True)
-
-
-def steps_of(folder: Path, conditions: list[str]) -> pd.DataFrame:
-    """Reads the steps of some conditions, of one table or of one part a condition; no rows where none were kept.
-
-    Args:
-        folder: the run folder.
-        conditions: ids.
-
-    Returns:
-        `condition`, `seed`, `realisation`, `map`, `time_s`, `x_m`, `y_m`, `traversability`, by time.
-    """
-    columns = [*_KEYS, "time_s", "x_m", "y_m", "traversability"]
+    failed = episodes.loc[~episodes["success"].astype(bool), columns].reset_index(drop=True)
     source = open_steps(folder)
     if source is None:
-        return pd.DataFrame(
-            {name: pd.Series(dtype=object if name == "condition" else float) for name in columns}
-        )
-    return rows_of(folder, source, columns, ds.field("condition").isin(pa.array(conditions, pa.string())))
+        return failed.assign(**dict.fromkeys(_ENDS, np.nan))
+    chosen = ds.field("condition").isin(pa.array(failed["condition"].unique(), pa.string()))
+    steps = rows_of(folder, source, [*_KEYS, "time_s", "x_m", "y_m", "traversability"], chosen)
+    return failed.merge(_ends(steps), on=_KEYS, how="left")
 
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:

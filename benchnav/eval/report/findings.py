@@ -36,26 +36,26 @@ class Finding:
 
 
 def findings(
-    summary: pd.DataFrame, failures: pd.DataFrame, told: Mapping[str, np.ndarray] | None = None
+    summary: pd.DataFrame, failures: pd.DataFrame, predicted: Mapping[str, np.ndarray] | None = None
 ) -> list[Finding]:
     """Says of each block which setting is best, by how much, how sure that is, and how the failures failed.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures.failures_table`.
-        told: by condition the λ̂ where its failed episodes ended, where that is known.
+        predicted: by condition the λ̂ where its failed episodes ended, where that is known.
     """
     several = several_models(summary)
     rows = ({str(name): value for name, value in row.items()} for row in summary.to_dict("records"))
     names = {row["condition"]: condition_name(row, several) for row in rows}
     return [
-        Finding(title=title, sentences=tuple(_sentences(block, names, failures, told or {})))
+        Finding(title=title, sentences=tuple(_sentences(block, names, failures, predicted or {})))
         for title, block in blocks(summary)
     ]
 
 
 def _sentences(
-    rows: pd.DataFrame, names: Mapping[str, str], failures: pd.DataFrame, told: Mapping[str, np.ndarray]
+    rows: pd.DataFrame, names: Mapping[str, str], failures: pd.DataFrame, predicted: Mapping[str, np.ndarray]
 ) -> Iterable[str]:
     rivals = rows[competing(rows)]
     best = rivals[rivals["condition"] == rivals["best"].iloc[0]].to_dict("records")[0]
@@ -70,7 +70,7 @@ def _sentences(
     if not others.empty and (rivals["n_episodes"] > common).any():
         yield f"The settings are compared on the {common} episodes that all of them have."
     yield from _rank(best, others, names)
-    yield from _why(best, names, failures, told)
+    yield from _why(best, names, failures, predicted)
     count = int(rivals["n_episodes"].sum())
     failed = count - round(float((rivals["success_rate"] * rivals["n_episodes"]).sum()))
     if failed and len(rivals) > 1:
@@ -123,7 +123,10 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame, names: Mapping[str, str
 
 
 def _why(
-    best: Mapping[Any, Any], names: Mapping[str, str], failures: pd.DataFrame, told: Mapping[str, np.ndarray]
+    best: Mapping[Any, Any],
+    names: Mapping[str, str],
+    failures: pd.DataFrame,
+    predicted: Mapping[str, np.ndarray],
 ) -> Iterable[str]:
     """How the best setting's failures failed, and on what ground."""
     outcomes = pd.Series({f"{o.name.lower()}_count": best[f"{o.name.lower()}_count"] for o in FAILURES})
@@ -132,7 +135,7 @@ def _why(
         return
     yield f"It failed in {int(outcomes.sum())} of {best['n_episodes']} episodes: {_shares(outcomes)}."
     met = failures.loc[failures["condition"] == best["condition"], "last_traversability"].median()
-    known = told.get(best["condition"], np.empty(0))
+    known = predicted.get(best["condition"], np.empty(0))
     known = known[~np.isnan(known)]  # an end outside the map has none
     if np.isnan(met):
         return

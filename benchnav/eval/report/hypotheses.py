@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.core.tables import Table
+from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
@@ -59,7 +59,7 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> Table:
             _with_unit(row),
             _interval(row),
             p_value(row["p_holm"]),
-            _verdict(row),
+            Bold(_verdict(row)) if row["supported"] else _verdict(row),
         )
         for number, row in enumerate(tests.to_dict("records"), start=1)
     )
@@ -79,10 +79,9 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> Table:
         )
     if (tests["metric"] == "path_length").any():
         notes.append("Path length: of the episodes in which both arrived.")
-    bold = frozenset((place, 7) for place, supported in enumerate(tests["supported"]) if supported)
     return Table(
-        headings=headings, labels=2, rows=rows, notes=tuple(notes), bold=bold,
-        bold_note="supported." if bold else "",
+        headings=headings, labels=2, rows=rows, notes=tuple(notes),
+        bold_note="supported." if tests["supported"].any() else "",
     )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +16,13 @@ from benchnav.eval.report.findings import Finding
 _SCREEN = 0.6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drawn:
-    """A figure of a report.
-
-    Args:
-        path: of its PNG.
-        caption: what it shows.
-    """
-
-    path: Path
-    caption: str
-
-
 def write_page(
     name: str,
     header: Sequence[str],
     warnings: Sequence[str],
     findings: Sequence[Finding],
     table: Table,
-    figures: Sequence[Drawn],
+    figures: Mapping[Path, str],
     about: Mapping[str, Any],
 ) -> str:
     """Writes the page; all text is escaped.
@@ -47,7 +33,7 @@ def write_page(
         warnings: lines on what went wrong.
         findings: what the run says.
         table: a row a condition.
-        figures: in order.
+        figures: by the path of its PNG what each shows.
         about: all of `run.json`.
 
     Returns:
@@ -63,7 +49,7 @@ def write_page(
         warnings=warnings,
         findings=findings,
         table=table,
-        figures=[(one.path.stem, one.caption, _inline(one.path), _width(one.path)) for one in figures],
+        figures=[(path.stem, caption, _inline(path), _width(path)) for path, caption in figures.items()],
         provenance=provenance_lines(about),
         commands=about["commands"],
         version=benchnav.__version__,

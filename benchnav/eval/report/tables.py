@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from benchnav.core.figures import planner_name
-from benchnav.core.tables import Table, to_latex
+from benchnav.core.tables import Bold, Table, to_latex
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.report.words import (
     blocks,
@@ -90,6 +90,8 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     for row, mark in zip(summary.to_dict("records"), marks, strict=True):
         cells = {name: str(row[name]) for name in labels} | {name: str(row[f"n_{name}"]) for name in counts}
         cells |= {"planner": row["planner"] + mark, **_results(row)}
+        if row["best_marked"]:
+            cells["Succ. [%]"] = Bold(cells["Succ. [%]"])
         rows.append(tuple(cells[heading] for heading in headings))
     if any("¶" in cell for row in rows for cell in row):
         notes.append("¶ compiled planner: its time is that of compiled code.")
@@ -98,11 +100,6 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
         labels=len(labels),
         rows=tuple(rows),
         notes=tuple(notes),
-        bold=frozenset(
-            (place, headings.index(_RESULTS[0]))
-            for place, is_best in enumerate(summary["best_marked"])
-            if is_best
-        ),
         bold_note=bold_note(summary),
         explained=tuple((heading, _COLUMNS[heading]) for heading in headings),
     )
@@ -137,7 +134,7 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
     ]
     settings = list(dict.fromkeys(setting for block in results for setting in block))
     planners = list(dict.fromkeys(setting[0] for setting in settings))
-    rows, bold, rules = [], set(), set()
+    rows, rules = [], set()
     above: tuple[str, ...] = ()
     for place, setting in enumerate(sorted(settings, key=lambda setting: planners.index(setting[0]))):
         if above and setting[0] != above[0]:
@@ -147,8 +144,6 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
             if setting[: column + 1] == above[: column + 1]:
                 cells[column] = ""
         for block in results:
-            if setting in block and block[setting]["best_marked"]:
-                bold.add((place, len(cells)))
             cells += _in_paper(block[setting]) if setting in block else [NOT_USED] * len(_PAPER)
         rows.append(tuple(cells))
         above = setting
@@ -156,15 +151,15 @@ def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -
         headings=(*(name.capitalize() for name in labels), *_PAPER * len(known)),
         labels=len(labels),
         rows=tuple(rows),
-        bold=frozenset(bold),
         groups=tuple(title for title, _ in known),
         rules=frozenset(rules),
     )
 
 
 def _in_paper(row: Mapping[Any, Any]) -> list[str]:
+    success = f"{rate_in_words(row)} ({success_interval_in_words(row)})"
     return [
-        f"{rate_in_words(row)} ({success_interval_in_words(row)})",
+        Bold(success) if row["best_marked"] else success,
         mean_and_std(row["total_time_mean_s"], row["total_time_std_s"]),
         mean_and_std(100 * row["traversability_mean"], 100 * row["traversability_std"]),
     ]

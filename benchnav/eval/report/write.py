@@ -1,9 +1,9 @@
 """The report of a run: what it says, its table, where its rows come from, and its figures."""
 
+import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,26 +14,26 @@ from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
+from benchnav.eval.recording import MAP, read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
     forest_figure,
     outcome_figure,
     success_figure,
 )
-from benchnav.eval.report.charts.driven import read_driven
 from benchnav.eval.report.charts.maps import (
-    choose_snapshots,
+    choose_recordings,
     driven_figure,
     failure_figure,
+    read_driven,
     trajectory_figure,
 )
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
-from benchnav.eval.report.failure_choice import GroundOf, Sheets, collect_sheets
+from benchnav.eval.report.failure_choice import RecordFailures, Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
-from benchnav.eval.report.page import Drawn, write_page
-from benchnav.eval.report.recorded.recording import read_snapshots
+from benchnav.eval.report.page import write_page
 from benchnav.eval.report.tables import LATENCIES, is_grouped, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
 from benchnav.eval.stats.best import against_best, privileged_models
@@ -92,12 +92,13 @@ class Report:
     about: Mapping[str, Any]
 
 
-def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
+def read_report(folder: Path, record_failures: RecordFailures | None = None) -> Report:
     """Makes the report of a finished run, and writes nothing.
 
     Args:
         folder: a finished run.
-        ground_of: gives the ground of failures; without it they are not shown on maps.
+        record_failures: records failures again, as `run.again.record_failures` does of the folder; without it none is
+            shown on a map.
 
     Raises:
         ConfigError: the folder is no run folder, or its run is not finished.
@@ -114,11 +115,11 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
     summary = _with_latency(summary, about["conditions"])
     failures = failures_table(folder, episodes)
-    sheets = collect_sheets(folder, summary, failures, ground_of)
+    sheets = collect_sheets(summary, failures, record_failures)
     left_out = [sheets.left_out] if sheets.left_out else []
     return Report(
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
-        findings=_findings(findings(summary, failures, sheets.told), tests, about, grouped),
+        findings=_findings(findings(summary, failures, sheets.predicted), tests, about, grouped),
         table=result_table(summary, about["conditions"]),
         warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
         summary=summary,
@@ -130,18 +131,21 @@ def read_report(folder: Path, ground_of: GroundOf | None = None) -> Report:
     )
 
 
-def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | None = None) -> Report:
+def write_report(
+    folder: Path, record_failures: RecordFailures | None = None, out: Path | None = None
+) -> Report:
     """Writes `report.html`, `summary.{csv,md,tex}`, `failures.csv` and `figures/` of a run.
 
     Args:
         folder: a finished run.
-        ground_of: gives the ground of failures; without it they are not shown on maps.
+        record_failures: records failures again, as `run.again.record_failures` does of the folder; without it none is
+            shown on a map.
         out: where to; the run folder when not given.
 
     Returns:
         What was written of.
     """
-    report, out = read_report(folder, ground_of), out or folder
+    report, out = read_report(folder, record_failures), out or folder
     name = folder.resolve().name
     write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
@@ -150,15 +154,13 @@ def write_report(folder: Path, ground_of: GroundOf | None = None, out: Path | No
         write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
         shown = hypothesis_table(report.tests, is_grouped(report.summary))
         write_text(out / "hypotheses.tex", to_latex([shown], _HYPOTHESES, f"{name}-hypotheses"))
-    figures = []
-    for figure_name, caption, draw, trim in (
-        *_charts(report),
-        *_trajectories(folder, report.summary),
-        *_driven(folder),
-    ):
+    figures = {}
+    charts, maps = _charts(report), (_trajectories(folder, report.summary), _driven(folder))
+    for figure_name, caption, figure in itertools.chain(charts, *maps):
         path = out / "figures" / f"{figure_name}.png"
-        save_twice(draw(), path, trim)
-        figures.append(Drawn(path=path, caption=caption))
+        # These are as wide as their maps: white borders are cut away.
+        save_twice(figure, path, trim=figure_name in ("trajectories", "driven"))
+        figures[path] = caption
     write_text(out / "summary.md", _as_markdown(report, figures))
     page = write_page(
         name, report.header, report.warnings, report.findings, report.table, figures, report.about
@@ -185,46 +187,40 @@ def _findings(
     return (hypothesis_finding(tests, about, grouped), *rest)
 
 
-# Name, caption, what draws it, and whether its white borders are cut away.
-ToDraw = tuple[str, str, Callable[[], Figure], bool]
+Drawn = Iterator[tuple[str, str, Figure]]  # name, caption and figure
 
 
-def _charts(report: Report) -> Iterator[ToDraw]:
+def _charts(report: Report) -> Drawn:
     """The figures at the width of a column or a page."""
     summary = report.summary
     marked = set(summary.loc[summary["best_marked"], "condition"])
     if not report.tests.empty:
-        yield "forest", _FOREST, partial(forest_figure, report.tests), False
-    yield "success", _SUCCESS, partial(success_figure, summary, marked), False
+        yield "forest", _FOREST, forest_figure(report.tests)
+    yield "success", _SUCCESS, success_figure(summary, marked)
     sweeps = find_sweeps(report.about["conditions"])
     names = Counter(sweep_name(sweep.number) for sweep in sweeps)
     for sweep in sweeps:
         short = sweep_name(sweep.number)
         name = short if names[short] == 1 else sweep.number.replace(".", "-")
-        yield f"over-{name}", _SWEEP.format(name), partial(curve_figure, sweep, summary), False
-    yield "outcomes", _OUTCOMES, partial(outcome_figure, summary), False
-    yield "distributions", _DISTRIBUTIONS, partial(distribution_figure, summary, report.episodes), False
+        yield f"over-{name}", _SWEEP.format(name), curve_figure(sweep, summary)
+    yield "outcomes", _OUTCOMES, outcome_figure(summary)
+    yield "distributions", _DISTRIBUTIONS, distribution_figure(summary, report.episodes)
     for place, (title, lines) in enumerate(report.sheets.shown, start=1):
         name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place}"
-        yield name, _FAILURES.format(title), partial(failure_figure, lines), False
+        yield name, _FAILURES.format(title), failure_figure(lines)
 
 
-def _trajectories(folder: Path, summary: pd.DataFrame) -> Iterator[ToDraw]:
+def _trajectories(folder: Path, summary: pd.DataFrame) -> Drawn:
     """The figure of recorded episodes; none where nothing was recorded."""
-    recorded = read_snapshots(folder)
-    chosen = choose_snapshots(recorded, list(summary["condition"]))
+    recorded = read_recordings(folder)
+    chosen = choose_recordings(recorded, list(summary["condition"]))
     if chosen:
-        whole = [_TO_THE_END] if any(snapshot.field is not None for snapshot in chosen) else []
+        whole = [_TO_THE_END] if any(recording.field is not None for recording in chosen) else []
         count = f"{len(chosen)} of {len(recorded)} recorded episodes."
-        yield (
-            "trajectories",
-            " ".join([_TRAJECTORIES, *whole, count]),
-            partial(trajectory_figure, chosen),
-            True,
-        )
+        yield "trajectories", " ".join([_TRAJECTORIES, *whole, count]), trajectory_figure(chosen)
 
 
-def _driven(folder: Path) -> Iterator[ToDraw]:
+def _driven(folder: Path) -> Drawn:
     """The figure of whole driven paths; none where no steps were kept."""
     driven = read_driven(folder)
     if driven is None:
@@ -242,14 +238,13 @@ def _driven(folder: Path) -> Iterator[ToDraw]:
     ]
     if len(shown) < len(rows):
         words.append(f"{len(shown)} of {len(rows)} conditions.")
-    yield "driven", " ".join(words), partial(driven_figure, ground, shown, tracks[:_MOST_PATHS]), True
+    yield "driven", " ".join(words), driven_figure(ground, shown, tracks[:_MOST_PATHS])
 
 
 def _with_latency(summary: pd.DataFrame, conditions: Mapping[str, Any]) -> pd.DataFrame:
     """A summary with how long a step of one robot takes, where the run measured it."""
     known = [conditions[condition].get("latency", {}) for condition in summary["condition"]]
-    columns = {f"latency_{name}": [one.get(name, float("nan")) for one in known] for name in LATENCIES}
-    return summary.assign(**columns)
+    return summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
@@ -276,15 +271,14 @@ def _rejected_draws(episodes: pd.DataFrame, conditions: Mapping[str, Any]) -> li
     episodes = episodes[episodes["condition"].isin(frozen)]
     if not episodes["rejected_draws"].any():
         return []
-    draws = ["data", "scenario", "world", "seed", "realisation", "map"]
     # All conditions met the same; where a model failed nothing was drawn.
-    again = episodes.groupby(draws)["rejected_draws"].max()
+    again = episodes.groupby(MAP)["rejected_draws"].max()
     share = again.sum() / (again + 1).sum()
     return [f"Of the draws of λ {100 * share:.1f} % joined start and goal by no ground and were drawn again."]
 
 
 def _world(value: Mapping[str, Any]) -> str:
-    world, rules = value["world"], value.get("rules")
+    world, free = value["world"], value["rules"]["free_space"]
     words = [f"λ {world['noise']}"]
     if "correlation_m" in world:
         words[0] += f", correlated over {world['correlation_m']:g} m"
@@ -295,10 +289,7 @@ def _world(value: Mapping[str, Any]) -> str:
         words.append(f"T = {world['time_budget_ratio']:g} × the reference time at the robot's top speed")
     else:
         words.append(f"T = {world['time_budget_s']:g} s")
-    if rules:
-        free = rules["free_space"]
-        words.append(f"free where the {free['by']} map is above {free['above']:g}")
-    return ", ".join(words)
+    return ", ".join([*words, f"free where the {free['by']} map is above {free['above']:g}"])
 
 
 def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:
@@ -309,7 +300,7 @@ def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:
     return [f"In {episodes} a planner or model failed; tracebacks: {folder / ERRORS}"]
 
 
-def _as_markdown(report: Report, figures: Sequence[Drawn]) -> str:
+def _as_markdown(report: Report, figures: Mapping[Path, str]) -> str:
     lines = ["# Run summary", "", "## What the run says", ""]
     for finding in report.findings:
         lines += [f"**{markdown(finding.title)}**", "", *_items(finding.sentences)]
@@ -318,8 +309,8 @@ def _as_markdown(report: Report, figures: Sequence[Drawn]) -> str:
         lines += ["## Hypotheses", "", to_markdown(shown), ""]
     lines += ["## Results", "", *_items(report.header), to_markdown(report.table)]
     lines += _items(report.warnings) if report.warnings else []
-    for drawn in figures:
-        lines += [f"![{drawn.path.stem}](figures/{drawn.path.name})", "", markdown(drawn.caption), ""]
+    for path, caption in figures.items():
+        lines += [f"![{path.stem}](figures/{path.name})", "", markdown(caption), ""]
     return "\n".join(
         [*lines, "Commands:", "", *(f"    {command}" for command in report.about["commands"]), ""]
     )

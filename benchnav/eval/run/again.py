@@ -1,19 +1,24 @@
-"""Running episodes of a run again: for playback of what was not recorded."""
+"""What is made again of a finished run: recordings of episodes, the ground of failures, and that of driven paths."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+import torch
 
 from benchnav.core.device import device_of_run
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.folder import EPISODES, open_run, read_table
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.folder.folder import EPISODES, Run, open_run, read_table
+from benchnav.eval.folder.steps import LAST_COLUMN, open_steps, read_steps
+from benchnav.eval.recording import GROUND, MAP, Ground, Recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.rows import path_length_m
-from benchnav.eval.run.unit import Settings, build, one_thread, read_block, simulate
+from benchnav.eval.run.unit import Settings, build, noise_key, one_thread, read_block, read_maps, simulate
+from benchnav.planning.world.simulation import Simulation
 
 
 def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = None) -> Recording:
@@ -36,12 +41,10 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
             return Recording.load(stored)
     row = _row(folder, unit, unit.maps[member])
     with one_thread():
-        device = device_of_run(open_run(folder).about)
         # Without a time limit of planners, which changes no action.
-        settings = Settings(device=device.type)
-        origin = settings.origins().of(unit)
-        problem, simulation = build(unit, origin, device)
-        recorder = Recorder(unit, problem, simulation, read_block(unit, origin, device).terrain, [member])
+        settings = Settings(device=device_of_run(open_run(folder).about).type)
+        recorder = _recorder(unit, settings, [member])
+        problem, simulation = recorder.problem, recorder.simulation
         episodes, _ = simulate(unit, problem, simulation, settings, recorder.watch, recorder.every)
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
@@ -53,11 +56,23 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
     return recording
 
 
+def _recorder(unit: Unit, settings: Settings, members: Sequence[int]) -> Recorder:
+    """Makes the problem and the simulation of a unit again."""
+    origin, device = settings.origins().of(unit), torch.device(settings.device)
+    problem, simulation = build(unit, origin, device)
+    return Recorder(unit, problem, simulation, read_block(unit, origin, device).terrain, members)
+
+
 def _row(folder: Path, unit: Unit, map_index: int) -> dict[str, Any]:
     """What a finished run holds of an episode."""
     rows = read_table(folder, EPISODES)
-    own = (rows["condition"] == unit.condition.id) & (rows["seed"] == unit.seed)
-    own &= (rows["realisation"] == unit.realisation) & (rows["map"] == map_index)
+    known = {
+        "condition": unit.condition.id,
+        "seed": unit.seed,
+        "realisation": unit.realisation,
+        "map": map_index,
+    }
+    own = (rows[list(known)] == pd.Series(known)).all(axis=1)
     if not own.any():
         raise ConfigError(
             f"Expected a finished run, got {folder} without that episode. Run the same command again to finish it."
@@ -72,6 +87,97 @@ def _repeats(row: Mapping[str, Any], recording: Recording) -> bool:
         return False
     if not len(recording.traversability):
         return True
-    length_m = path_length_m(recording.states[:, :2].astype(np.float64))
+    length_m = path_length_m(recording.track.astype(np.float64))
     met = recording.traversability.astype(np.float64).mean()
     return bool(row["path_length_m"] == length_m and row["traversability"] == met)
+
+
+def record_failures(folder: Path, failures: pd.DataFrame) -> list[Recording]:
+    """Records failures again from the steps that were kept: their ground is read and predicted, nothing is planned.
+
+    Args:
+        folder: a finished run that kept steps.
+        failures: episodes of one condition, rows of the run's table.
+
+    Returns:
+        A recording a row.
+
+    Raises:
+        BenchnavError: the maps or the parts are not those of the run, or cannot be had.
+    """
+    run, recordings = open_run(folder), dict[int, Recording]()
+    for _, rows in failures.groupby(["seed", "realisation"], sort=False):
+        recordings |= dict(zip(rows.index, _record_block(run, rows), strict=True))
+    return [recordings[index] for index in failures.index]
+
+
+def _record_block(run: Run, rows: pd.DataFrame) -> Iterator[Recording]:
+    """Records failures under one seed and realisation."""
+    first = rows.iloc[0]
+    condition, _ = run.conditions[first["condition"]]
+    maps = tuple(rows["map"].tolist())
+    seed, realisation = int(first["seed"]), int(first["realisation"])
+    unit = Unit(condition=condition, seed=seed, realisation=realisation, maps=maps)
+    origin, made = Settings().origins().of(unit), run.about["codes"][first["code"]]
+    digests = run.about["datasets"][condition.data]["maps"][condition.split]
+    if origin.maps[1:] != tuple(digests[i] for i in maps):
+        raise BenchnavError(f"Expected {condition.data} with the maps that {run.folder} was on, got others.")
+    for part, digest in origin.code["parts"].items():
+        if made["parts"].get(part) != digest:
+            raise BenchnavError(f"Expected {part} as it was when {run.folder} was run, got another.")
+    with one_thread():
+        recorder = _recorder(unit, Settings(), ())
+    kept = read_steps(run.folder, condition=condition.id, seed=seed, realisation=realisation, map=maps)
+    driven = kept.groupby("map")
+    commands = list(recorder.problem.robot.action_names)
+    for member, (map_index, outcome) in enumerate(zip(maps, rows["outcome"], strict=True)):
+        steps = driven.get_group(map_index)
+        states = steps[["x_m", "y_m", "heading_rad"]].to_numpy()
+        yield recorder.driven(
+            member, outcome, states, steps[commands].to_numpy()[:-1], steps[LAST_COLUMN].to_numpy()[:-1]
+        )
+
+
+def telling_map(episodes: pd.DataFrame) -> dict[str, Any]:
+    """Chooses the map and the draw of λ on which about as many conditions succeed as fail.
+
+    Of several such the one that most conditions were run on, then the first.
+
+    Args:
+        episodes: rows of a run.
+
+    Returns:
+        What the map is known by, by the names of `MAP`.
+    """
+    groups = episodes.groupby(MAP, sort=False)["success"]
+    counted = groups.agg(conditions="size", successes="sum").reset_index()
+    counted["differing"] = np.minimum(counted["successes"], counted["conditions"] - counted["successes"])
+    best = counted.sort_values(["differing", "conditions"], ascending=False, kind="stable")
+    return best[MAP].head(1).to_dict("records")[0]
+
+
+def keep_ground(folder: Path) -> None:
+    """Writes the map on which the outcomes of a run differ most, with λ as it was there; not where no steps were kept.
+
+    Args:
+        folder: a run whose rows are all there.
+    """
+    if open_steps(folder) is None:
+        return
+    rows = read_table(folder, EPISODES)
+    about = telling_map(rows)
+    on_map = rows[(rows[list(about)] == pd.Series(about)).all(axis=1)]
+    condition, _ = open_run(folder).conditions[on_map["condition"].iloc[0]]
+    block = read_maps(TerrainDataset(find_dataset(condition.data)), condition.split, [about["map"]])
+    noise = noise_key(about["seed"], condition.split, about["realisation"])
+    simulation = Simulation(
+        block.terrain, condition.make_task(), condition.world, block.places, noise, [about["map"]]
+    )
+    Ground(
+        about=about,
+        resolution_m=block.terrain.grid.resolution_m,
+        rgb=block.terrain.rgb[0].cpu().numpy(),
+        field=None if simulation.field is None else simulation.field[0].cpu().numpy(),
+        immobilising=simulation.immobilising[0].cpu().numpy(),
+        goal_m=block.places.goal_m[0].cpu().numpy(),
+    ).save(folder / GROUND)

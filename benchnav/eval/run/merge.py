@@ -29,7 +29,7 @@ from benchnav.eval.folder.folder import (
     write_run,
 )
 from benchnav.eval.folder.steps import align_steps
-from benchnav.eval.run.driven_ground import keep_ground
+from benchnav.eval.run.again import keep_ground
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:

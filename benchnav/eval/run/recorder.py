@@ -3,13 +3,12 @@
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch
 
 from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, drawing_interval, drawn_plan, thinned
-from benchnav.eval.report.recorded.recording import Recording
-from benchnav.eval.report.recorded.snapshot import SNAPSHOT_S
+from benchnav.eval.recording import MOMENT_S, DrawnPlan, Recording, drawing_interval, drawn_plan, thinned
 from benchnav.eval.run.rollout import Episodes
 from benchnav.planning.planners.planner import Plan
 from benchnav.planning.problem import Problem
@@ -44,51 +43,71 @@ class Recorder:
             plan: of some episodes.
             planned: which of the unit's these are.
         """
-        whole = step * self.problem.dt_s <= SNAPSHOT_S + 1e-6
-        places = {member: place for place, member in enumerate(planned)}
-        for member, plans in self._plans.items():
-            if member not in places:
-                continue  # it has ended
-            drawn = drawn_plan(step, plan.lines(places[member]))
-            plans.append(drawn if whole else thinned(drawn))
+        whole = step * self.problem.dt_s <= MOMENT_S + 1e-6
+        for place, member in enumerate(planned):
+            if member in self._plans:
+                drawn = drawn_plan(step, plan.lines(place))
+                self._plans[member].append(drawn if whole else thinned(drawn))
 
     def recording(self, episodes: Episodes, member: int) -> Recording:
         """All that is played back of one episode."""
-        unit, problem, steps = self.unit, self.problem, int(episodes.steps[member])
-        about = {
-            "condition": unit.condition.id,
-            **unit.condition.labels,
-            "seed": str(unit.seed),
-            "realisation": str(unit.realisation),
-            "map": str(unit.maps[member]),
-            "outcome": Outcome(int(episodes.outcome[member])).name.lower(),
-        }
-        free = problem.task.rules.free_space
+        steps = int(episodes.steps[member])
+        return self.driven(
+            member,
+            Outcome(int(episodes.outcome[member])).name.lower(),
+            episodes.states[member, : steps + 1].numpy(),
+            episodes.actions[member, :steps].numpy(),
+            episodes.traversability[member, :steps].numpy(),
+        )
+
+    def driven(
+        self,
+        member: int,
+        outcome: str,
+        states: np.ndarray,
+        actions: np.ndarray,
+        traversability: np.ndarray,
+    ) -> Recording:
+        """Records an episode that was driven elsewhere, with what was planned here for it.
+
+        Args:
+            member: which of the unit's episodes; letters in the shapes of what follows are those of `Recording`.
+            outcome: how it ended.
+            states: shape [N + 1, S].
+            actions: shape [N, A].
+            traversability: observed λ, shape [N].
+        """
+        unit, problem, simulation = self.unit, self.problem, self.simulation
+
+        def own(values: Any) -> np.ndarray:
+            return values[member].cpu().numpy()
+
+        truth, free = self.terrain.truth, problem.task.rules.free_space
+        numbers = {"seed": unit.seed, "realisation": unit.realisation, "map": unit.maps[member]}
         return Recording(
-            about=about,
-            grid=problem.grid,
-            rgb=problem.observation.rgb[member].cpu().numpy(),
-            elevation_m=problem.elevation_m[member].cpu().numpy(),
-            predicted=problem.risk_map[member].cpu().numpy(),
-            free=problem.free[member].cpu().numpy(),
+            about={
+                "condition": unit.condition.id,
+                **unit.condition.labels,
+                **{name: str(number) for name, number in numbers.items()},
+                "outcome": outcome,
+            },
+            resolution_m=problem.grid.resolution_m,
+            rgb=own(problem.observation.rgb),
+            field=None if simulation.field is None else own(simulation.field),
+            immobilising=own(simulation.immobilising),
+            goal_m=own(problem.goal_m),
+            elevation_m=own(problem.elevation_m),
+            true_mean=truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy(),
+            soft=(truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy(),
+            predicted=own(problem.risk_map),
+            free=own(problem.free),
             free_by=free.by,
             free_above=free.above,
-            **self._ground(member),
-            goal_m=problem.goal_m[member].cpu().numpy(),
             dt_s=problem.dt_s,
             time_budget_s=float(problem.time_budget_s[member]),
             action_names=problem.robot.action_names,
-            states=episodes.states[member, : steps + 1].cpu().numpy(),
-            actions=episodes.actions[member, :steps].cpu().numpy(),
-            traversability=episodes.traversability[member, :steps].cpu().numpy(),
-            plans=self._plans[member],
+            states=states,
+            actions=actions,
+            traversability=traversability,
+            plans=self._plans.get(member, ()),
         )
-
-    def _ground(self, member: int) -> dict[str, Any]:
-        """What the ground is like, of which planners are told nothing."""
-        truth = self.terrain.truth
-        soft = (truth.weights[member, 1:] > 0).any(dim=0).cpu().numpy()
-        mean = truth.select(torch.tensor([member])).mean()[0].float().cpu().numpy()
-        field = None if self.simulation.field is None else self.simulation.field[member].cpu().numpy()
-        immobilising = self.simulation.immobilising[member].cpu().numpy()
-        return {"true_mean": mean, "field": field, "soft": soft, "immobilising": immobilising}

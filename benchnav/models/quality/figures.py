@@ -9,9 +9,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 from scipy.stats import binom
 
 from benchnav.core.figures import (
@@ -22,9 +23,10 @@ from benchnav.core.figures import (
     SKY,
     TEXT,
     TWO_COLUMNS_IN,
+    frame_map,
     legend_outside,
+    stack_panels,
     styled,
-    thin_ticks,
 )
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
@@ -37,7 +39,6 @@ _SMALL = 5.5
 _MOST_NUMBERED = 16  # classes; among more, numbers would not fit their cells
 _BAND = "0.82"
 _RARE = 1e-3
-_NO_SOFT = (0.0, 0.0, 1.0)  # weight, mean and standard deviation of no second mode
 _NEAR = 0.01  # to the ideal; finer differences fill no panel
 
 # Title, the quantity of ClassQuality or TraversabilityQuality, and its ideal where that is not an end.
@@ -70,7 +71,7 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
     figure, panels = _grid(titles, most, high, 1.25 if ragged else 0.7, share_y=True)
     labels = [name.replace("_", " ") for name in names]
     palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
-    for panel, quality in zip(panels, qualities.values(), strict=True):
+    for (panel,), quality in zip(panels, qualities.values(), strict=True):
         counts = np.array(quality.confusion, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             shares = 100 * counts / counts.sum(1, keepdims=True)
@@ -82,11 +83,11 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
             panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
         panel.set_xticks(range(len(names)), labels, rotation=90, parse_math=False)
         panel.set_yticks(range(len(names)), labels, parse_math=False)
-        thin_ticks(panel)
+        frame_map(panel)
     figure.supxlabel("most likely class")
     figure.supylabel("true class")
     # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
-    beside = panels[min(len(panels), most) - 1].inset_axes((1.04, 0, 0.05, 1))
+    beside = panels[min(len(panels), most) - 1][0].inset_axes((1.04, 0, 0.05, 1))
     figure.colorbar(image, cax=beside, label="share of the true class [%]")
     return figure
 
@@ -98,17 +99,10 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
     Args:
         qualities: by split.
     """
-    columns = min(len(qualities), 3)
-    rows = -(-len(qualities) // columns)
-    figure = _figure(columns / 3, rows * 2.6 + 0.35)
-    panels = figure.subplots(2 * rows, columns, squeeze=False, sharex=True, height_ratios=[3, 1] * rows)
-    pairs = [
-        (panels[2 * row, column], panels[2 * row + 1, column])
-        for row in range(rows)
-        for column in range(columns)
-    ]
+    titles = [f"{split}: ECE {quality.ece:.3f}" for split, quality in qualities.items()]
+    figure, pairs = _grid(titles, 3, 2.6, 0.35, heights=(3, 1))
     edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
-    for (upper, lower), (split, quality) in zip(pairs, qualities.items(), strict=False):
+    for (upper, lower), quality in zip(pairs, qualities.values(), strict=True):
         curve = quality.reliability
         cells, confidence, accuracy = map(np.array, (curve.cells, curve.confidence, curve.accuracy))
         share, filled = cells / cells.sum(), cells > 0
@@ -122,18 +116,14 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
             upper.plot(confidence[few], accuracy[few], "o", mfc="white", **points, label=words)
         gap = (confidence[filled], confidence[filled], accuracy[filled])
         upper.vlines(*gap, color=ORANGE, lw=2, alpha=0.45, zorder=1.5, label="gap")
-        upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1], title=f"{split}: ECE {quality.ece:.3f}")
+        upper.set(xlim=(0, 1), ylim=(0, 1), yticks=[0, 0.5, 1])
         lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    for place in range(len(qualities), len(pairs)):
-        for panel in pairs[place]:
-            panel.remove()
-        pairs[place - columns][1].tick_params(labelbottom=True)
-    for upper, lower in pairs[::columns]:
+    for upper, lower in pairs[::3]:
         upper.set_ylabel("how often right")
         lower.set_ylabel("cells")
-    figure.align_ylabels(panels[:, 0])
+    figure.align_ylabels()
     figure.supxlabel("probability of the most likely class")
     _explain(figure)
     return figure
@@ -152,7 +142,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     figure, panels = _grid(list(qualities), 3, 1.75, 0.45 if len(qualities) > 2 else 0.65)
     edges = np.linspace(0, 1, PIT_BINS + 1)
     tail = round((1 - LEVEL) * PIT_BINS)
-    for panel, quality in zip(panels, qualities.values(), strict=True):
+    for (panel,), quality in zip(panels, qualities.values(), strict=True):
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
         low, high = (bound / level for bound in binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
@@ -176,7 +166,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
         lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
-        panel.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        panel.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
     figure.supxlabel("PIT of the realised λ")
     figure.supylabel("density")
     _explain(figure, most=5)
@@ -193,32 +183,35 @@ def severity_figure(
         all_series: by scenario, its pairs as (severity, split), ascending.
         qualities: of all these splits.
     """
-    shown = [qualities[split] for series in all_series.values() for _, split in series]
-    quantities = [*_CLASS_SEVERITY * all(bool(quality.classes) for quality in shown), *_LATENT_SEVERITY]
-    ensemble = not any(np.isnan(_quantity(quality, "mutual_information")) for quality in shown)
-    looks: dict[str, dict[str, Any]] = {
-        scenario: {"ms": 3, "lw": 1, "color": colour, "marker": MARKERS[place % len(MARKERS)]}
-        for place, (scenario, colour) in enumerate(
-            zip(all_series, LINE_COLOURS * len(all_series), strict=False)
-        )
-    }
+    rows = []
+    for scenario, series in all_series.items():
+        for severity, split in series:
+            values = {"scenario": scenario, "severity": severity, **vars(qualities[split].traversability)}
+            rows.append(
+                values | {name: v for own in qualities[split].classes for name, v in vars(own).items()}
+            )
+    table = pd.DataFrame(rows)
+    measured = table.dropna(axis=1)
+    quantities = [*_CLASS_SEVERITY * ("accuracy" in measured), *_LATENT_SEVERITY]
     figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
-    for panel, (_, name, ideal) in zip(panels, quantities, strict=True):
-        for scenario, series in all_series.items():
-            severities, splits = zip(*series, strict=True)
-            values = [_quantity(qualities[split], name) for split in splits]
-            panel.plot(severities, values, label=scenario, **looks[scenario])
-            if name == "entropy_auroc" and ensemble:
-                others = [_quantity(qualities[split], "mutual_information_auroc") for split in splits]
+    for (panel,), (_, name, ideal) in zip(panels, quantities, strict=True):
+        for place, (scenario, own) in enumerate(table.groupby("scenario", sort=False)):
+            look: dict[str, Any] = {
+                "color": LINE_COLOURS[place % len(LINE_COLOURS)], "marker": MARKERS[place % len(MARKERS)],
+                "ms": 3, "lw": 1,
+            }  # fmt: skip
+            panel.plot(own["severity"], own[name], label=scenario, **look)
+            if name == "entropy_auroc" and "mutual_information" in measured:
                 words = "of mutual information; solid: of entropy"
-                panel.plot(severities, others, ls=":", mfc="white", **looks[scenario], label=words)
+                others = own["mutual_information_auroc"]
+                panel.plot(own["severity"], others, ls=":", mfc="white", **look, label=words)
         panel.margins(x=0.05, y=0.12)
         if ideal is not None:
             panel.axhline(ideal, color="0.4", lw=0.8, ls="--", label="calibrated")
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
         panel.grid(alpha=0.3)
-        panel.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        panel.locator_params(axis="y", nbins=4, steps=[1, 2, 5, 10])
     figure.supxlabel("severity of the shift")
     _explain(figure)
     return figure
@@ -243,16 +236,16 @@ def latent_figure(
     figure, panels = _grid(titles, 5, 1.55, 0.5 if len(titles) > 4 else 1.0, share_y=True)
     slopes = table_slopes().numpy()
     shown = slopes <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))
-    soft = _soft_modes(table)
-    means, stds, noise = (
-        values.double().cpu().numpy() for values in (table.mean, table.std, table.noise_std)
-    )
+    parts = [table.mean, table.std, table.noise_std]
+    parts += [table.soft.weight, table.soft.mean, table.soft.std] if table.soft else []
+    means, stds, noise, *soft = (values.double().cpu().numpy() for values in parts)
     x = slopes[shown]
-    for number, (panel, item) in enumerate(zip(panels, classes, strict=True)):
+    for number, ((panel,), item) in enumerate(zip(panels, classes, strict=True)):
         mean, std = means[number, shown], stds[number, shown]
         latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
         panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
-        expected = _with_soft(expected_traversability(mean, std), *soft[number])
+        second = [values[number] for values in soft]
+        expected = _expected(mean, std, *second)
         panel.plot(x, expected, color=ORANGE, lw=1.1, label="predicted E[λ]")
         for spread, colour, alpha, label in (
             (std, SKY, 0.3, "± 2σ with noise"),
@@ -264,12 +257,12 @@ def latent_figure(
         if truth:
             true = latent_mean(np.full(len(x), number), x, tuple(classes))
             panel.plot(x, true, color="black", lw=0.9, ls="--", label="true latent function")
-            firm = expected_traversability(true, np.full_like(x, item.noise))
-            true_soft = (item.soft.weight, item.soft.mean, item.soft.std) if item.soft else _NO_SOFT
-            panel.plot(x, _with_soft(firm, *true_soft), color="black", lw=1, ls=":", label="true E[λ]")
+            true_soft = (item.soft.weight, item.soft.mean, item.soft.std) if item.soft else ()
+            expected = _expected(true, np.full_like(x, item.noise), *true_soft)
+            panel.plot(x, expected, color="black", lw=1, ls=":", label="true E[λ]")
             words += f" ({item.noise:.3f})"
-        if soft[number][0]:
-            panel.axhline(soft[number][1], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
+        if soft and second[0]:
+            panel.axhline(second[1], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
         for share, shade, label in (
             (_RARE, 0.12, "steeper: 1 cell in 1000"),
             (0.0, 0.25, "steeper: no cell of the class"),
@@ -277,25 +270,20 @@ def latent_figure(
             steeper = _steeper_than(slope_cells[number], share)
             panel.axvspan(steeper, 90, color="0.4", alpha=shade, lw=0, label=label)
         panel.text(0.05, 0.05, words, size=TEXT, transform=panel.transAxes)
-    panels[0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
+    panels[0][0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
     figure.supylabel("traversability")
     _explain(figure)
     return figure
 
 
-def _soft_modes(table: SlopeTable) -> list[tuple[float, float, float]]:
-    """Weight, mean and standard deviation of each class's second mode as it was found."""
-    if table.soft is None:
-        return [_NO_SOFT] * len(table.mean)
-    found = (values.double().tolist() for values in (table.soft.weight, table.soft.mean, table.soft.std))
-    return list(zip(*found, strict=True))
-
-
-def _with_soft(expected: np.ndarray, weight: float, mean: float, std: float) -> np.ndarray:
-    """E[λ] of ground with soft spots, from that of its firm part."""
-    soft = expected_traversability(np.array([mean]), np.array([std]))
-    return (1 - weight) * expected + weight * soft
+def _expected(mean: np.ndarray, std: np.ndarray, *soft: float) -> np.ndarray:
+    """E[λ] of ground; of that with soft spots, these have a weight, a mean and a standard deviation."""
+    firm = expected_traversability(mean, std)
+    if not soft:
+        return firm
+    weight, soft_mean, soft_std = soft
+    return (1 - weight) * firm + weight * expected_traversability(np.array([soft_mean]), np.array([soft_std]))
 
 
 def _steeper_than(cells: Sequence[int], share: float) -> float:
@@ -304,30 +292,30 @@ def _steeper_than(cells: Sequence[int], share: float) -> float:
     return float(np.sum(steeper > share * steeper[0]))
 
 
-def _quantity(quality: Quality, name: str) -> float:
-    sources = [*quality.classes, quality.traversability]
-    return next((float(getattr(source, name)) for source in sources if hasattr(source, name)), float("nan"))
-
-
 def _grid(
-    titles: Sequence[str], most: int, high: float, rest: float, share_y: bool = False
-) -> tuple[Figure, list[Axes]]:
-    """A figure with a panel a title, at most so many side by side, each so high, and with room for the rest."""
+    titles: Sequence[str],
+    most: int,
+    high: float,
+    rest: float,
+    heights: Sequence[float] = (1,),
+    share_y: bool = False,
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure of titled places, at most so many side by side, each so high, and with room for the rest.
+
+    A place holds panels under each other, whose heights are as given. The figure has the width that its places need,
+    and that of its legend.
+    """
     columns = min(len(titles), most)
     rows = -(-len(titles) // columns)
-    figure = _figure(columns / most, rows * high + rest)
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=share_y).flat
-    for panel, title in zip(panels[: len(titles)], titles, strict=True):
+    width = max(TWO_COLUMNS_IN * (columns / most), _LEAST_WIDTH)
+    figure = Figure(figsize=(width, rows * high + rest), layout="constrained")
+    places = stack_panels(
+        figure, len(titles), columns, len(heights), sharex=True, sharey=share_y,
+        height_ratios=[*heights] * rows,
+    )  # fmt: skip
+    for (panel, *_), title in zip(places, titles, strict=True):
         panel.set_title(title, parse_math=False)
-    for place in range(len(titles), rows * columns):
-        panels[place].remove()
-        panels[place - columns].tick_params(labelbottom=True)
-    return figure, list(panels[: len(titles)])
-
-
-def _figure(share: float, high: float) -> Figure:
-    """A figure of this share of the full width, but wide enough for its legend."""
-    return Figure(figsize=(max(TWO_COLUMNS_IN * share, _LEAST_WIDTH), high), layout="constrained")
+    return figure, places
 
 
 def _explain(figure: Figure, most: int = 4) -> None:

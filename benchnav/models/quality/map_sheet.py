@@ -28,28 +28,19 @@ from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import Oracle
 from benchnav.models.quality.scores import mutual_information, predictive_entropy
 
-TITLES = {
-    "rgb": "Image",
-    "class_true": "True class",
-    "class_found": "Most likely class",
-    "expected_true": "True E[λ]",
-    "observed": "Observed λ",
-    "expected": "Predicted E[λ]",
-    "error_observed": "E[λ] − observed λ",
-    "error": "Error of E[λ]",
-    "width": "90 % interval of λ",
-    "entropy": "Entropy",
-    "information": "Mutual information",
-}
-
-_UNITS = {
-    **dict.fromkeys(("expected_true", "observed", "expected"), "λ"),
-    **{"error_observed": "predicted − observed", "error": "predicted − true", "width": "width"},
-    **dict.fromkeys(("entropy", "information"), "nats"),
-}
-_PALETTES = {
-    **dict.fromkeys(("error", "error_observed"), "RdBu_r"),
-    **dict.fromkeys(("width", "entropy", "information"), "magma"),
+# Of each layer its title, what stands under its colour bar, and its colours; classes and images have no bar.
+_LAYERS: dict[str, tuple[str, str, str]] = {
+    "rgb": ("Image", "", ""),
+    "class_true": ("True class", "", ""),
+    "class_found": ("Most likely class", "", ""),
+    "expected_true": ("True E[λ]", "λ", TRAVERSABILITY_COLOURS),
+    "observed": ("Observed λ", "λ", TRAVERSABILITY_COLOURS),
+    "expected": ("Predicted E[λ]", "λ", TRAVERSABILITY_COLOURS),
+    "error_observed": ("E[λ] − observed λ", "predicted − observed", "RdBu_r"),
+    "error": ("Error of E[λ]", "predicted − true", "RdBu_r"),
+    "width": ("90 % interval of λ", "width", "magma"),
+    "entropy": ("Entropy", "nats", "magma"),
+    "information": ("Mutual information", "nats", "magma"),
 }
 _SHOWN_SHARE = 0.995
 
@@ -62,7 +53,7 @@ class MapSheet:
         split: where the maps are from.
         indices: which maps.
         extent_m: size of a map along x and y.
-        layers: by the keys of `TITLES`, those that the model has, each of shape [B, H, W]; `rgb` is of
+        layers: by the keys of `_LAYERS`, those that the model has, each of shape [B, H, W]; `rgb` is of
             shape [B, H, W, 3].
     """
 
@@ -104,8 +95,8 @@ def read_sheet(
         if model.class_names:
             layers["entropy"] = predictive_entropy(classes)
         members = model.member_probabilities(terrain.observe())
-        if members is not None:
-            layers |= {"information": mutual_information(members)} if len(members) > 1 else {}
+        if members is not None and len(members) > 1:
+            layers["information"] = mutual_information(members)
     return MapSheet(
         split=split,
         indices=tuple(indices),
@@ -124,16 +115,13 @@ def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -
         classes: of the dataset.
     """
     kinds = {"cmap": class_shades(class_colours(classes)), "vmin": -0.5, "vmax": len(classes) - 0.5}
-    share = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
-    scales: dict[str, dict[str, Any]] = {
-        "rgb": {},
-        **dict.fromkeys(("class_true", "class_found"), kinds),
-        **dict.fromkeys(("expected_true", "observed", "expected"), share),
-    }
-    for name, palette in _PALETTES.items():
-        values = [np.abs(sheet.layers[name]).ravel() for sheet in sheets if name in sheet.layers]
-        if values:
-            shown = np.concatenate(values)
+    scales: dict[str, dict[str, Any]] = {"rgb": {}, "class_true": kinds, "class_found": kinds}
+    for name, (_, unit, palette) in _LAYERS.items():
+        values = [sheet.layers[name].ravel() for sheet in sheets if name in sheet.layers and unit]
+        if unit == "λ":
+            scales[name] = {"cmap": palette, "vmin": 0, "vmax": 1}
+        elif values:
+            shown = np.abs(np.concatenate(values))
             shown = shown[np.isfinite(shown)]
             most = _round_up(float(np.quantile(shown, _SHOWN_SHARE)) if len(shown) else 0.0)
             scales[name] = {"cmap": palette, "vmin": -most if name.startswith("error") else 0, "vmax": most}
@@ -152,15 +140,16 @@ def map_sheet_figure(
         title: which model and dataset; the split follows.
     """
     columns = []
-    for name in (name for name in TITLES if name in sheet.layers):
-        layers, unit, is_error = sheet.layers[name], _UNITS.get(name), name.startswith("error")
+    for name in (name for name in _LAYERS if name in sheet.layers):
+        title_of, unit, _ = _LAYERS[name]
+        layers, is_error = sheet.layers[name], name.startswith("error")
         columns.append(
             SheetColumn(
                 name=name,
-                title=TITLES[name],
+                title=title_of,
                 layers=np.ma.masked_equal(layers, UNLABELLED) if name == "class_true" else layers,
                 shades=scales[name],
-                unit=unit,
+                unit=unit or None,
                 # λ ends at 0 and 1.
                 extend="neither" if unit == "λ" else "both" if is_error else "max",
                 most=2 if is_error else 4,

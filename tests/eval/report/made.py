@@ -1,4 +1,4 @@
-"""Hand-made rows, snapshots and recordings."""
+"""Hand-made rows and recordings."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -7,10 +7,9 @@ import numpy as np
 import pandas as pd
 import torch
 
-from benchnav.core.grid import Grid
+from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.recorded.drawn_plan import drawn_plan
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.recording import Recording, drawn_plan
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.summary import summarise
 
@@ -40,7 +39,7 @@ def row(
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,
         "roughness_radps2": 2.0, "planning_ms": 1.0, "planning_ms_p95": 3.0, "planning_start_ms": 9.0,
-        "rejected_draws": 0, "compiled": True, "error": "",
+        "rejected_draws": 0, "compiled": True, "error": "", "code": "c",
     }  # fmt: skip
     return made | changes
 
@@ -67,6 +66,16 @@ def _model(rows: pd.DataFrame) -> dict[str, Any]:
     return {"model": {"part": "oracle" if label == "–" else label, "options": {}}}
 
 
+def bold_cells(table: Table) -> set[tuple[int, int]]:
+    """Row and column of what is set in bold."""
+    return {
+        (place, column)
+        for place, row in enumerate(table.rows)
+        for column, cell in enumerate(row)
+        if isinstance(cell, Bold)
+    }
+
+
 def summarised(episodes: pd.DataFrame, world: dict[str, Any] = PAPER["world"]) -> pd.DataFrame:
     """A row a condition, all of one world."""
     return summarise(episodes, dict.fromkeys(episodes["condition"].unique(), world))
@@ -83,7 +92,6 @@ def recording(
 ) -> Recording:
     """An episode on a map that is not square, of a robot with five states and two actions."""
     labels = labels or condition()
-    grid = Grid(40, 60, 0.5)
     generator = np.random.default_rng(3)
     x = 2 + np.arange(steps + 1) * dt_s
     states = np.stack((x, 3 + 0.5 * x, np.full(steps + 1, 0.46)), axis=1)
@@ -91,7 +99,7 @@ def recording(
     predicted = generator.random((40, 60)).astype(np.float32) ** 0.5
     made: dict[str, Any] = {
         "about": {"condition": "t", **labels, "seed": "0", "realisation": "0", "map": "4", "outcome": "success"},
-        "grid": grid, "rgb": (255 * generator.random((3, 40, 60))).astype(np.uint8),
+        "resolution_m": 0.5, "rgb": (255 * generator.random((3, 40, 60))).astype(np.uint8),
         "elevation_m": generator.random((40, 60)).astype(np.float32), "predicted": predicted,
         "true_mean": generator.random((40, 60)).astype(np.float32), "time_budget_s": 100.0,
         "free": predicted > 0.3, "free_by": "risk", "free_above": 0.3, "field": None, "soft": np.zeros((40, 60), bool),

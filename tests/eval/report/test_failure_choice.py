@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -6,7 +7,7 @@ import pandas as pd
 import pytest
 
 from benchnav.core.errors import BenchnavError
-from benchnav.eval.report.charts.failure_sheet import FailedGround
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.failure_choice import Sheets, collect_sheets
 from benchnav.eval.report.failures import failures_table
 from tests.eval.report import made
@@ -14,19 +15,20 @@ from tests.eval.report import made
 RATES = {"mean": 2, "var": 5, "cvar": 8}
 
 
-def ground_of(failures: pd.DataFrame) -> FailedGround:
+def recorded(failures: pd.DataFrame) -> list[Recording]:
     """λ̂ is a hundredth of the map; the goal's x is the map."""
-    count = len(failures)
-    map_index = failures["map"].to_numpy(dtype=float)
-    return FailedGround(
-        predicted=np.ones((count, 8, 8)) * map_index[:, None, None] / 100,
-        immobilising=np.zeros((count, 8, 8), bool),
-        resolution_m=1.0,
-        goal_m=np.stack((map_index, map_index), axis=1),
-    )
+    return [
+        replace(
+            made.recording(1),
+            predicted=np.full((40, 60), map_index / 100),
+            goal_m=np.array([map_index, map_index]),
+            states=np.array([[0.5, 0.1 * map_index], [1, 0.1 * map_index]]),
+        )
+        for map_index in failures["map"]
+    ]
 
 
-def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, dict[str, str]]:
+def collected(folder: Path, record: Any, steps: bool = True) -> tuple[Sheets, dict[str, str]]:
     """Ten maps; robots fail on the last ones, and end at x = 1."""
     blind = made.condition("straight", "–", model="–")
     rows = made.rows(
@@ -49,45 +51,43 @@ def collected(folder: Path, ground: Any, steps: bool = True) -> tuple[Sheets, di
             path.parent.mkdir(parents=True, exist_ok=True)
             part.drop(columns="condition").to_parquet(path, index=False)
     summary = made.summary(rows)
-    sheets = collect_sheets(folder, summary, failures_table(folder, rows), ground)
+    sheets = collect_sheets(summary, failures_table(folder, rows), record)
     return sheets, dict(zip(summary["risk"], summary["condition"], strict=True))
 
 
 def test_the_best_and_the_worst_that_sees_are_shown(tmp_path: Path) -> None:
-    sheets, conditions = collected(tmp_path, ground_of)
+    sheets, conditions = collected(tmp_path, recorded)
     ((title, (best, worst)),) = sheets.shown
     assert title == "std"
     assert (best.name, best.among, list(best.failures["map"])) == ("MPPI, cvar", 2, [8, 9])
     assert (worst.name, worst.among, list(worst.failures["map"])) == ("MPPI, mean", 8, [2, 3, 4, 5])
     assert sheets.left_out == ""
     for line in (best, worst):
-        np.testing.assert_array_equal(line.ground.goal_m[:, 0], line.failures["map"])
-        for track, map_index in zip(line.tracks, line.failures["map"], strict=True):
-            np.testing.assert_allclose(track, [[0.5, 0.1 * map_index], [1, 0.1 * map_index]])
+        assert [recording.goal_m[0] for recording in line.recordings] == line.failures["map"].tolist()
     # What was predicted is that of all failures, shown or not.
-    assert set(sheets.told) == {conditions["cvar"], conditions["mean"]}
-    np.testing.assert_allclose(sheets.told[conditions["mean"]], np.arange(2, 10) / 100)
+    assert set(sheets.predicted) == {conditions["cvar"], conditions["mean"]}
+    np.testing.assert_allclose(sheets.predicted[conditions["mean"]], np.arange(2, 10) / 100)
 
 
 def test_a_planner_that_is_told_nothing_has_no_sheet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in RATES:  # the blind line, which fails on all, is then as good
         monkeypatch.setitem(RATES, name, 0)
-    sheets, conditions = collected(tmp_path, ground_of)
-    assert conditions["–"] not in sheets.told
+    sheets, conditions = collected(tmp_path, recorded)
+    assert conditions["–"] not in sheets.predicted
     assert all("straight" not in line.name for _, lines in sheets.shown for line in lines)
 
 
 def test_it_is_left_out_with_a_reason(tmp_path: Path) -> None:
-    def gone(failures: pd.DataFrame) -> FailedGround:
+    def gone(failures: pd.DataFrame) -> list[Recording]:
         raise BenchnavError("Expected a dataset, got none.")
 
     sheets, _ = collected(tmp_path, gone)
-    assert (sheets.shown, sheets.told) == ((), {})
+    assert (sheets.shown, sheets.predicted) == ((), {})
     assert sheets.left_out == "No sheet of failures: Expected a dataset, got none."
     assert collected(tmp_path, None)[0].left_out == ""
 
 
 def test_without_steps_there_is_no_sheet(tmp_path: Path) -> None:
-    sheets, _ = collected(tmp_path, ground_of, steps=False)
+    sheets, _ = collected(tmp_path, recorded, steps=False)
     assert sheets.shown == ()
     assert sheets.left_out == "No sheet of failures: the run kept no steps of them."

@@ -68,7 +68,7 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
 def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> None:
     table = hypothesis_table(pd.DataFrame([a_test(**changes)]), False)
     assert table.rows[0][-1] == words
-    assert bool(table.bold) == (changes.get("supported", True))
+    assert bool(made.bold_cells(table)) == (changes.get("supported", True))
 
 
 def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> None:

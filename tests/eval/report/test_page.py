@@ -5,9 +5,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from benchnav.core.tables import Table
+from benchnav.core.tables import Bold, Table
 from benchnav.eval.report.findings import Finding
-from benchnav.eval.report.page import Drawn, provenance_lines, write_page
+from benchnav.eval.report.page import provenance_lines, write_page
 from tests.eval.forged import code_with
 
 EVIL = "<script>alert(1)</script> & \"quoted\" 'too'"
@@ -41,15 +41,15 @@ def page(tmp_path: Path) -> Page:
     picture = tmp_path / "success.png"
     matplotlib.image.imsave(picture, np.zeros((20, 1000, 3)))
     table = Table(
-        headings=("planner", EVIL), labels=1, rows=(("a", "1"), (EVIL, "2")), notes=(EVIL,),
-        bold=frozenset({(1, 1)}), bold_note="the best", explained=(("planner", EVIL),),
+        headings=("planner", EVIL), labels=1, rows=(("a", "1"), (EVIL, Bold("2"))), notes=(EVIL,),
+        bold_note="the best", explained=(("planner", EVIL),),
     )  # fmt: skip
     about = {
         "commands": [EVIL], "datasets": {}, "conditions": {}, "codes": {"a": code_with(parts={EVIL: EVIL})},
         "machine": {"processor": "", "cores": 2}, "history": [{"commit": "", "benchnav": "1"}],
     }  # fmt: skip
     text = write_page(
-        EVIL, [EVIL], [EVIL], [Finding(title=EVIL, sentences=(EVIL,))], table, [Drawn(path=picture, caption=EVIL)],
+        EVIL, [EVIL], [EVIL], [Finding(title=EVIL, sentences=(EVIL,))], table, {picture: EVIL},
         about,
     )  # fmt: skip
     return Page(text)

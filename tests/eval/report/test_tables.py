@@ -105,16 +105,16 @@ def test_bold_is_what_is_not_worse_than_the_best_where_another_is() -> None:
     )
     table = table_of(rows)
     rate = table.headings.index("Succ. [%]")
-    assert table.bold == {(1, rate), (2, rate)}
+    assert made.bold_cells(table) == {(1, rate), (2, rate)}
     assert table.bold_note == (
         "not significantly worse than the highest success rate of its block (max-T sign-flip test by map over the "
         "block, step by step, p ≥ 0.05); in blocks where nothing is significantly worse none is marked; privileged "
         "models (oracle) do not compete."
     )
     alike = table_of(rows[rows["risk"].isin(["var", "cvar"]) & (rows["model"] != "oracle")])
-    assert (alike.bold, alike.bold_note) == (frozenset(), "")
+    assert (made.bold_cells(alike), alike.bold_note) == (set(), "")
     alone = table_of(made.rows(made.row(made.condition())))
-    assert (alone.bold, alone.bold_note) == (frozenset(), "")
+    assert (made.bold_cells(alone), alone.bold_note) == (set(), "")
 
 
 def test_labels_that_differ_are_shown_and_others_are_not() -> None:

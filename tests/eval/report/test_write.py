@@ -8,7 +8,6 @@ import pytest
 from benchnav.core.errors import ConfigError
 from benchnav.eval.folder.folder import write_run
 from benchnav.eval.report import write
-from benchnav.eval.report.playback.files import write_playback
 from benchnav.eval.report.write import print_report, read_report, write_report
 from tests.eval.forged import forge_run
 from tests.eval.report import made
@@ -48,7 +47,8 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         for name, about in known.items()
     }
     commands = ["benchnav-eval run --seeds '[0,7]'"]
-    return forge_run(folder, rows, known, **({"commands": commands} | changes))
+    history = [{"commit": "abc", "benchnav": "0.8"}]
+    return forge_run(folder, rows, known, **({"commands": commands, "history": history} | changes))
 
 
 @pytest.mark.usefixtures("whole_fonts")
@@ -128,7 +128,7 @@ def test_trajectories_are_drawn_of_what_was_recorded(tmp_path: Path) -> None:
             "realisation": "0",
             "outcome": "stuck",
         }
-        write_playback(folder, labels["planner"], made.recording(20, about=about))
+        made.recording(20, about=about).save(folder / "playback" / f"{labels['planner']}.npz")
     write_report(folder)
     assert (folder / "figures" / "trajectories.png").stat().st_size > 10_000
     text = (folder / "summary.md").read_text()
@@ -143,7 +143,7 @@ def test_a_figure_with_λ_as_it_was_says_so(tmp_path: Path) -> None:
     )
     folder = run_folder(tmp_path / "run", rows)
     about = {**made.held_recording().about, "condition": rows["condition"][0]}
-    write_playback(folder, "a", made.held_recording(about=about))
+    made.held_recording(about=about).save(folder / "playback" / "a.npz")
     write_report(folder)
     text = (folder / "summary.md").read_text()
     assert "Below, the whole driven path on λ as it was. 1 of 1 recorded episodes." in text

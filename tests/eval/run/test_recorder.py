@@ -18,8 +18,7 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder.folder import open_run
-from benchnav.eval.report.recorded.drawn_plan import drawn_plan, thinned
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.eval.recording import Recording, drawn_plan, thinned
 from benchnav.eval.run.again import find_recording
 from benchnav.eval.run.recorder import Recorder
 from benchnav.eval.run.runner import run_suite

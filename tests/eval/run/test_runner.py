@@ -27,7 +27,7 @@ from benchnav.eval.folder import provenance
 from benchnav.eval.folder.folder import open_run, read_table
 from benchnav.eval.folder.provenance import Origin
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.report.playback.files import write_viewer_files
+from benchnav.eval.report.playback.rerun_file import write_viewer_files
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run import runner
 from benchnav.eval.run import unit as units_of_run

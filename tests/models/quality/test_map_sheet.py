@@ -3,6 +3,7 @@ import pytest
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.datagen.files.reader import TerrainDataset
@@ -79,7 +80,7 @@ def test_panels_show_their_layers_in_rows_of_maps(dataset: TerrainDataset) -> No
             np.testing.assert_array_equal(np.asarray(image.get_array()), layer[row])
             assert image.origin == "lower"
             assert image.get_extent() == [0, sheet.extent_m[0], 0, sheet.extent_m[1]]
-    texts = {text.get_text() for text in figure.texts}
+    texts = {text.get_text() for text in figure.findobj(Text)}
     assert {"model m on dataset d, split test/std", "map 1", "map 0", "Mutual information"} <= texts
     image = panel(figure, "class_true 0").images[0]
     drawn = image.cmap(image.norm(sheet.layers["class_true"][0]))[..., :3]

@@ -4,9 +4,8 @@ All but the last have a panel a block and a row a setting. Any number of planner
 since their names stand on the left.
 """
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,12 +28,12 @@ from benchnav.core.figures import (
     legend_outside,
     planner_colours,
     planner_name,
+    stack_panels,
     styled,
 )
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
 from benchnav.eval.report.words import blocks, condition_name, outcome_in_words, p_in_words, several_models
-from benchnav.planning.world.outcome import FAILURES
 
 # From what the ground did to what the code did; success is light, each failure has a colour of its own.
 OUTCOME_COLOURS = {
@@ -48,7 +47,6 @@ OUTCOME_COLOURS = {
     "model_error": "#7F7F7F",
 }
 SUCCESS_COLOUR = "#E4E4E4"
-assert set(OUTCOME_COLOURS) == {outcome.name.lower() for outcome in FAILURES}
 
 _ROW_IN, _GAP_ROWS = 0.145, 0.6
 _PANELS_A_LINE = 4
@@ -57,75 +55,52 @@ _SPREAD = 0.32  # of a row's height, to either side
 _TEST_IN, _METRIC_IN = 0.3, 0.55
 _MARGIN = "0.88"
 
-Setting = tuple[str, str, str]
+_SETTING = ["planner", "model", "risk"]
+
+Panels = list[tuple[Axes, pd.DataFrame]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layout:
-    """Where what is drawn.
-
-    Args:
-        figure: with a panel a block.
-        panels: of each block its panel, and its rows of the summary.
-        heights: of each setting (planner, model, risk) its height in a panel.
-    """
-
-    figure: Figure
-    panels: tuple[tuple[Axes, pd.DataFrame], ...]
-    heights: dict[Setting, float]
-
-    def rows(self, summary: pd.DataFrame) -> Iterator[tuple[float, dict[Any, Any]]]:
-        """Rows of a block with their heights."""
-        for row in summary.to_dict("records"):
-            yield self.heights[row["planner"], row["model"], row["risk"]], row
-
-
-def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0) -> Layout:
+def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0) -> tuple[Figure, Panels]:
     """Makes the panels, with the names of settings at the left of each line of panels.
 
     Args:
         summary: from `summary.summarise`.
-        measures: what is drawn of each block, a panel each and side by side; the layout then lists each block as
+        measures: what is drawn of each block, a panel each and side by side; the panels then list each block as
             often.
         legend_in: height kept for a legend.
+
+    Returns:
+        The figure; of each block its panel, and its rows of the summary with the `height` that each is drawn at.
     """
+    settings = summary[_SETTING].drop_duplicates()
+    # Planners are a little apart.
+    planner = settings["planner"].factorize()[0]
+    settings = settings.assign(gap=_GAP_ROWS * planner).sort_values("gap", kind="stable")
+    settings["height"] = np.arange(len(settings)) + settings.pop("gap")
     columns = len(measures)
-    every = [block for block in blocks(summary) for _ in range(columns)]
-    heights = _heights(summary)
+    known = blocks(summary.merge(settings, on=_SETTING, how="left"))
+    every = [block for block in known for _ in measures]
     across = columns if columns > 1 else min(len(every), _PANELS_A_LINE)
-    down = -(-len(every) // across)
-    tall = _ROW_IN * (max(heights.values()) + 1.4) + 0.5
+    tall = _ROW_IN * (settings["height"].max() + 1.4) + 0.5
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
-    figure = Figure(figsize=(width, tall * down + 0.2 + legend_in), layout="constrained")
-    shared: Literal["all", "col"] = "all" if columns == 1 else "col"
-    axes = list(figure.subplots(down, across, squeeze=False, sharex=shared, sharey=True).flat)
-    panels = tuple((panel, rows) for panel, (_, rows) in zip(axes, every, strict=False))
-    for place, (panel, (title, _)) in enumerate(zip(axes, every, strict=False)):
+    high = tall * -(-len(every) // across) + 0.2 + legend_in
+    figure = Figure(figsize=(width, high), layout="constrained")
+    shared = "all" if columns == 1 else "col"
+    stacks = stack_panels(figure, len(every), across, sharex=shared, sharey=True)
+    panels = [(panel, rows) for (panel,), (_, rows) in zip(stacks, every, strict=True)]
+    for place, (panel, (title, _)) in enumerate(zip(figure.axes, every, strict=True)):
         panel.set_title(title)
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="x", color="0.9")
         panel.set_axisbelow(True)
         if place >= len(every) - across:
-            panel.tick_params(labelbottom=True)
             panel.set_xlabel(measures[place % columns])
-    for panel in axes[len(every) :]:
-        panel.set_visible(False)
     several = several_models(summary)
-    names = [
-        condition_name({"planner": planner, "model": model, "risk": risk}, several)
-        for planner, model, risk in heights
-    ]
-    axes[0].set_yticks(list(heights.values()), names)
-    axes[0].set_ylim(max(heights.values()) + 0.7, min(heights.values()) - 0.7)
-    return Layout(figure=figure, panels=panels, heights=heights)
-
-
-def _heights(summary: pd.DataFrame) -> dict[Setting, float]:
-    """Height of each setting, planners a little apart."""
-    planners = list(summary["planner"].unique())
-    rows = summary[["planner", "model", "risk"]].drop_duplicates().itertuples(index=False, name=None)
-    ordered = sorted(rows, key=lambda setting: planners.index(setting[0]))
-    return {setting: place + _GAP_ROWS * planners.index(setting[0]) for place, setting in enumerate(ordered)}
+    names = [condition_name(row, several) for row in settings.to_dict("records")]
+    first = figure.axes[0]
+    first.set_yticks(settings["height"].tolist(), names)
+    first.set_ylim(settings["height"].max() + 0.7, settings["height"].min() - 0.7)
+    return figure, panels
 
 
 @styled()
@@ -138,22 +113,21 @@ def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figur
         summary: from `summary.summarise`.
         marked: conditions whose points are filled, as `best_marked` of `best.against_best` has them.
     """
-    layout, colours = lay_out(summary, ["success [%]"]), planner_colours(list(summary["planner"]))
-    for panel, rows in layout.panels:
-        for height, row in layout.rows(rows):
+    (figure, panels), colours = lay_out(summary, ["success [%]"]), planner_colours(list(summary["planner"]))
+    for panel, rows in panels:
+        for row in rows.to_dict("records"):
             # The clairvoyant has a model, and no risk.
             blind = row["model"] == NOT_USED
             colour = BLIND if blind else colours[row["planner"]]
             face = colour if row["condition"] in marked else "white"
             rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
-            panel.plot([low, high], [height, height], color=colour, lw=1.2, solid_capstyle="butt")
-            panel.plot(rate, height, "o", color=colour, ms=4, mfc=face)
+            panel.plot([low, high], [row["height"]] * 2, color=colour, lw=1.2, solid_capstyle="butt")
+            panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
             if blind:
                 panel.axvline(rate, color=colour, lw=0.8, ls="--", zorder=0)
                 panel.axvspan(low, high, color=colour, alpha=0.12, lw=0, zorder=0)
-        panel.set_xticks(np.arange(0, 101, 25))
-    layout.panels[0][0].set_xlim(-4, 104)
-    return layout.figure
+    panel.set(xticks=np.arange(0, 101, 25), xlim=(-4, 104))
+    return figure
 
 
 @styled()
@@ -164,19 +138,18 @@ def outcome_figure(summary: pd.DataFrame) -> Figure:
         summary: from `summary.summarise`.
     """
     ended = [name for name in OUTCOME_COLOURS if summary[f"{name}_count"].sum()]
-    layout = lay_out(summary, ["share of episodes [%]"], legend_in=0.15 + 0.15 * (len(ended) // 3))
-    for panel, rows in layout.panels:
-        for height, row in layout.rows(rows):
-            left = 0.0
-            for name in ended:
-                share = 100 * row[f"{name}_count"] / row["n_episodes"]
-                colour, label = OUTCOME_COLOURS[name], outcome_in_words(name)
-                panel.barh(height, share, 0.78, left, color=colour, lw=0, label=label)
-                left += share
-            panel.barh(height, 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
-    layout.panels[0][0].set_xlim(0, 100)
-    legend_outside(layout.figure, columns=3 if layout.figure.get_figwidth() < TWO_COLUMNS_IN else 6)
-    return layout.figure
+    figure, panels = lay_out(summary, ["share of episodes [%]"], legend_in=0.15 + 0.15 * (len(ended) // 3))
+    for panel, rows in panels:
+        left = np.zeros(len(rows))
+        for name in ended:
+            share = 100 * rows[f"{name}_count"] / rows["n_episodes"]
+            colour, label = OUTCOME_COLOURS[name], outcome_in_words(name)
+            panel.barh(rows["height"], share, 0.78, left, color=colour, lw=0, label=label)
+            left = left + share
+        panel.barh(rows["height"], 100 - left, 0.78, left, color=SUCCESS_COLOUR, lw=0, label="success")
+    panel.set_xlim(0, 100)
+    legend_outside(figure, columns=3 if figure.get_figwidth() < TWO_COLUMNS_IN else 6)
+    return figure
 
 
 @styled()
@@ -187,41 +160,37 @@ def distribution_figure(summary: pd.DataFrame, episodes: pd.DataFrame) -> Figure
         summary: from `summary.summarise`.
         episodes: the rows it was made of.
     """
-    groups = dict(list(episodes.groupby("condition", sort=False)))
-    layout = lay_out(summary, list(_QUANTITIES.values()), legend_in=0.15)
-    for place, (panel, rows) in enumerate(layout.panels):
-        name = list(_QUANTITIES)[place % len(_QUANTITIES)]
-        _draw_dots(panel, [(height, groups[row["condition"]]) for height, row in layout.rows(rows)], name)
-    layout.panels[0][0].set_xlim(left=0)
-    layout.panels[1][0].set_xlim(0, 1)
-    handles = [Line2D([], [], marker="o", ls="none", ms=3, color=BLUE, label="success")]
-    handles.append(Line2D([], [], marker="o", ls="none", ms=3, color=ORANGE, label="failure"))
-    handles.append(
-        Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label="median and quartiles of all")
-    )
-    legend_outside(layout.figure, handles)
-    return layout.figure
+    figure, panels = lay_out(summary, list(_QUANTITIES.values()), legend_in=0.15)
+    for place, (panel, rows) in enumerate(panels):
+        _draw_dots(panel, rows, episodes, list(_QUANTITIES)[place % len(_QUANTITIES)])
+    panels[0][0].set_xlim(left=0)
+    panels[1][0].set_xlim(0, 1)
+    handles = [
+        Line2D([], [], marker="o", ls="none", ms=3, color=colour, label=label)
+        for label, colour in (("success", BLUE), ("failure", ORANGE))
+    ]
+    words = "median and quartiles of all"
+    handles.append(Line2D([], [], color="black", marker="|", ms=6, lw=1.2, label=words))
+    legend_outside(figure, handles)
+    return figure
 
 
-def _draw_dots(panel: Axes, rows: Sequence[tuple[float, pd.DataFrame]], name: str) -> None:
+def _draw_dots(panel: Axes, rows: pd.DataFrame, episodes: pd.DataFrame, name: str) -> None:
     """Draws a quantity of the episodes of several conditions, each condition at its height; all dots at once."""
-    dots, middles = [], []
-    for height, episodes in rows:
-        values = episodes[name].to_numpy(dtype=float)
-        known = ~np.isnan(values)
-        if not known.any():
-            continue
-        shift = np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, len(values))
-        colours = np.where(episodes["success"].to_numpy(dtype=bool), BLUE, ORANGE)
-        dots.append((values[known], height + shift[known], colours[known]))
-        middles.append((height, *np.percentile(values[known], (25, 50, 75))))
-    if not dots:
+    dots = rows[["condition", "height"]].merge(episodes, on="condition")
+    turn = dots.groupby("condition").cumcount()
+    dots["up"] = dots["height"] + np.random.default_rng(0).uniform(-_SPREAD, _SPREAD, len(dots))[turn]
+    dots = dots[dots[name].notna()]
+    if dots.empty:
         return
-    across, up, colours = (np.concatenate(part) for part in zip(*dots, strict=True))
-    panel.scatter(across, up, s=2.5, c=colours, alpha=0.35, lw=0, rasterized=True)
-    heights, low, median, high = np.transpose(middles)
-    panel.plot([low, high], [heights, heights], color="black", lw=1.2, solid_capstyle="butt")
-    panel.plot(median, heights, "|", color="black", ms=6, mew=1.4)
+    colours = np.where(dots["success"], BLUE, ORANGE)
+    panel.scatter(dots[name], dots["up"], s=2.5, c=colours, alpha=0.35, lw=0, rasterized=True)
+    middles = dots.groupby("height")[name].quantile([0.25, 0.5, 0.75]).unstack()
+    heights = middles.index.to_numpy()
+    panel.plot(
+        [middles[0.25], middles[0.75]], [heights, heights], color="black", lw=1.2, solid_capstyle="butt"
+    )
+    panel.plot(middles[0.5], heights, "|", color="black", ms=6, mew=1.4)
 
 
 @styled()
@@ -240,12 +209,13 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
     axes = figure.subplots(len(panels), squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     for panel, rows in zip(axes, panels, strict=True):
         _draw_tests(panel, rows)
-    handles: list[Artist] = [
-        Line2D([], [], color=BLUE, marker="o", ms=4, lw=0, label="supported"),
-        Line2D([], [], color=BLUE, marker="o", ms=4, lw=0, mfc="white", label="not supported"),
-        Line2D([], [], color=BLUE, lw=2.6, label="90 % interval"),
-        Line2D([], [], color=BLUE, lw=0.9, label="95 % interval"),
-    ]
+    looks: dict[str, Any] = {
+        "supported": {"marker": "o", "ms": 4, "lw": 0},
+        "not supported": {"marker": "o", "ms": 4, "lw": 0, "mfc": "white"},
+        "90 % interval": {"lw": 2.6},
+        "95 % interval": {"lw": 0.9},
+    }
+    handles: list[Artist] = [Line2D([], [], color=BLUE, label=label, **look) for label, look in looks.items()]
     if (tests["margin"] > 0).any():
         handles.append(Patch(color=_MARGIN, label="within the margin"))
     legend_outside(figure, handles, 5)
@@ -254,9 +224,9 @@ def forest_figure(tests: pd.DataFrame) -> Figure:
 
 def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
     metric = METRICS[rows["metric"].iloc[0]]
-    ends = rows[["low", "high", "difference"]].to_numpy(dtype=float)
     # Where no episode tells anything, a row has no numbers.
-    reach = np.nanmax([*np.abs(ends).ravel(), rows["margin"].max(), 1e-9]) * 1.08
+    ends = rows[["low", "high", "difference", "margin"]].astype(float).abs()
+    reach = max(ends.max().max(), 1e-9) * 1.08
     panel.set(xlim=(-reach, reach), ylim=(len(rows) - 0.4, -0.6))
     panel.axvline(0, color="0.4", lw=0.6, zorder=1)
     names = []

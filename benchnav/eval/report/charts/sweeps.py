@@ -1,12 +1,11 @@
 """Sweeps of a run: conditions that are equal in all but one number, which takes three values or more, as curves."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -19,6 +18,7 @@ from benchnav.core.figures import (
     condition_colours,
     legend_outside,
     planner_name,
+    stack_panels,
     styled,
 )
 from benchnav.datagen.recipe.scenario import find_series
@@ -40,7 +40,9 @@ _MOST_LINES, _MOST_ACROSS = 7, 4
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
 Labels = Mapping[Any, Any]
-Columns = tuple[str, str, str, float]
+
+# What panels are named by, in order.
+_LABELS = ("scenario", "data", "world", "model", "who", "risk", "robot", "objective")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,15 +73,6 @@ class Sweep:
     lines: tuple[Line, ...]
 
 
-def flatten(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Names every entry of nested mappings by its path with dots; a list is an entry."""
-    flat: dict[str, Any] = {}
-    for name, inner in value.items():
-        path = f"{before}{name}"
-        flat |= flatten(inner, f"{path}.") if isinstance(inner, Mapping) else {path: inner}
-    return flat
-
-
 def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
     """Finds the sweeps of a run.
 
@@ -91,54 +84,37 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
     Returns:
         By name of the number.
     """
+    points = []
     flat = {
-        condition: flatten(about["value"])
+        condition: pd.json_normalize(dict(about["value"])).to_dict("records")[0]
         for condition, about in conditions.items()
         if "split" in about["value"]
     }
-    numbers = sorted({name for one in flat.values() for name, value in one.items() if _is_number(value)})
-    sweeps = [Sweep(number=name, lines=tuple(_lines(_along(flat, name)))) for name in numbers]
-    sweeps.append(Sweep(number=SEVERITY, lines=tuple(_lines(_along_severity(flat)))))
-    return [sweep for sweep in sweeps if sweep.lines]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-Found = Iterator[tuple[str, float, dict[str, Any]]]
-
-
-def _along(flat: Mapping[str, Mapping[str, Any]], name: str) -> Found:
-    """Conditions with their value of a number, and all else."""
-    for condition, one in flat.items():
-        if _is_number(one.get(name)):
-            yield condition, float(one[name]), {key: value for key, value in one.items() if key != name}
-
-
-def _along_severity(flat: Mapping[str, Mapping[str, Any]]) -> Found:
-    for scenario, pairs in find_series(dict.fromkeys(one["split"] for one in flat.values())).items():
+    for condition, value in flat.items():
+        for name, number in value.items():
+            if isinstance(number, int | float) and not isinstance(number, bool):
+                rest = {key: other for key, other in value.items() if key != name}
+                points.append((name, condition, float(number), rest))
+    points.sort(key=lambda point: point[0])
+    for scenario, pairs in find_series(dict.fromkeys(value["split"] for value in flat.values())).items():
         severities = {split: severity for severity, split in pairs}
-        for condition, one in flat.items():
-            if one["split"] in severities:
-                yield condition, severities[one["split"]], {**one, "split": scenario}
-
-
-def _lines(found: Found) -> Iterator[Line]:
-    table = pd.DataFrame(
-        [(condition, value, repr(sorted(rest.items())), rest) for condition, value, rest in found]
-    )
-    if table.empty:
-        return
-    table.columns = pd.Index(["condition", "value", "key", "rest"])
-    for _, group in table.groupby("key", sort=False):
+        for condition, value in flat.items():
+            if value["split"] in severities:
+                rest = {**value, "split": scenario}
+                points.append((SEVERITY, condition, severities[value["split"]], rest))
+    lines: dict[str, list[Line]] = {}
+    table = pd.DataFrame(points, columns=["number", "condition", "value", "rest"])
+    table["key"] = [repr(sorted(rest.items())) for rest in table["rest"]]
+    for (number, _), group in table.groupby(["number", "key"], sort=False):
         if group["value"].nunique() >= LEAST_VALUES:
             ordered = group.sort_values("value", kind="stable")
-            yield Line(
+            line = Line(
                 values=tuple(ordered["value"]),
                 conditions=tuple(ordered["condition"]),
                 rest=group["rest"].iloc[0],
             )
+            lines.setdefault(number, []).append(line)
+    return [Sweep(number=number, lines=tuple(own)) for number, own in lines.items()]
 
 
 def sweep_name(number: str) -> str:
@@ -157,140 +133,121 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
         sweep: from `find_sweeps`.
         summary: of the run.
     """
-    return _Curves(sweep, summary).draw()
+    rows = summary.set_index("condition", drop=False)
+    labels = _label_lines(sweep, rows)
+    planners = labels.drop_duplicates("name").set_index("name")["planner"]
+    colours = dict(zip(planners.index, condition_colours(planners.tolist(), LINE_COLOURS), strict=True))
+    groups = _panels(labels)
+    across = min(len(groups), _MOST_ACROSS)
+    down = -(-len(groups) // across)
+    width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
+    figure = Figure(figsize=(width, 3.3 * down + 0.5), layout="constrained")
+    stacks = stack_panels(figure, len(groups), across, layers=2, sharex=True)
+    for above, below in stacks[1:]:
+        above.sharey(stacks[0][0])
+        below.sharey(stacks[0][1])
+    values = sorted({value for line in sweep.lines for value in line.values})
+    swept = [condition for line in sweep.lines for condition in line.conditions]
+    others = rows.drop(swept).to_dict("records") if sweep.number.startswith("risk.") else []
+    references: dict[str, str] = {}
+    for place, ((above, below), (title, lines)) in enumerate(zip(stacks, groups, strict=True)):
+        for panel, (measure, (*names, scale)) in zip((above, below), _MEASURES.items(), strict=True):
+            for number in lines:
+                line, name = sweep.lines[number], labels["name"][number]
+                own = rows.loc[list(line.conditions)]
+                for label, row in _references(own.iloc[0], others):
+                    blind = row["model"] == NOT_USED
+                    references.setdefault(label, BLIND if blind else "0.2")
+                    style = _style(list(references).index(label))
+                    colour = BLIND if blind else colours[name]
+                    panel.axhline(scale * row[names[0]], color=colour, ls=style, lw=1, zorder=1)
+                rate, low, high = (scale * own[column] for column in names)
+                marker = MARKERS[list(colours).index(name) // len(LINE_COLOURS) % len(MARKERS)]
+                places = _places(sweep, line.values)
+                panel.fill_between(places, low, high, color=colours[name], alpha=0.15, lw=0)
+                panel.plot(places, rate, color=colours[name], marker=marker, ms=3.5, lw=1.2, label=name)
+            panel.grid(axis="y", color="0.9")
+            panel.tick_params(labelleft=place % across == 0)
+            panel.set_ylabel("" if place % across else measure)
+        above.set_title(title)
+        below.tick_params(labelbottom=True)
+        below.set_xlabel(_NAMES.get(sweep.number, sweep_name(sweep.number)))
+        below.set_xticks(_places(sweep, values), [f"{value:g}" for value in values])
+    # Matplotlib names every pattern of dashes "--", so that a style cannot be read back from a line.
+    handles = [
+        Line2D([], [], color=colour, lw=1, ls=_style(place), label=label)
+        for place, (label, colour) in enumerate(references.items())
+    ]
+    legend_outside(figure, handles, 2 if across == 1 else 4)
+    return figure
 
 
-class _Curves:
-    """What the lines of one sweep are called and look like, and where they stand."""
+def _label_lines(sweep: Sweep, rows: pd.DataFrame) -> pd.DataFrame:
+    """What names lines and their panels: a row a line, with the `planner` and the `name` of the line beside `_LABELS`.
 
-    def __init__(self, sweep: Sweep, summary: pd.DataFrame) -> None:
-        self.sweep = sweep
-        self.rows: dict[str, Labels] = {row["condition"]: row for row in summary.to_dict("records")}
-        names = {self.name(line): self.first(line)["planner"] for line in sweep.lines}
-        colours = condition_colours(list(names.values()), LINE_COLOURS)
-        markers = [MARKERS[place // len(LINE_COLOURS) % len(MARKERS)] for place in range(len(names))]
-        self.looks = dict(zip(names, zip(colours, markers, strict=True), strict=True))
-        self.references: dict[str, Line2D] = {}
-
-    def draw(self) -> Figure:
-        groups = self.panels()
-        across = min(len(groups), _MOST_ACROSS)
-        down = -(-len(groups) // across)
-        width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
-        figure = Figure(figsize=(width, 3.3 * down + 0.5), layout="constrained")
-        axes = figure.subplots(2 * down, across, squeeze=False, sharex=True, sharey=False)
-        for panel in axes.flat:
-            panel.set_visible(False)
-        for place, (title, lines) in enumerate(groups):
-            row, column = divmod(place, across)
-            above, below = axes[2 * row : 2 * row + 2, column]
-            for panel, (label, columns) in zip((above, below), _MEASURES.items(), strict=True):
-                panel.set_visible(True)
-                self.draw_references(panel, lines, columns)
-                for line in lines:
-                    self.draw_line(panel, line, columns)
-                panel.grid(axis="y", color="0.9")
-                if column == 0:
-                    panel.set_ylabel(label)
-            above.set_title(title)
-            above.tick_params(labelbottom=False)
-            below.tick_params(labelbottom=True)
-            below.set_xlabel(_NAMES.get(self.sweep.number, sweep_name(self.sweep.number)))
-            values = sorted({value for line in self.sweep.lines for value in line.values})
-            below.set_xticks(self.places(values), [f"{value:g}" for value in values])
-        for first in range(2):
-            _share_heights(list(axes[first::2].flat))
-        legend_outside(figure, list(self.references.values()), 2 if across == 1 else 4)
-        return figure
-
-    def panels(self) -> list[tuple[str, list[Line]]]:
-        """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish."""
-        for split in (("model",), ("model", "planner"), ("model", "planner", "risk")):
-            groups: dict[tuple[str, ...], list[Line]] = {}
-            for line in self.sweep.lines:
-                groups.setdefault(self.place(line, split), []).append(line)
-            if split == ("model",):
-                groups = _with_blind(groups)
-            if max(map(len, groups.values())) <= _MOST_LINES:
-                break
-        differing = [len(set(labels)) > 1 for labels in zip(*groups, strict=True)]
-        return [
-            (joined(label for label, shown in zip(key, differing, strict=True) if shown) or key[0], lines)
-            for key, lines in groups.items()
-        ]
-
-    def first(self, line: Line) -> Labels:
-        """The labels of a line, of which all conditions have the same but for the number."""
-        return self.rows[line.conditions[0]]
-
-    def place(self, line: Line, split: Sequence[str] = ("model",)) -> tuple[str, ...]:
-        """What names the panel of a line: scenario, data, world, model, and what else it is split by."""
-        row = self.first(line)
-        world = (
-            row["world"].split(" ")[0] if self.sweep.number.startswith(("world.", "rules.")) else row["world"]
+    Of the part that is swept it is the name alone, since its label holds the number.
+    """
+    table = []
+    for line in sweep.lines:
+        first = rows.loc[line.conditions[0]]
+        labels = {name: first[name] for name in ("model", "planner", "risk", "robot", "objective")}
+        for name, label in labels.items():
+            if sweep.number.startswith(f"{name}.") and label != NOT_USED:
+                labels[name] = str(line.rest[f"{name}.part"])
+        world = first["world"]
+        table.append(
+            {
+                "scenario": str(line.rest["split"]).removeprefix("test/"),
+                "data": str(line.rest.get("data", first["data"])),
+                "world": world.split(" ")[0] if sweep.number.startswith(("world.", "rules.")) else world,
+                **labels,
+                "planner": first["planner"],
+                "who": planner_name(labels["planner"]),
+            }
         )
-        scenario = str(line.rest["split"]).removeprefix("test/")
-        labels = (self.label(line, name) for name in (*split, "robot", "objective"))
-        return (scenario, str(line.rest.get("data", row["data"])), world, *labels)
-
-    def label(self, line: Line, name: str) -> str:
-        """A label of a line; of the part that is swept its name alone, since its label holds the number."""
-        label = self.first(line)[name]
-        if self.sweep.number.startswith(f"{name}.") and label != NOT_USED:
-            label = str(line.rest[f"{name}.part"])
-        return planner_name(label) if name == "planner" else label
-
-    def name(self, line: Line) -> str:
-        """What a line is called: planner and risk setting, and what its labels do not say where that is needed."""
-        alike = [other for other in self.sweep.lines if self._said(other) == self._said(line)]
-        differing = [key for key in line.rest if len({repr(other.rest.get(key)) for other in alike}) > 1]
-        return joined([*self._said(line)[0], *(f"{sweep_name(key)} {line.rest[key]}" for key in differing)])
-
-    def _said(self, line: Line) -> tuple[tuple[str, str], tuple[str, ...]]:
-        return (self.label(line, "planner"), self.label(line, "risk")), self.place(line)
-
-    def draw_line(self, panel: Axes, line: Line, columns: Columns) -> None:
-        rate, low, high = (
-            [columns[3] * self.rows[condition][name] for condition in line.conditions] for name in columns[:3]
-        )
-        name, places = self.name(line), self.places(line.values)
-        colour, marker = self.looks[name]
-        panel.fill_between(places, low, high, color=colour, alpha=0.15, lw=0)
-        panel.plot(places, rate, color=colour, marker=marker, ms=3.5, lw=1.2, label=name)
-
-    def draw_references(self, panel: Axes, lines: Sequence[Line], columns: Columns) -> None:
-        """Draws the settings that have no such number, each in the colour of its planner's line."""
-        if not self.sweep.number.startswith("risk."):
-            return
-        swept = {condition for line in self.sweep.lines for condition in line.conditions}
-        others = [row for condition, row in self.rows.items() if condition not in swept]
-        for line in lines:
-            first = self.first(line)
-            for row in others:
-                blind = row["model"] == NOT_USED
-                shared = _SAME if blind else (*_SAME, "model", "planner")
-                if any(row[name] != first[name] for name in shared):
-                    continue
-                label = planner_name(row["planner"]) if blind else row["risk"]
-                if label not in self.references:
-                    style = _style(len(self.references))
-                    self.references[label] = Line2D(
-                        [], [], color=BLIND if blind else "0.2", lw=1, ls=style, label=label
-                    )
-                # Matplotlib names every pattern of dashes "--", so that a style cannot be read back from a line.
-                style = _style(list(self.references).index(label))
-                colour = BLIND if blind else self.looks[self.name(line)][0]
-                panel.axhline(columns[3] * row[columns[0]], color=colour, ls=style, lw=1, zorder=1)
-
-    def places(self, values: Sequence[float]) -> np.ndarray:
-        """Where values stand: levels by the logarithm of the tail's share, since they crowd toward 1."""
-        numbers = np.asarray(values)
-        return -np.log(1 - numbers) if self.sweep.number == _LEVEL and numbers.max() < 1 else numbers
+    labelled = pd.DataFrame(table)
+    names = {}
+    for _, alike in labelled.groupby(list(_LABELS), sort=False):
+        rests = [sweep.lines[number].rest for number in alike.index]
+        for number, rest in zip(alike.index, rests, strict=True):
+            # What labels do not say is said where that is needed.
+            differing = [key for key in rest if len({repr(other.get(key)) for other in rests}) > 1]
+            more = (f"{sweep_name(key)} {rest[key]}" for key in differing)
+            names[number] = joined([alike["who"][number], alike["risk"][number], *more])
+    return labelled.assign(name=pd.Series(names))
 
 
-def _with_blind(groups: dict[tuple[str, ...], list[Line]]) -> dict[tuple[str, ...], list[Line]]:
+def _panels(labels: pd.DataFrame) -> list[tuple[str, list[int]]]:
+    """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish."""
+    for left_out in (("who", "risk"), ("risk",), ()):
+        columns = [name for name in _LABELS if name not in left_out]
+        groups = {key: group.index.tolist() for key, group in labels.groupby(columns, sort=False)}
+        if len(left_out) == 2:
+            groups = _with_blind(groups)
+        if max(map(len, groups.values())) <= _MOST_LINES:
+            break
+    differing = [place for place, own in enumerate(zip(*groups, strict=True)) if len(set(own)) > 1]
+    return [(joined(key[place] for place in differing) or key[0], lines) for key, lines in groups.items()]
+
+
+def _references(first: Labels, others: Iterable[Labels]) -> Iterator[tuple[str, Labels]]:
+    """Settings that have no such number and stand beside a line: of its planner, and blind ones."""
+    for row in others:
+        blind = row["model"] == NOT_USED
+        shared = _SAME if blind else (*_SAME, "model", "planner")
+        if all(row[name] == first[name] for name in shared):
+            yield planner_name(row["planner"]) if blind else row["risk"], row
+
+
+def _places(sweep: Sweep, values: Sequence[float]) -> np.ndarray:
+    """Where values stand: levels by the logarithm of the tail's share, since they crowd toward 1."""
+    numbers = np.asarray(values)
+    return -np.log(1 - numbers) if sweep.number == _LEVEL and numbers.max() < 1 else numbers
+
+
+def _with_blind(groups: dict[Any, list[int]]) -> dict[Any, list[int]]:
     """Puts what is blind into the panels of the models that it stands beside."""
-    merged: dict[tuple[str, ...], list[Line]] = {}
+    merged: dict[Any, list[int]] = {}
     for key, lines in groups.items():
         scenario, data, world, model, *rest = key
         beside = [k for k in groups if k != key and (*k[:3], *k[4:]) == (scenario, data, world, *rest)]
@@ -306,12 +263,3 @@ def _style(place: int) -> Any:
     """A pattern of dashes for each setting: those of `_STYLES`, then dashes with more and more dots between."""
     more = place - len(_STYLES) + 3
     return _STYLES[place] if place < len(_STYLES) else (0, (8, 2, *(1, 1.5) * more))
-
-
-def _share_heights(panels: Sequence[Axes]) -> None:
-    """Gives panels of one measure the same range, and numbers at the left alone."""
-    shown = [panel for panel in panels if panel.get_visible()]
-    ends = np.array([panel.get_ylim() for panel in shown])
-    for panel in shown:
-        panel.set_ylim(ends[:, 0].min(), ends[:, 1].max())
-        panel.tick_params(labelleft=bool(panel.get_ylabel()))

@@ -5,26 +5,30 @@ met; below, λ as it was where it stayed so, else the λ̂ that the planner was 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map, unit
-from benchnav.eval.report.charts.maps import plan_layer, soft_lines
-from benchnav.eval.report.recorded.drawn_plan import STYLES
-from benchnav.eval.report.recorded.ground import field_colours, immobilised_at
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map
+from benchnav.eval.recording import Recording
+from benchnav.eval.report.layers import (
+    STYLES,
+    draw_driven,
+    driven_path,
+    field_colours,
+    plan_layer,
+    soft_lines,
+)
 from benchnav.eval.report.words import condition_name, contender_names
 
-# Red, green, blue of the robot, as no λ is coloured.
-ROBOT = (255, 120, 0)
+ROBOT = "#ff7800"  # as no λ is coloured
 
 _DPI = 100
 _PANEL, _GAP, _HEAD, _FOOT = 440, 20, 92, 76  # pixels
@@ -46,25 +50,34 @@ class Frames:
 
     def __init__(self, recordings: Sequence[Recording]) -> None:
         """Draws what never changes."""
-        wide, high = recordings[0].grid.extent_m
-        panel_high = round(_PANEL * min(high / wide, _TALLEST))
+        rows, columns = recordings[0].grid.shape
+        panel_high = round(_PANEL * min(rows / columns, _TALLEST))
         width = len(recordings) * (_PANEL + _GAP) + _GAP
         height = _HEAD + 2 * panel_high + _GAP + _FOOT
-        self.size = (width + width % 2, height + height % 2)
-        self._figure = Figure(figsize=(self.size[0] / _DPI, self.size[1] / _DPI), dpi=_DPI)
+        across, up = self.size = (width + width % 2, height + height % 2)
+        self._figure = Figure(figsize=(across / _DPI, up / _DPI), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
-        self._columns = []
+        panels = self._figure.subplots(
+            2, len(recordings), squeeze=False,
+            gridspec_kw={
+                "left": _GAP / across, "right": (width - _GAP) / across, "wspace": _GAP / _PANEL,
+                "bottom": _FOOT / up, "top": (_FOOT + 2 * panel_high + _GAP) / up, "hspace": _GAP / panel_high,
+            },
+        )  # fmt: skip
         if len(recordings) == 1:
             names = [condition_name(recordings[0].about)]
         else:
             names = contender_names([recording.about for recording in recordings])
-        for place, (recording, name) in enumerate(zip(recordings, names, strict=True)):
-            left = _GAP + place * (_PANEL + _GAP)
-            panels = [
-                self._axes(left, _FOOT + row * (panel_high + _GAP), _PANEL, panel_high) for row in (1, 0)
-            ]
-            self._columns.append(_Column(self._figure, panels, recording, name, left / self.size[0]))
-        self._draw_foot(recordings)
+        self._columns = [_Column(*column) for column in zip(panels.T, recordings, names, strict=True)]
+        bar = self._figure.add_axes((_GAP / across, 44 / up, _PANEL / across, 12 / up))
+        shades = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
+        self._figure.colorbar(shades, cax=bar, orientation="horizontal")
+        bar.tick_params(labelsize=8, length=2)
+        words = ["traversability λ"]
+        words += ["hatched: soft ground"] if any(r.soft.any() for r in recordings) else []
+        words += ["dark red: immobilises a robot"] if any(r.immobilising.any() for r in recordings) else []
+        words += ["grey: not free"] if any(r.field is None for r in recordings) else []
+        self._figure.text(_GAP / across, 10 / up, "; ".join(words), fontsize=8)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
@@ -82,43 +95,28 @@ class Frames:
                     self._figure.draw_artist(artist)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def pixel_of(self, place: int, x_m: float, y_m: float) -> tuple[float, float]:
-        """Where a position on the terrain of an episode is in a frame: column and row from the top."""
-        x, y = self._columns[place].panels[0].transData.transform((x_m, y_m))
-        return float(x), float(self.size[1] - y)
-
-    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        across, up = self.size
-        return self._figure.add_axes((left / across, bottom / up, width / across, height / up))
-
-    def _draw_foot(self, recordings: Sequence[Recording]) -> None:
-        bar = self._axes(_GAP, 44, _PANEL, 12)
-        shades = ScalarMappable(Normalize(0, 1), TRAVERSABILITY_COLOURS)
-        self._figure.colorbar(shades, cax=bar, orientation="horizontal")
-        bar.tick_params(labelsize=8, length=2)
-        words = ["traversability λ"]
-        words += ["hatched: soft ground"] if any(r.soft.any() for r in recordings) else []
-        words += ["dark red: immobilises a robot"] if any(r.immobilising.any() for r in recordings) else []
-        words += ["grey: not free"] if any(r.field is None for r in recordings) else []
-        self._figure.text(_GAP / self.size[0], 10 / self.size[1], "; ".join(words), fontsize=8)
-
 
 class _Column:
     """One episode: its two panels, and what of them moves."""
 
-    def __init__(
-        self, figure: Figure, panels: Sequence[Axes], recording: Recording, name: str, left: float
-    ) -> None:
+    def __init__(self, panels: Sequence[Axes], recording: Recording, name: str) -> None:
         self.panels, self.recording = panels, recording
-        top = figure.get_size_inches()[1] * _DPI
-        figure.text(left, 1 - 26 / top, name, fontsize=12, weight="bold")
-        self._time = figure.text(left, 1 - 52 / top, "", fontsize=11, family="monospace")
-        self._outcome = figure.text(left, 1 - 78 / top, "", fontsize=12, weight="bold")
+        texts: Any = (
+            (name, 47.5, 12, {"weight": "bold"}),
+            ("", 28.8, 11, {"family": "monospace"}),
+            ("", 10.1, 12, {"weight": "bold"}),
+        )
+        _, self._time, self._outcome = (
+            # Points over the panel.
+            panels[0].annotate(
+                text, (0, 1), (0, over), "axes fraction", "offset points", fontsize=size, **style
+            )
+            for text, over, size, style in texts
+        )
         self._layers = {name: plan_layer(style) for name, style in STYLES.items()}
         for layer in self._layers.values():
             panels[0].add_collection(layer)
-        self._driven = LineCollection([], cmap=TRAVERSABILITY_COLOURS, linewidths=3.5, capstyle="round")
-        self._driven.set_clim(0, 1)
+        self._driven = driven_path(3.5)
         self._edges = [
             panel.plot([], [], color=colour, lw=width, solid_capstyle="round")[0]
             for panel, colour, width in (
@@ -128,11 +126,29 @@ class _Column:
             )
         ]
         panels[0].add_collection(self._driven)
-        self._robots = [Polygon(_ROBOT_M, fc=unit(ROBOT), ec="black", lw=0.8) for _ in panels]
+        self._robots = [Polygon(_ROBOT_M, fc=ROBOT, ec="black", lw=0.8) for _ in panels]
         for panel, body in zip(panels, self._robots, strict=True):
             panel.add_patch(body)
         self._crosses = [panel.plot([], [], **MARKS["end"] | {"ms": 13})[0] for panel in panels]
-        _draw_ground(panels, recording)
+        extent_m = recording.grid.extent_m
+        show_map(panels[0], np.moveaxis(recording.rgb, 0, -1), extent_m)
+        for lines in soft_lines(recording.soft, recording.grid.resolution_m):
+            panels[0].add_collection(lines)
+        if recording.field is not None:
+            shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
+        else:
+            shown = field_colours(recording.predicted, np.zeros_like(recording.free))
+            shown[~recording.free] = round(255 * _CLOSED)
+            title = "λ̂ given to the planner"
+        show_map(panels[1], shown, extent_m)
+        for panel, words in zip(panels, ("terrain and plan", title), strict=True):
+            mark(panel, "start", recording.states[0, :2], _MARKS)
+            mark(panel, "goal", recording.goal_m, _MARKS)
+            panel.set(aspect="auto", xticks=[], yticks=[])
+            panel.text(
+                0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
+                bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},
+            )  # fmt: skip
         self.moving: list[Artist] = [
             *self._layers.values(), *self._edges, self._driven, *self._robots, *self._crosses, self._time,
             self._outcome,
@@ -146,9 +162,8 @@ class _Column:
         steps = len(recording.traversability)
         now = min(int(time_s / recording.dt_s + 1e-6), steps)
         x, y, heading = recording.states[now, :3]
-        track = recording.states[: now + 1, :2]
-        self._driven.set_segments(list(np.stack((track[:-1], track[1:]), axis=1)))
-        self._driven.set_array(recording.traversability[:now])
+        track = recording.track[: now + 1]
+        draw_driven(self._driven, track, recording.traversability)
         for line in self._edges:
             line.set_data(*track.T)
         turn = np.array(((np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))))
@@ -162,28 +177,6 @@ class _Column:
         self._time.set_text(f"t = {now * recording.dt_s:5.1f} s   observed λ = {met}")
         self._outcome.set_text(recording.outcome if has_ended else "")
         self._outcome.set_color("#00684a" if recording.about["outcome"] == "success" else "#a00000")
-        held = immobilised_at(recording.about, track) if has_ended else None
+        held = recording.immobilised_at if has_ended else None
         for cross in self._crosses:
             cross.set_data(*(([], []) if held is None else ([held[0]], [held[1]])))
-
-
-def _draw_ground(panels: Sequence[Axes], recording: Recording) -> None:
-    extent_m = recording.grid.extent_m
-    show_map(panels[0], np.moveaxis(recording.rgb, 0, -1), extent_m)
-    for lines in soft_lines(recording.soft, recording.grid.resolution_m):
-        panels[0].add_collection(lines)
-    if recording.field is not None:
-        shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
-    else:
-        shown = field_colours(recording.predicted, np.zeros_like(recording.free))
-        shown[~recording.free] = round(255 * _CLOSED)
-        title = "λ̂ given to the planner"
-    show_map(panels[1], shown, extent_m)
-    for panel, words in zip(panels, ("terrain and plan", title), strict=True):
-        mark(panel, "start", recording.states[0, :2], _MARKS)
-        mark(panel, "goal", recording.goal_m, _MARKS)
-        panel.set(xlim=(0, extent_m[0]), ylim=(0, extent_m[1]), aspect="auto", xticks=[], yticks=[])
-        panel.text(
-            0.02, 0.975, words, transform=panel.transAxes, fontsize=9, va="top",
-            bbox={"fc": "white", "ec": "none", "alpha": 0.75, "pad": 2},
-        )  # fmt: skip

@@ -9,10 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchnav.core.figures import bytes_of, condition_colours
+import rerun as rr
+import rerun.blueprint as rrb
+
+from benchnav.core.figures import condition_colours
 from benchnav.core.store import replacing
-from benchnav.core.tables import Table, to_markdown
+from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.robot import (
     TIMELINE,
     Driver,
@@ -23,13 +27,23 @@ from benchnav.eval.report.playback.robot import (
     log_series,
 )
 from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
-from benchnav.eval.report.recorded.recording import Recording
 from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
 
-_ALONE = (0, 170, 0)
+_ALONE = "#00aa00"
 _ALL, _PLACES = "/map/overlay/**", "/map/places/**"
+
+
+def write_viewer_files(folder: Path) -> None:
+    """Writes the viewer's file of each recording in a run folder that has none.
+
+    Args:
+        folder: the run folder.
+    """
+    for path in sorted((folder / "playback").glob("*.npz")):
+        if not path.with_suffix(".rrd").exists():
+            write_rerun([Recording.load(path)], path.with_suffix(".rrd"))
 
 
 def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
@@ -39,8 +53,6 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         recordings: one, or several of one map.
         path: file to write; its name is what the viewer calls it.
     """
-    import rerun as rr
-
     drivers = drivers_of(recordings)
     first = recordings[0]
     # One chunk an entity, however slow the machine is: each has a header of more than a kilobyte.
@@ -70,7 +82,7 @@ def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     abouts = [recording.about for recording in recordings]
     colours = condition_colours([about["planner"] for about in abouts])
     return [
-        Driver(recording=recording, name=name, colour=bytes_of(colour))
+        Driver(recording=recording, name=name, colour=colour)
         for recording, name, colour in zip(recordings, contender_names(abouts), colours, strict=True)
     ]
 
@@ -84,8 +96,6 @@ def _title(drivers: Sequence[Driver]) -> str:
 
 def arrange(drivers: Sequence[Driver]) -> Any:
     """Arranges the views: the terrain and time series to the left, maps to the right."""
-    import rerun.blueprint as rrb
-
     series = [
         rrb.TimeSeriesView(
             name="Observed λ", origin="/series/traversability", axis_y=rrb.ScalarAxis(range=(0, 1))
@@ -137,36 +147,27 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
-    about = drivers[0].recording.about
-    lines = [f"# {about['data']}, {about['scenario']} {about['map']}", ""]
-    lines += [f"Seed {about['seed']}, realisation {about['realisation']}", ""]
+    recording = drivers[0].recording
+    about = recording.about
+    lines = [
+        f"# {about['data']}, {about['scenario']} {about['map']}",
+        f"Seed {about['seed']}, realisation {about['realisation']}",
+    ]
     if len(drivers) == 1:
-        recording = drivers[0].recording
-        lines += [
-            f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s",
-            "",
-        ]
-        lines += [
-            f"observed λ on average: {_mean_observed(recording)}",
-            "",
-            f"Free: {free_rule(recording)}",
-            "",
-        ]
+        ended = f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s"
+        met = f"observed λ on average: {_mean_observed(recording)}"
         used = tuple((name, about[name]) for name in NAMING if about.get(name, NOT_USED) != NOT_USED)
-        return "\n".join([*lines, to_markdown(Table(headings=("", ""), rows=used))])
-    rows = tuple(
-        (
-            driver.name,
-            driver.recording.outcome,
-            f"{driver.recording.end_s:.1f}",
-            _mean_observed(driver.recording),
-            free_rule(driver.recording),
-        )
-        for driver in drivers
+        table = Table(headings=("", ""), rows=used)
+        return "\n\n".join([*lines, ended, met, f"Free: {free_rule(recording)}", to_markdown(table)])
+    rows = []
+    for driver in drivers:
+        own = driver.recording
+        rows.append((driver.name, Bold(own.outcome), f"{own.end_s:.1f}", _mean_observed(own), free_rule(own)))
+    table = Table(
+        headings=("condition", "outcome", "time [s]", "observed λ", "free"),
+        rows=tuple(rows),
     )
-    headings = ("condition", "outcome", "time [s]", "observed λ", "free")
-    table = Table(headings=headings, rows=rows, bold=frozenset((place, 1) for place in range(len(rows))))
-    return "\n".join([*lines, to_markdown(table)])
+    return "\n\n".join([*lines, to_markdown(table)])
 
 
 def free_rule(recording: Recording) -> str:

@@ -1,15 +1,23 @@
 """What belongs to one robot of a recording in the Rerun viewer: where it is, what it planned, drove and met."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
-from benchnav.eval.report.playback.scene import cells_of, on_map, over_ground, shades
-from benchnav.eval.report.recorded.drawn_plan import STYLES, drawing_interval, thinned
-from benchnav.eval.report.recorded.ground import immobilised_at
-from benchnav.eval.report.recorded.recording import Recording
+from benchnav.core.figures import bytes_of
+from benchnav.eval.recording import Recording, drawing_interval, thinned
+from benchnav.eval.report.layers import STYLES, shades
+from benchnav.eval.report.playback.scene import (
+    LIFT_M,
+    POINTS,
+    STRIPS,
+    cells_of,
+    log_both,
+    on_map,
+    over_ground,
+)
 
 TIMELINE = "time"
 
@@ -30,56 +38,52 @@ class Driver:
     Args:
         recording: its episode.
         name: unlike those of the others; empty where it is alone.
-        colour: red, green, blue, in [0, 255].
+        colour: as Matplotlib takes it.
     """
 
     recording: Recording
     name: str
-    colour: tuple[int, int, int]
+    colour: str
 
-    def entity(self, root: str, leaf: str = "") -> str:
+    def entity(self, root: str, *leaf: str) -> str:
         """Path of what is the robot's own under a root."""
-        import rerun as rr
-
         own = ["conditions", rr.escape_entity_path_part(self.name)] if self.name else []
-        return "/".join([root, *own, *([leaf] if leaf else [])])
+        return "/".join([root, *own, *leaf])
+
+    def entities(self, leaf: str) -> tuple[str, str]:
+        """Paths of what is its own over the ground and on the maps."""
+        return self.entity("world", leaf), self.entity("map/overlay", leaf)
 
 
 def log_robot(stream: Any, driver: Driver) -> None:
     """Logs where the robot is and where it heads, at every step."""
-    import rerun as rr
-
     recording = driver.recording
-    states = recording.states
-    times = rr.TimeColumn(TIMELINE, duration=np.arange(len(states)) * recording.dt_s)
-    place = states[:, :2].astype(np.float32)
-    lifted, flat = over_ground(recording, place), on_map(recording.grid, place)
-    cos, sin, none = np.cos(states[:, 2]), np.sin(states[:, 2]), np.zeros(len(states))
-    ahead = _HEADING_M * np.stack((cos, sin, none), axis=1)
-    ahead_flat = _HEADING_M / recording.grid.resolution_m * np.stack((cos, -sin), axis=1)
-    for root, points, vectors, dots, arrows, radius in (
-        ("world", lifted, ahead, rr.Points3D, rr.Arrows3D, 0.3),
-        ("map/overlay", flat, ahead_flat, rr.Points2D, rr.Arrows2D, 0.7),
-    ):
-        robot, heading = driver.entity(root, "robot"), driver.entity(root, "heading")
+    heading_rad = recording.states[:, 2]
+    times = rr.TimeColumn(TIMELINE, duration=np.arange(len(heading_rad)) * recording.dt_s)
+    lifted, flat = over_ground(recording, recording.track), on_map(recording.grid, recording.track)
+    ahead = _HEADING_M * np.stack((np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad), axis=1)
+    ahead_flat = ahead[:, :2] * (1, -1) / recording.resolution_m
+    for robot, heading, points, vectors, dots, arrows, radius in zip(
+        driver.entities("robot"), driver.entities("heading"), (lifted, flat), (ahead, ahead_flat), POINTS,
+        (rr.Arrows3D, rr.Arrows2D), (0.3, 0.7), strict=True,
+    ):  # fmt: skip
         stream.send_columns(robot, [times], dots.columns(positions=points))
         stream.send_columns(heading, [times], arrows.columns(origins=points, vectors=vectors))
-        stream.log(robot, dots.from_fields(radii=[radius], colors=[driver.colour]), static=True)
-        stream.log(heading, arrows.from_fields(radii=[radius / 3], colors=[driver.colour]), static=True)
+        stream.log(robot, dots.from_fields(radii=[radius], colors=[bytes_of(driver.colour)]), static=True)
+        stream.log(
+            heading, arrows.from_fields(radii=[radius / 3], colors=[bytes_of(driver.colour)]), static=True
+        )
 
 
 def log_series(stream: Any, driver: Driver) -> None:
     """Logs observed λ and predicted, the threshold of free ground, the distance to the goal, and commands."""
-    import rerun as rr
-
     recording = driver.recording
-    place = recording.states[:-1, :2].astype(np.float32)
+    place = recording.track[:-1]
     times = rr.TimeColumn(TIMELINE, duration=np.arange(len(place)) * recording.dt_s)
-    what = {
-        "traversability": (recording.traversability, "met"),
-        "goal": (np.linalg.norm(place - recording.goal_m, axis=1), "distance"),
+    lines = {
+        driver.entity("series/traversability", "met"): recording.traversability,
+        driver.entity("series/goal", "distance"): np.linalg.norm(place - recording.goal_m, axis=1),
     }
-    lines = {driver.entity(f"series/{kind}", name): values for kind, (values, name) in what.items()}
     if not driver.name:
         lines["series/traversability/predicted"] = recording.predicted[cells_of(recording.grid, place)]
         lines["series/traversability/threshold"] = np.full(len(place), recording.free_above)
@@ -91,14 +95,14 @@ def log_series(stream: Any, driver: Driver) -> None:
     for entity, values in lines.items():
         stream.send_columns(entity, [times], rr.Scalars.columns(scalars=values.astype(np.float64)))
         if driver.name:
-            style = rr.SeriesLines(colors=[driver.colour], names=[driver.name])
+            style = rr.SeriesLines(colors=[bytes_of(driver.colour)], names=[driver.name])
             stream.log(entity, style, static=True)
 
 
 def log_driven(stream: Any, driver: Driver) -> None:
     """Logs the path driven so far, coloured by the observed λ, or in the robot's colour where it is not alone."""
     recording = driver.recording
-    place = recording.states[:, :2].astype(np.float32)
+    place = recording.track
     count, every = len(recording.traversability), drawing_interval(recording.dt_s)
     colours = shades(recording.traversability)
     for piece, first in enumerate(range(0, count, _PIECE * every)):
@@ -108,8 +112,9 @@ def log_driven(stream: Any, driver: Driver) -> None:
             lines = [place[first : step + 1]]
             if not driver.name:
                 lines = [place[k : k + 2] for k in range(first, step)]
-            shown = [driver.colour] if driver.name else colours[first:step]
-            _log_strips(stream, driver, f"driven/{piece:03}", lines, shown, (0.08, 0.25))
+            shown = [bytes_of(driver.colour)] if driver.name else colours[first:step]
+            entities = driver.entities(f"driven/{piece:03}")
+            log_both(stream, recording, entities, STRIPS, lines, (0.08, 0.25), colors=shown)
 
 
 def log_plans(stream: Any, driver: Driver) -> None:
@@ -120,66 +125,34 @@ def log_plans(stream: Any, driver: Driver) -> None:
         for name, style in STYLES.items():
             lines = list(plan.lines.get(name, ()))
             # A layer without lines is logged too: it wipes out the earlier plan's. One that stays is not.
-            if (driver.name and name != "path") or (name in known and _same(known[name], lines)):
+            if (driver.name and name != "path") or _same(known.get(name), lines):
                 continue
             known[name] = lines
-            colours = [(*driver.colour, 160) if driver.name else style.colour]
+            colours = [bytes_of(driver.colour, 0.628) if driver.name else bytes_of(style.colour)]
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
-            _log_strips(stream, driver, f"plan/{name}", lines, colours, radii)
+            entities = driver.entities(f"plan/{name}")
+            log_both(stream, driver.recording, entities, STRIPS, lines, radii, colors=colours)
 
 
-def _log_strips(
-    stream: Any,
-    driver: Driver,
-    leaf: str,
-    lines: Sequence[np.ndarray],
-    colours: Any,
-    radii: tuple[float, float],
-) -> None:
-    """Logs lines, each of shape [N, 2], over the ground and on the maps; the radii are in metres and in cells."""
-    import rerun as rr
-
-    recording = driver.recording
-    lifted = [over_ground(recording, line) for line in lines]
-    flat = [on_map(recording.grid, line) for line in lines]
-    stream.log(driver.entity("world", leaf), rr.LineStrips3D(lifted, colors=colours, radii=radii[0]))
-    stream.log(driver.entity("map/overlay", leaf), rr.LineStrips2D(flat, colors=colours, radii=radii[1]))
-
-
-def _same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
-    return len(first) == len(second) and all(map(np.array_equal, first, second))
+def _same(known: list[np.ndarray] | None, lines: list[np.ndarray]) -> bool:
+    return known is not None and len(known) == len(lines) and all(map(np.array_equal, known, lines))
 
 
 def log_outcome(stream: Any, driver: Driver) -> None:
     """Says how the episode ended where it ended, from that moment on, and marks a robot that was held."""
-    import rerun as rr
-
     recording = driver.recording
-    end = recording.states[-1:, :2].astype(np.float32)
     words = [f"{driver.name}: {recording.outcome}" if driver.name else recording.outcome]
-    lifted, flat = over_ground(recording, end), on_map(recording.grid, end)
-    lifted[:, 2] += 0.6
     stream.set_time(TIMELINE, duration=recording.end_s)
-    for root, mark in (
-        ("world", rr.Points3D(lifted, labels=words, show_labels=True, colors=[driver.colour], radii=0.05)),
-        ("map/overlay", rr.Points2D(flat, labels=words, show_labels=True, colors=[driver.colour], radii=0.1)),
-    ):
-        stream.log(driver.entity(root, "outcome"), mark)
-    place = immobilised_at(recording.about, recording.states[:, :2])
-    if place is None:
+    log_both(
+        stream, recording, driver.entities("outcome"), POINTS, [recording.track[-1]],
+        (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[bytes_of(driver.colour)],
+    )  # fmt: skip
+    if recording.immobilised_at is None:
         return
-    cross = (place + _CROSS_M * _CROSS).astype(np.float32)
-    lifted, flat = over_ground(recording, cross), on_map(recording.grid, cross)
-    lifted[:, 2] += 0.3
-    for entity, crossed in (
-        (driver.entity("world", "immobilised"), rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12)),
-        (
-            driver.entity("map/overlay", "immobilised/edge"),
-            rr.LineStrips2D([flat], colors=[_EDGE], radii=0.55, draw_order=40),
-        ),
-        (
-            driver.entity("map/overlay", "immobilised/cross"),
-            rr.LineStrips2D([flat], colors=[_MARK], radii=0.3, draw_order=41),
-        ),
-    ):
-        stream.log(entity, crossed)
+    cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
+    lifted, flat = over_ground(recording, cross, LIFT_M + 0.3), on_map(recording.grid, cross)
+    world, overlay = driver.entities("immobilised")
+    stream.log(world, rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12))
+    for name, colour, radius, order in (("edge", _EDGE, 0.55, 40), ("cross", _MARK, 0.3, 41)):
+        crossed = rr.LineStrips2D([flat], colors=[colour], radii=radius, draw_order=order)
+        stream.log(f"{overlay}/{name}", crossed)

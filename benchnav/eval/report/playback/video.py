@@ -7,8 +7,8 @@ import numpy as np
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import replacing
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.frames import Frames
-from benchnav.eval.report.recorded.recording import Recording
 
 FRAMES_A_SECOND = 20
 # Seconds of an episode in a second of video.

@@ -7,34 +7,33 @@ import pytest
 from matplotlib.figure import Figure
 
 from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, save_twice
-from benchnav.eval.report.charts.maps import MOST_PANELS, choose_snapshots, trajectory_figure
-from benchnav.eval.report.recorded.ground import field_colours, hatching, outline
-from benchnav.eval.report.recorded.recording import take_snapshot
-from benchnav.eval.report.recorded.snapshot import Snapshot
+from benchnav.eval.recording import Recording
+from benchnav.eval.report.charts.maps import MOST_PANELS, choose_recordings, trajectory_figure
+from benchnav.eval.report.layers import field_colours, hatching, outline
 from tests.eval.report import made
 
 
-def snapshot(condition: str = "t", map_index: int = 0, seed: int = 0, **labels: str) -> Snapshot:
+def recording(condition: str = "t", map_index: int = 0, seed: int = 0, **labels: str) -> Recording:
     about = made.condition(**labels) | {"condition": condition, "map": str(map_index), "seed": str(seed)}
-    return take_snapshot(made.recording(about=about | {"realisation": "0", "outcome": "out_of_bounds"}))
+    return made.recording(about=about | {"realisation": "0", "outcome": "out_of_bounds"})
 
 
-def chosen(snapshots: list[Snapshot], conditions: list[str]) -> list[tuple[str, str]]:
-    return [(s.about["condition"], s.about["map"]) for s in choose_snapshots(snapshots, conditions)]
+def chosen(recordings: list[Recording], conditions: list[str]) -> list[tuple[str, str]]:
+    return [(s.about["condition"], s.about["map"]) for s in choose_recordings(recordings, conditions)]
 
 
 def test_one_a_condition_on_one_map_in_the_tables_order() -> None:
-    every = [snapshot("b", 10), snapshot("b", 9), snapshot("a", 9), snapshot("a", 10), snapshot("c", 3)]
+    every = [recording("b", 10), recording("b", 9), recording("a", 9), recording("a", 10), recording("c", 3)]
     assert chosen(every, ["c", "b", "a"]) == [("c", "3"), ("b", "9"), ("a", "9")]
     assert chosen(every, ["a", "b"]) == [("a", "9"), ("b", "9")]
-    mixed = [snapshot("a", 2), snapshot("b", 1), snapshot("b", 2)]
+    mixed = [recording("a", 2), recording("b", 1), recording("b", 2)]
     assert chosen(mixed, ["a", "b"]) == [("a", "2"), ("b", "2")]
     assert chosen([], ["a"]) == []
 
 
 def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do_not() -> None:
-    def ended(condition: str, map_index: int, outcome: str) -> Snapshot:
-        made = snapshot(condition, map_index)
+    def ended(condition: str, map_index: int, outcome: str) -> Recording:
+        made = recording(condition, map_index)
         return replace(made, about={**made.about, "outcome": outcome})
 
     outcomes = {("a", 1): "success", ("b", 1): "success", ("a", 2): "success", ("b", 2): "immobilised"}
@@ -53,7 +52,7 @@ def test_the_first_map_on_which_outcomes_differ_goes_before_one_on_which_they_do
 
 def test_no_more_than_can_be_seen() -> None:
     conditions = [f"t{k}" for k in range(12)]
-    assert len(chosen([snapshot(condition) for condition in conditions], conditions)) == MOST_PANELS
+    assert len(chosen([recording(condition) for condition in conditions], conditions)) == MOST_PANELS
 
 
 def shown(figure: Figure) -> list:  # type: ignore[type-arg]
@@ -64,8 +63,8 @@ SOFT_WORDS = "soft ground, which does not show"
 
 
 @pytest.mark.parametrize("count", [1, 3, 6])
-def test_every_snapshot_has_two_panels_of_its_map(count: int) -> None:
-    figure = trajectory_figure([snapshot()] * count)
+def test_every_episode_has_two_panels_of_its_map(count: int) -> None:
+    figure = trajectory_figure([recording()] * count)
     assert len(shown(figure)) == 2 * count
     for axes in shown(figure):
         assert (axes.get_xlim(), axes.get_ylim()) == ((0, 30), (0, 20))
@@ -78,7 +77,7 @@ def test_every_snapshot_has_two_panels_of_its_map(count: int) -> None:
 
 
 def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
-    taken = snapshot()
+    taken = recording()
     above, below = shown(trajectory_figure([taken]))
     now = taken.now
     assert above.get_title() == f"MPPI, cvar, std 0\nt = {now / 10:g} s; outcome: out of bounds"
@@ -98,10 +97,10 @@ def test_what_is_drawn_is_what_was_planned_and_driven_by_then() -> None:
     np.testing.assert_array_equal(np.isfinite(np.ma.filled(closed, np.nan)), ~taken.free)
 
 
-def held(world: str = "stakes", **changes: Any) -> Snapshot:
+def held(world: str = "stakes", **changes: Any) -> Recording:
     recording = made.held_recording(170)
     changes = {"about": recording.about | {"world": world}} | changes
-    return take_snapshot(replace(recording, **changes))
+    return replace(recording, **changes)
 
 
 def test_λ_as_it_was_has_a_third_panel_with_the_whole_path_and_where_it_ended() -> None:
@@ -152,7 +151,7 @@ def test_a_robot_that_was_not_held_has_no_mark_of_it() -> None:
 
 
 def test_only_panels_whose_λ_stayed_have_a_third() -> None:
-    figure = trajectory_figure([snapshot(), held(), snapshot(), snapshot(), held()])
+    figure = trajectory_figure([recording(), held(), recording(), recording(), held()])
     titles = [axes.get_title() for axes in shown(figure)]
     assert len(titles) == 5 * 2 + 2
     assert sum("as it was" in title for title in titles) == 2
@@ -175,7 +174,7 @@ def test_ground_is_not_drawn_where_λ_was_resampled() -> None:
 
 def test_titles_tell_models_and_worlds_apart_where_they_differ() -> None:
     def titles(*labels: dict[str, str]) -> list[str]:
-        figure = trajectory_figure([snapshot(**one) for one in labels])
+        figure = trajectory_figure([recording(**one) for one in labels])
         return [axes.get_title().split("\n")[0] for axes in shown(figure) if "outcome" in axes.get_title()]
 
     blind = {"planner": "straight", "model": "–", "risk": "–"}
@@ -204,21 +203,21 @@ def test_the_legend_names_what_the_ground_has(changes: dict[str, Any], names: li
 
 
 def test_the_legend_names_layers_that_are_there() -> None:
-    names = names_in_legend(trajectory_figure([snapshot()]))
+    names = names_in_legend(trajectory_figure([recording()]))
     marks = ["start", "goal", "robot", "driven; above in the colour of the observed λ"]
     assert names == ["samples", "reference path", "planned", *marks, "not free"]
-    taken = snapshot()
+    taken = recording()
     everywhere = replace(taken, free=np.ones_like(taken.free))
     assert "not free" not in names_in_legend(trajectory_figure([everywhere]))
 
 
 def test_whose_map_of_λ_it_is_stands_above_it() -> None:
     blind = {"planner": "straight", "model": "–", "risk": "–"}
-    *_, given, none = shown(trajectory_figure([snapshot(), snapshot(**blind)]))
+    *_, given, none = shown(trajectory_figure([recording(), recording(**blind)]))
     assert given.get_title() == "λ̂ given to the planner"
     assert none.get_title() == "E[λ] in truth; the planner is given nothing"
 
 
 def test_an_episode_that_ended_at_once_can_be_drawn(tmp_path: Path) -> None:
-    save_twice(trajectory_figure([take_snapshot(made.recording(0, plans=()))]), tmp_path / "a.png")
+    save_twice(trajectory_figure([made.recording(0, plans=())]), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 1000

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, flatten, sweep_name
+from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
 from tests.eval.report import made
 
 
@@ -18,10 +18,6 @@ def condition(split: str = "test/std", level: float | None = None, **options: An
 def found(*conditions: dict[str, Any]) -> dict[str, list[tuple[tuple[float, ...], tuple[str, ...]]]]:
     sweeps = find_sweeps({str(place): about for place, about in enumerate(conditions)})
     return {sweep.number: [(line.values, line.conditions) for line in sweep.lines] for sweep in sweeps}
-
-
-def test_flatten() -> None:
-    assert flatten({"a": {"b": {"c": 1}, "d": [1, 2]}, "e": None}) == {"a.b.c": 1, "a.d": [1, 2], "e": None}
 
 
 def test_three_values_of_one_number_make_a_line_and_are_put_in_order() -> None:

@@ -5,10 +5,10 @@ import matplotlib
 import numpy as np
 import pytest
 
+from benchnav.core.figures import bytes_of
+from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
+from benchnav.eval.report.layers import IMMOBILISING, field_colours, hatching, outline
 from benchnav.eval.report.playback.rerun_file import arrange, describe, drivers_of, map_views, write_rerun
-from benchnav.eval.report.recorded.drawn_plan import MOST_POINTS, DrawnPlan, thinned
-from benchnav.eval.report.recorded.ground import IMMOBILISING, field_colours, hatching, outline
-from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
 
@@ -97,7 +97,7 @@ def test_maps_are_those_of_the_recording(tmp_path: Path) -> None:
     assert recording.field is not None
     shown = image(path, "/map/field")
     np.testing.assert_array_equal(shown, field_colours(recording.field, recording.immobilising))
-    np.testing.assert_array_equal((shown == IMMOBILISING).all(axis=-1), recording.immobilising)
+    np.testing.assert_array_equal((shown == bytes_of(IMMOBILISING)[:3]).all(axis=-1), recording.immobilising)
     viridis = matplotlib.colormaps["viridis"]
     expected = np.round(255 * viridis(recording.true_mean)[..., :3])
     np.testing.assert_array_equal(image(path, "/map/true_mean"), expected)

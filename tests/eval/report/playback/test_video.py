@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from benchnav.core.errors import ConfigError
+from benchnav.core.figures import bytes_of
+from benchnav.eval.recording import Recording
 from benchnav.eval.report.playback.frames import ROBOT, Frames
 from benchnav.eval.report.playback.video import FRAMES_A_SECOND, HOLD_S, SPEED, frame_times, write_video
-from benchnav.eval.report.recorded.recording import Recording
 from tests.eval.report import made
 
 
@@ -33,7 +34,7 @@ def test_a_moment_lasts_a_frame_and_the_end_a_while() -> None:
 def robot_at(frame: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
     """Where the robot's mark is in the upper panel of a frame: column and row of its middle."""
     left, right = panel
-    own = np.abs(frame[:, left:right].astype(int) - ROBOT).sum(axis=-1) < 60
+    own = np.abs(frame[:, left:right].astype(int) - bytes_of(ROBOT)[:3]).sum(axis=-1) < 60
     rows, columns = np.nonzero(own[: frame.shape[0] // 2])
     return np.array([columns.mean() + left, rows.mean()])
 
@@ -58,7 +59,9 @@ def test_a_video_has_its_frames_size_and_duration_and_the_robot_where_the_path_s
     for number in (0, 5, 12, len(times) - 1):
         for place, recording in enumerate((first, second)):
             step = min(round(times[number] / recording.dt_s), len(recording.traversability))
-            expected = frames.pixel_of(place, *recording.states[step, :2])
+            panel = frames._columns[place].panels[0]
+            x, y = panel.transData.transform(recording.states[step, :2])
+            expected = (x, frames.size[1] - y)
             found = robot_at(decoded[number], ((0, half), (half, 2 * half))[place])
             np.testing.assert_allclose(found, expected, atol=5)
 
@@ -72,7 +75,7 @@ def test_the_robot_points_where_it_heads() -> None:
                             ("north", replace(turned, states=states))):  # fmt: skip
         frames = Frames([recording])
         shown = robot_at(frames.draw(0.1), (0, frames.size[0]))
-        own = np.abs(frames.draw(0.1).astype(int) - ROBOT).sum(axis=-1) < 60
+        own = np.abs(frames.draw(0.1).astype(int) - bytes_of(ROBOT)[:3]).sum(axis=-1) < 60
         rows, columns = np.nonzero(own[: frames.size[1] // 2])
         middle[name] = (np.ptp(columns), np.ptp(rows))
         assert np.isfinite(shown).all()

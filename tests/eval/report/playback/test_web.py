@@ -13,14 +13,15 @@ from urllib.request import urlopen
 import psutil
 import pytest
 
-from benchnav.eval.report.playback.files import write_playback
+from benchnav.eval.report.playback.rerun_file import write_rerun
 from benchnav.eval.report.playback.web import HOST, _free_port
 from tests.eval.report import made
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 def test_the_viewer_is_served_here_alone_until_it_is_told_to_end(tmp_path: Path, end: signal.Signals) -> None:
-    path = write_playback(tmp_path, "one", made.recording(5))
+    path = tmp_path / "one.rrd"
+    write_rerun([made.recording(5)], path)
     code = (
         "import sys; from pathlib import Path; from benchnav.eval.report.playback.web import serve; "
         "serve(Path(sys.argv[1]))"

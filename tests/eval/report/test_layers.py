@@ -6,12 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from matplotlib.colors import to_rgb
 
-from benchnav.eval.report.recorded.ground import (
+from benchnav.core.figures import bytes_of
+from benchnav.eval.report.layers import (
     IMMOBILISING,
     field_colours,
     hatching,
-    immobilised_at,
     outline,
 )
 
@@ -44,7 +45,7 @@ def lab(colours: np.ndarray, seen: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seen", SEEN)
 def test_what_immobilises_a_robot_has_a_colour_that_no_traversability_has(seen: str) -> None:
     shades = field_colours(np.linspace(0, 1, 256)[None], np.zeros((1, 256), bool))[0] / 255
-    away = lab(shades, SEEN[seen]) - lab(np.array(IMMOBILISING) / 255, SEEN[seen])
+    away = lab(shades, SEEN[seen]) - lab(np.array(to_rgb(IMMOBILISING)), SEEN[seen])
     # A difference of 2.3 can just be seen.
     assert np.linalg.norm(away, axis=1).min() > 30
 
@@ -56,7 +57,7 @@ def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds
     assert (colours.dtype, colours.shape) == (np.uint8, (5, 7, 3))
     usual = np.round(255 * matplotlib.colormaps["viridis"](field)[..., :3])
     np.testing.assert_array_equal(colours[~immobilising], usual[~immobilising])
-    assert (colours[immobilising] == IMMOBILISING).all()
+    assert (colours[immobilising] == bytes_of(IMMOBILISING)[:3]).all()
 
 
 def cells_beside(region: np.ndarray, edge: np.ndarray, resolution_m: float) -> list[bool]:
@@ -99,12 +100,3 @@ def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
         assert (row == line).sum() == 3
     starts = {tuple(point) for point in lines[:, 0]}
     assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)
-
-
-@pytest.mark.parametrize("outcome", ["immobilised", "stuck", "success"])
-def test_an_immobilised_robot_is_where_its_episode_ended(outcome: str) -> None:
-    place = immobilised_at({"outcome": outcome}, np.array([[1.0, 2.0], [3.0, 4.0]]))
-    if outcome == "immobilised":
-        np.testing.assert_array_equal(place, [3.0, 4.0])
-    else:
-        assert place is None

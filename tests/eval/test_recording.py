@@ -1,12 +1,21 @@
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.report.recorded.drawn_plan import DrawnPlan, thinned
-from benchnav.eval.report.recorded.recording import Recording, read_snapshots, take_snapshot
+from benchnav.eval.recording import (
+    DrawnPlan,
+    Recording,
+    drawing_interval,
+    drawn_plan,
+    read_recordings,
+    thinned,
+)
+from benchnav.eval.report.layers import STYLES
+from benchnav.planning.planners.planner import Plan
 from tests.eval.report import made
 
 
@@ -20,28 +29,16 @@ from tests.eval.report import made
         (42, 0.1, 15.0, 40),  # an episode that had ended by then
     ],
 )
-def test_a_snapshot_is_of_the_last_plan_by_its_time(
-    steps: int, dt_s: float, time_s: float, step: int
-) -> None:
+def test_a_moment_has_the_last_plan_by_its_time(steps: int, dt_s: float, time_s: float, step: int) -> None:
     recording = made.recording(steps, dt_s)
-    snapshot = take_snapshot(recording, time_s)
-    assert (snapshot.plan.step, snapshot.now) == (step, step)
-    assert snapshot.time_s == pytest.approx(step * dt_s)
-    np.testing.assert_array_equal(snapshot.track, recording.states[:, :2])
-    np.testing.assert_array_equal(snapshot.extent_m, [30, 20])
-
-
-def test_a_snapshot_is_of_the_recordings_own_ground() -> None:
-    recording = made.held_recording()
-    snapshot = take_snapshot(recording)
-    for name in ("field", "soft", "immobilising"):
-        np.testing.assert_array_equal(getattr(snapshot, name), getattr(recording, name))
-    assert take_snapshot(made.recording()).field is None
+    assert recording.plan_at(time_s).step == step
+    np.testing.assert_array_equal(recording.track, recording.states[:, :2])
+    assert recording.grid.extent_m == (30, 20)
 
 
 def test_fifteen_seconds_is_the_moment_and_half_way_of_a_short_episode() -> None:
-    assert take_snapshot(made.recording(400, 0.1)).time_s == pytest.approx(15)
-    assert take_snapshot(made.recording(200, 0.1)).time_s == pytest.approx(10)
+    assert (made.recording(400, 0.1).plan.step, made.recording(400, 0.1).now) == (150, 150)
+    assert made.recording(200, 0.1).now == 100
 
 
 def test_plans_after_the_end_are_not_the_episodes_own() -> None:
@@ -52,10 +49,10 @@ def test_plans_after_the_end_are_not_the_episodes_own() -> None:
     assert [plan.step for plan in at_once.own_plans] == [0]
 
 
-def test_an_episode_that_ended_before_it_was_planned_has_a_snapshot_all_the_same() -> None:
-    snapshot = take_snapshot(made.recording(0, plans=()))
-    assert (snapshot.now, snapshot.time_s) == (0, 0)
-    assert not any(snapshot.plan.lines.values())
+def test_an_episode_that_ended_before_it_was_planned_has_a_moment_all_the_same() -> None:
+    recording = made.recording(0, plans=())
+    assert recording.now == 0
+    assert not any(recording.plan.lines.values())
 
 
 def test_its_title_says_what_is_seen() -> None:
@@ -87,7 +84,7 @@ def test_a_recording_comes_back_as_it_was(recording: Recording, tmp_path: Path) 
         elif item.name != "plans":
             assert after == before
     # The plan of figures is whole; the others are thinned, as the viewer is given them.
-    moment = recording.plan_at(recording.moment_s).step
+    moment = recording.plan.step
     for before, after in zip(recording.own_plans, again.plans, strict=True):
         expected = before if before.step == moment else thinned(before)
         assert (after.step, set(after.lines)) == (before.step, set(before.lines))
@@ -115,6 +112,55 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for damage in (b"", b"no zip", whole[: len(whole) // 2], whole[:500] + bytes(400) + whole[900:]):
         path.write_bytes(damage)
-        for read in (lambda: Recording.load(path), lambda: read_snapshots(tmp_path)):
+        for read in (lambda: Recording.load(path), lambda: read_recordings(tmp_path)):
             with pytest.raises(ConfigError, match=r"a\.npz is damaged"):
                 read()
+
+
+def test_points_that_are_not_used_and_lines_without_two_are_left_out() -> None:
+    nan = torch.nan
+    samples = torch.tensor(
+        [[[0.0, 1.0], [2.0, 3.0], [nan, nan]], [[4.0, 5.0], [nan, nan], [nan, nan]], [[nan, nan]] * 3]
+    )
+    plan = drawn_plan(7, {"samples": samples, "tree": torch.empty(0, 0, 2)})
+    assert plan.step == 7
+    assert plan.lines["tree"] == []
+    (line,) = plan.lines["samples"]
+    np.testing.assert_array_equal(line, [[0, 1], [2, 3]])
+
+
+def test_every_layer_of_a_plan_has_a_style_and_the_members_own_lines() -> None:
+    path = torch.arange(24.0).reshape(3, 4, 2)
+    lines = drawn_plan(0, Plan.empty(3, path=path).lines(1)).lines
+    assert set(lines) == set(STYLES)
+    np.testing.assert_array_equal(lines["path"][0], path[1])
+    assert [name for name, layer in lines.items() if layer] == ["path"]
+
+
+@pytest.mark.parametrize(("dt_s", "steps"), [(0.1, 5), (0.05, 10), (0.3, 2), (2.0, 1)])
+def test_plans_are_drawn_twice_a_second(dt_s: float, steps: int) -> None:
+    assert drawing_interval(dt_s) == steps
+
+
+@pytest.mark.parametrize("outcome", ["immobilised", "stuck", "success"])
+def test_an_immobilised_robot_is_where_its_episode_ended(outcome: str) -> None:
+    recording = made.recording(9)
+    recording = replace(recording, about={**recording.about, "outcome": outcome})
+    if outcome == "immobilised":
+        np.testing.assert_array_equal(recording.immobilised_at, recording.states[-1, :2])
+    else:
+        assert recording.immobilised_at is None
+
+
+@pytest.mark.parametrize(
+    ("place", "cell"),
+    [((29.9, 0.1), (0, 59)), ((0.2, 19.9), (39, 0)), ((30.1, 1.0), None), ((1.0, -0.1), None)],
+)
+def test_what_was_predicted_at_the_end_is_that_of_the_cell_it_lies_in(
+    place: tuple[float, float], cell: tuple[int, int] | None
+) -> None:
+    recording = made.recording(3)
+    states = recording.states.copy()
+    states[-1, :2] = place
+    found = replace(recording, states=states).predicted_at_end
+    assert np.isnan(found) if cell is None else found == recording.predicted[cell]

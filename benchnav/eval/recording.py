@@ -1,0 +1,279 @@
+"""An episode with all that is shown of it, and the file that holds it.
+
+Running fills it. Viewer files, videos, comparisons and figures are made of it alone, without dataset or prediction.
+Letters in shapes: N steps, H×W cells, S state and A action dimensions, P points.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from torch import Tensor
+
+from benchnav.core.grid import Grid
+from benchnav.core.store import replacing
+from benchnav.eval.folder.folder import damaged
+from benchnav.planning.world.outcome import Outcome
+
+# The ground that whole driven paths of a run are shown on, in its folder.
+GROUND = "ground.npz"
+# What one map under one draw of λ is known by.
+MAP = ["data", "scenario", "world", "seed", "realisation", "map"]
+# The moment that figures show: about half-way for most episodes; the paper shows 25 s, when robots here have mostly
+# arrived.
+MOMENT_S = 15.0
+# Of a layer of a plan in a recording: keeps long episodes of planners with many thoughts within 3 MB.
+MOST_POINTS = 160
+
+_DRAW_EVERY_S = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnPlan:
+    """What a planner had in mind at one step of one episode.
+
+    Args:
+        step: the step.
+        lines: by layer its polylines, (x, y) in metres, each of shape [P, 2] with P ≥ 2.
+    """
+
+    step: int
+    lines: Mapping[str, Sequence[np.ndarray]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """A map under one draw of λ: what driven paths are shown on.
+
+    Args:
+        about: what it is known by: labels of a condition, `seed`, `realisation` and `map` among them.
+        resolution_m: edge length of a cell.
+        rgb: uint8, shape [3, H, W].
+        field: λ as it was through the episode, shape [H, W]; None where it was resampled.
+        immobilising: cells of the field that immobilise a robot, bool, shape [H, W].
+        goal_m: (x, y).
+    """
+
+    about: Mapping[str, Any]
+    resolution_m: float
+    rgb: np.ndarray
+    field: np.ndarray | None
+    immobilising: np.ndarray
+    goal_m: np.ndarray
+
+    _REMEDY: ClassVar[str] = "Remove it; the run's command makes it again."
+
+    @property
+    def grid(self) -> Grid:
+        """The map's."""
+        height, width = self.immobilising.shape
+        return Grid(height, width, self.resolution_m)
+
+    def save(self, path: Path) -> None:
+        """Writes it to an `.npz` file, whole or not at all: arrays by their names, all else as JSON."""
+        stored = self._stored()
+        arrays: dict[str, Any] = {name: v for name, v in stored.items() if isinstance(v, np.ndarray)}
+        rest = json.dumps({name: value for name, value in stored.items() if name not in arrays})
+        with replacing(path) as partial, open(partial, "wb") as file:
+            np.savez_compressed(file, scalars=np.array(rest), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Reads what `save` wrote.
+
+        Raises:
+            ConfigError: the file is damaged.
+        """
+        with damaged(path, cls._REMEDY), np.load(path, allow_pickle=False) as stored:
+            values = dict(stored)
+            return cls._read(json.loads(str(values.pop("scalars"))) | values)
+
+    def _stored(self) -> dict[str, Any]:
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    @classmethod
+    def _read(cls, values: dict[str, Any]) -> Self:
+        return cls(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording(Ground):
+    """An episode of any robot, from its start to its end; `about` holds `condition` and `outcome` too, all as text.
+
+    Args:
+        elevation_m: shape [H, W].
+        true_mean: E[λ] of the truth, shape [H, W].
+        soft: ground with soft spots that do not show, bool, shape [H, W].
+        predicted: λ̂, the map the planner was given, shape [H, W].
+        free: S_free, bool, shape [H, W].
+        free_by: the map that decides what is free, `risk` or `mean`.
+        free_above: what that map has to exceed.
+        dt_s: time step.
+        time_budget_s: T.
+        action_names: what each action is, with its unit, A of them.
+        states: robot states beginning with (x, y, θ), shape [N + 1, S].
+        actions: shape [N, A].
+        traversability: observed λ, shape [N].
+        plans: what was planned, in order of steps; those after the episode's end are left out.
+    """
+
+    elevation_m: np.ndarray
+    true_mean: np.ndarray
+    soft: np.ndarray
+    predicted: np.ndarray
+    free: np.ndarray
+    free_by: str
+    free_above: float
+    dt_s: float
+    time_budget_s: float
+    action_names: tuple[str, ...]
+    states: np.ndarray
+    actions: np.ndarray
+    traversability: np.ndarray
+    plans: Sequence[DrawnPlan] = ()
+
+    _REMEDY: ClassVar[str] = "Remove it and its .rrd; `replay` makes them again."
+
+    @property
+    def title(self) -> str:
+        """What it is, for people."""
+        named = ("planner", "risk", "model", "scenario", "map", "outcome")
+        return ", ".join(self.about[name] for name in named)
+
+    @property
+    def outcome(self) -> str:
+        """How it ended, in words."""
+        return self.about["outcome"].replace("_", " ")
+
+    @property
+    def track(self) -> np.ndarray:
+        """Driven positions to the end, shape [N + 1, 2]."""
+        return self.states[:, :2]
+
+    @property
+    def end_s(self) -> float:
+        """When it ended."""
+        return len(self.traversability) * self.dt_s
+
+    @property
+    def immobilised_at(self) -> np.ndarray | None:
+        """Where it ended on ground that immobilises a robot, (x, y); None where it ended otherwise."""
+        return self.track[-1] if self.about["outcome"] == Outcome.IMMOBILISED.name.lower() else None
+
+    @property
+    def predicted_at_end(self) -> float:
+        """λ̂ where it ended; NaN outside the map."""
+        column, row = np.floor(self.track[-1].astype(np.float64) / self.resolution_m).astype(int)
+        inside = 0 <= row < self.grid.height and 0 <= column < self.grid.width
+        return float(self.predicted[row, column]) if inside else float("nan")
+
+    @property
+    def own_plans(self) -> list[DrawnPlan]:
+        """Plans up to the last step that was taken; the first is one of them, also where none was taken."""
+        last = max(len(self.traversability) - 1, 0)
+        return [plan for plan in self.plans if plan.step <= last]
+
+    @property
+    def plan(self) -> DrawnPlan:
+        """The plan that figures show: that of `MOMENT_S`, or of half-way where the episode was short."""
+        return self.plan_at(min(MOMENT_S, self.end_s / 2))
+
+    @property
+    def now(self) -> int:
+        """The step that figures show, at most the last."""
+        return min(self.plan.step, len(self.traversability))
+
+    def plan_at(self, time_s: float) -> DrawnPlan:
+        """The last plan that was drawn by a time; an empty one where there is none."""
+        due = time_s / self.dt_s + 1e-6
+        known = [plan for plan in self.own_plans if plan.step <= due]
+        return known[-1] if known else DrawnPlan(step=0, lines={})
+
+    def _stored(self) -> dict[str, Any]:
+        """Its values; plans are thinned but the one of figures, and packed into few arrays."""
+        values, shown = super()._stored(), self.plan.step
+        del values["plans"]
+        return values | _pack([plan if plan.step == shown else thinned(plan) for plan in self.own_plans])
+
+    @classmethod
+    def _read(cls, values: dict[str, Any]) -> Self:
+        packed = {name: values.pop(name) for name in list(values) if name.startswith("plans:")}
+        return cls(**values | {"plans": _unpack(packed), "action_names": tuple(values["action_names"])})
+
+
+def read_recordings(folder: Path) -> list[Recording]:
+    """Reads every recorded episode of a run."""
+    return [Recording.load(path) for path in sorted((folder / "playback").glob("*.npz"))]
+
+
+def drawing_interval(dt_s: float) -> int:
+    """Steps from one plan that is drawn to the next."""
+    return max(1, round(_DRAW_EVERY_S / dt_s))
+
+
+def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
+    """Keeps of a plan what can be drawn: points that are numbers, lines of at least two of them.
+
+    Args:
+        step: when it was planned.
+        layers: from `Plan.lines`, polylines of shape [lines, P, 2] by layer; unused points are NaN.
+    """
+    lines = {}
+    for name, layer in layers.items():
+        kept = [line[np.isfinite(line).all(axis=1)] for line in layer.detach().cpu().numpy()]
+        lines[name] = [line for line in kept if len(line) > 1]
+    return DrawnPlan(step=step, lines=lines)
+
+
+def thinned(plan: DrawnPlan) -> DrawnPlan:
+    """Leaves out lines and points within lines where a layer has too many; what is thin stays as it is."""
+    return DrawnPlan(step=plan.step, lines={name: _thinned(lines) for name, lines in plan.lines.items()})
+
+
+def _thinned(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
+    lines = [lines[place] for place in _spread(len(lines), MOST_POINTS // 2)]
+    most = MOST_POINTS // max(len(lines), 1)
+    return [line[_spread(len(line), most)] for line in lines]
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """Indices of so many, evenly spread, the first and the last among them; of all where they are few."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int)
+
+
+def _pack(plans: Sequence[DrawnPlan]) -> dict[str, np.ndarray]:
+    """Packs plans, in order of steps, into few arrays, which `_unpack` takes apart.
+
+    Returns:
+        `plans:steps`; by layer all points as `plans:points/LAYER`, points of each line as `plans:sizes/LAYER`, and
+        lines of each plan as `plans:counts/LAYER`.
+    """
+    arrays: dict[str, np.ndarray] = {"plans:steps": np.array([plan.step for plan in plans], np.int64)}
+    for name in dict.fromkeys(name for plan in plans for name in plan.lines):
+        layers = [plan.lines.get(name, ()) for plan in plans]
+        lines = [line for layer in layers for line in layer]
+        arrays[f"plans:points/{name}"] = np.concatenate([np.empty((0, 2), np.float32), *lines])
+        arrays[f"plans:sizes/{name}"] = np.array([len(line) for line in lines], np.int64)
+        arrays[f"plans:counts/{name}"] = np.array([len(layer) for layer in layers], np.int64)
+    return arrays
+
+
+def _unpack(arrays: Mapping[str, np.ndarray]) -> list[DrawnPlan]:
+    points, sizes, counts = (
+        {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
+        for kind in ("plans:points/", "plans:sizes/", "plans:counts/")
+    )
+    layers = {name: _cut(_cut(points[name], sizes[name]), counts[name]) for name in points}
+    return [
+        DrawnPlan(step=int(step), lines={name: lines[place] for name, lines in layers.items()})
+        for place, step in enumerate(arrays["plans:steps"])
+    ]
+
+
+def _cut(values: Any, sizes: np.ndarray) -> list[Any]:
+    """Cuts a sequence into consecutive pieces of given sizes."""
+    ends = sizes.cumsum()
+    return [values[end - size : end] for end, size in zip(ends, sizes, strict=True)]

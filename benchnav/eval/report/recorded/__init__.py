@@ -1,1 +1,0 @@
-"""What was recorded of an episode, as figures and playback read it."""
