@@ -9,7 +9,6 @@ a batch has, nor on what the process compiled before, since compiled and eager r
 bits and much in speed.
 """
 
-import logging
 import os
 import shutil
 import sys
@@ -18,6 +17,8 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import torch
+
+from benchnav.core.errors import quiet
 
 R = TypeVar("R")
 
@@ -59,8 +60,10 @@ class Fused(Generic[R]):
 
     def __call__(self, *args: Any) -> R:
         """Calls the function."""
-        if self.compiled is None and not self._wanted(args[0]):
-            self.compiled = False
+        if self.compiled is None:
+            worth = worth_compiling(self._rollouts, self._least, args[0].device)
+            if torch._dynamo.config.disable or not worth:
+                self.compiled = False
         if self.compiled is False:
             return self._function(*args)
         if self._fused is None:
@@ -98,27 +101,18 @@ class Fused(Generic[R]):
             torch.get_num_threads(),
         ]
         for place, arg in enumerate(args):
-            if not isinstance(arg, torch.Tensor):
-                found.append(_key(arg))
-            elif place in self._batched:
-                found.append((arg.shape[0] > 1, arg.shape[1:], arg.dtype, arg.device))
+            if isinstance(arg, torch.Tensor):
+                shape = (len(arg) > 1, arg.shape[1:]) if place in self._batched else arg.shape
+                found.append((shape, arg.dtype, arg.device))
             else:
-                found.append((arg.shape, arg.dtype, arg.device))
+                found.append(_key(arg))
         return tuple(found)
 
-    def _mark(self, args: tuple[object, ...]) -> None:
+    def _mark(self, args: tuple[Any, ...]) -> None:
         """Lets the number of episodes be any, but one."""
         for place in self._batched:
-            tensor = args[place]
-            assert isinstance(tensor, torch.Tensor)
-            if len(tensor) > 1:
-                torch._dynamo.maybe_mark_dynamic(tensor, 0)
-
-    def _wanted(self, example: object) -> bool:
-        assert isinstance(example, torch.Tensor)
-        return (
-            worth_compiling(self._rollouts, self._least, example.device) and not torch._dynamo.config.disable
-        )
+            if len(args[place]) > 1:
+                torch._dynamo.maybe_mark_dynamic(args[place], 0)
 
 
 @contextmanager
@@ -130,24 +124,19 @@ def _compiling(checked: bool) -> Iterator[None]:
     """
     import torch._inductor.config  # imported here: it takes a second
 
-    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
-    notices = logging.getLogger("torch.utils.cpp_extension")
-    level = notices.level
-    notices.setLevel(logging.ERROR)
-    try:
-        with (
-            # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
-            torch._dynamo.config.patch(
-                recompile_limit=sys.maxsize,
-                accumulated_recompile_limit=sys.maxsize,
-                fail_on_recompile_limit_hit=True,
-                suppress_errors=False,
-            ),
-            torch._inductor.config.patch(assert_indirect_indexing=checked),
-        ):
-            yield
-    finally:
-        notices.setLevel(level)
+    with (
+        # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
+        quiet("torch.utils.cpp_extension"),
+        # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
+        torch._dynamo.config.patch(
+            recompile_limit=sys.maxsize,
+            accumulated_recompile_limit=sys.maxsize,
+            fail_on_recompile_limit_hit=True,
+            suppress_errors=False,
+        ),
+        torch._inductor.config.patch(assert_indirect_indexing=checked),
+    ):
+        yield
 
 
 def _key(arg: object) -> object:
