@@ -395,7 +395,7 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
 def _listed_files(target: Any) -> Iterator[str]:
     """What a part lists as `files`, each followed by its digest."""
     listed = getattr(target, "files", ())
-    if not isinstance(listed, list | tuple) or "files" in parameters(target):
+    if not listed or not isinstance(listed, list | tuple) or "files" in parameters(target):
         return
     module = sys.modules.get(str(getattr(target, "__module__", "")))
     folder = Path(getattr(module, "__file__", None) or "").parent
