@@ -151,7 +151,7 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
     if config and isinstance(value, Mapping):
         base = now if isinstance(now, config) else None
-        before = base and {f.name: getattr(base, f.name) for f in fields(base)}
+        before = {f.name: getattr(base, f.name) for f in fields(base)} if base is not None else None
         given = read_options(list_options(config), value, name, key, before, getattr(config, "gone", {}))
         return call(name(key), partial(replace, base) if base else config, given)
     if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):

@@ -155,7 +155,7 @@ def digest_of_path(path: Path) -> str:
 
 def digest_of_file_part(path: Path, content: bytes) -> str:
     """Digest of a file that stands alone and of the modules that it imports; see `imported_sources`."""
-    return _digest_of_sources({"": content} | imported_sources(path.parent, [("", content)]))
+    return _digest_of_sources({"": content} | imported_sources(path.parent, "", content))
 
 
 def digest_of_target(target: Callable[..., Any]) -> str:
@@ -184,7 +184,7 @@ def digest_of_modules(names: Iterable[str]) -> str:
         file = Path(getattr(module, "__file__", None) or "")
         if file.is_file():
             within = getattr(module, "__package__", "") or ""
-            found |= imported_sources(file.parent, [(within, file.read_bytes())])
+            found |= imported_sources(file.parent, within, file.read_bytes())
     return _digest_of_sources(found)
 
 
@@ -228,21 +228,22 @@ def _digest_of_sources(found: Mapping[str, bytes]) -> str:
     return digest_of(item for name in sorted(found) for item in (name.encode(), found[name]))
 
 
-def imported_sources(near: Path, modules: list[tuple[str, bytes]]) -> dict[str, bytes]:
-    """Sources of all that modules import, and of what that imports, wherever in the code an import stands.
+def imported_sources(near: Path, package: str, content: bytes) -> dict[str, bytes]:
+    """Sources of all that a module imports, and of what that imports, wherever in the code an import stands.
 
     The standard library, installed distributions and benchnav itself are left out: `run.json` has their versions and
     digests. Nothing is imported by this, and names that are put together at run time are not seen.
 
     Args:
         near: folder in which an imported file may lie besides `sys.path`.
-        modules: for each its package, empty for none, and its source.
+        package: of the module, empty for none.
+        content: its source.
 
     Returns:
         By the name of the module.
     """
     found: dict[str, bytes] = {}
-    todo = list(modules)
+    todo = [(package, content)]
     while todo:
         package, content = todo.pop()
         for name in _imports(content, package):

@@ -237,6 +237,11 @@ def _drive(state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor) -> tu
     return x + moved * heading.cos(), y + moved * heading.sin(), heading + scale * turn_rate
 
 
+def steps_in(time_s: float, dt_s: float) -> int:
+    """Time steps in so many seconds, to the nearest number, one at least."""
+    return max(1, round(time_s / dt_s))
+
+
 def component_wise(values: Tensor) -> Tensor:
     """The same states or actions, shape [*B, S], laid out in memory as `Robot` returns them, see `_stack`."""
     return values.movedim(-1, 0).contiguous().movedim(0, -1)

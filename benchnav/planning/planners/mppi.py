@@ -34,7 +34,7 @@ from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
-from benchnav.planning.robots import Robot, component_wise
+from benchnav.planning.robots import Robot, component_wise, steps_in
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
@@ -77,10 +77,6 @@ class MPPIConfig:
         check_finite("MPPI", self, above, ("control_cost",))
         if self.noise is not None and not (self.noise and all(0 < scale < math.inf for scale in self.noise)):
             raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
-
-    def steps(self, dt_s: float) -> int:
-        """Steps T of the horizon for a time step."""
-        return max(1, round(self.horizon_s / dt_s))
 
 
 @dataclass(frozen=True)
@@ -138,9 +134,10 @@ class MPPI(LocalPlanner[MPPIState]):
             )
         seed = int(torch.randint(2**62, (), generator=generator))
         low, high = problem.action_bounds
-        mean = problem.start.new_zeros(len(problem), config.steps(problem.dt_s), len(names))
+        horizon = steps_in(config.horizon_s, problem.dt_s)
+        mean = problem.start.new_zeros(len(problem), horizon, len(names))
         scale = config.noise_share * (high - low) if config.noise is None else low.new_tensor(config.noise)
-        return MPPIState(problem, mean, scale, draw_bank(seed, mean.shape[1], config.samples, scale), 0)
+        return MPPIState(problem, mean, scale, draw_bank(seed, horizon, config.samples, scale), 0)
 
     def plan_toward(
         self, step: Step, plan_state: MPPIState, target_m: Tensor

@@ -13,6 +13,7 @@ from torch import Tensor
 from benchnav.core.terrain import Terrain
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Task
+from benchnav.planning.robots import steps_in
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.realisation import Realisation
@@ -116,7 +117,7 @@ class Simulation:
         held = now.held
         if self._immobile is not None:
             held = torch.where(traversability < self._immobile.below, held + 1, 0)
-            most = max(1, round(self._immobile.for_s / self.robot.dt_s))
+            most = steps_in(self._immobile.for_s, self.robot.dt_s)
             outcome = torch.where(held >= most, Outcome.IMMOBILISED, outcome)
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(arrived, Outcome.SUCCESS, outcome)

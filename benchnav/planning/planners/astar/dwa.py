@@ -30,7 +30,7 @@ from benchnav.planning.problem import (
     predicted_traversability,
     stage_cost,
 )
-from benchnav.planning.robots import Robot, component_wise
+from benchnav.planning.robots import Robot, component_wise, steps_in
 
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10
@@ -71,10 +71,6 @@ class DWAConfig:
     def __post_init__(self) -> None:
         """Refuses an empty window, and weights that mean nothing."""
         check_finite("DWA", self, ("speeds", "turn_rates", "horizon_s"), ("heading_weight", "arrival_m"))
-
-    def steps(self, dt_s: float) -> int:
-        """The horizon in steps T of so many seconds."""
-        return max(1, round(self.horizon_s / dt_s))
 
 
 @dataclass(frozen=True)
@@ -125,7 +121,7 @@ class DWA(LocalPlanner[DWAState]):
         best = cost.argmin(dim=1)[:, None, None]
         layers = {}
         if step.draw:
-            held = window.mT[:, None].expand(-1, self.config.steps(problem.dt_s), -1, -1)
+            held = window.mT[:, None].expand(-1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1)
             drawn = rollout_path(problem, step.state, held)
             path = drawn.take_along_dim(best[..., None], 1)[:, 0]
             layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
@@ -211,7 +207,7 @@ def score(
     pairs = component_wise(window)
     cost = torch.zeros_like(window[..., 0])
     under_way = torch.ones_like(cost, dtype=torch.bool)
-    steps = config.steps(problem.dt_s)
+    steps = steps_in(config.horizon_s, problem.dt_s)
     for first in range(0, steps, _CHUNK_STEPS):
         states, cost, under_way = advance(
             states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,

@@ -25,6 +25,7 @@ from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, PathFollower, Reference, Tracking
 from benchnav.planning.problem import Problem, motion_traversability
+from benchnav.planning.robots import steps_in
 
 DRAWN_M = 0.5  # between the drawn points of an edge
 _CHECK_STEPS = 8  # between looks at whether all edges of a round have ended
@@ -162,7 +163,7 @@ def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: T
     state, tracking, progress = begin.state, begin.tracking, torch.zeros_like(end_m)
     was_free, collided = begin.free, torch.zeros_like(begin.free)
     log: list[tuple[Tensor, ...]] = []
-    for step in range(max(1, round(loop.edge_time_s / problem.dt_s)) + 1):
+    for step in range(steps_in(loop.edge_time_s, problem.dt_s) + 1):
         progress = follower.advance(reference, state, progress)
         ground = problem.ground_at(state)
         free = ground > 0
