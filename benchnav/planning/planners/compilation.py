@@ -9,6 +9,7 @@ a batch has, nor on what the process compiled before, since compiled and eager r
 bits and much in speed.
 """
 
+import logging
 import os
 import shutil
 import sys
@@ -17,8 +18,6 @@ from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import torch
-
-from benchnav.core.errors import quiet
 
 R = TypeVar("R")
 
@@ -124,19 +123,24 @@ def _compiling(checked: bool) -> Iterator[None]:
     """
     import torch._inductor.config  # imported here: it takes a second
 
-    with (
-        # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
-        quiet("torch.utils.cpp_extension"),
-        # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
-        torch._dynamo.config.patch(
-            recompile_limit=sys.maxsize,
-            accumulated_recompile_limit=sys.maxsize,
-            fail_on_recompile_limit_hit=True,
-            suppress_errors=False,
-        ),
-        torch._inductor.config.patch(assert_indirect_indexing=checked),
-    ):
-        yield
+    # It would tell of a CUDA toolkit without a GPU, which is no concern of a rollout on the CPU.
+    notices = logging.getLogger("torch.utils.cpp_extension")
+    level = notices.level
+    notices.setLevel(logging.ERROR)
+    try:
+        with (
+            # PyTorch's own limit, a few shapes in a process, would make results depend on earlier runs.
+            torch._dynamo.config.patch(
+                recompile_limit=sys.maxsize,
+                accumulated_recompile_limit=sys.maxsize,
+                fail_on_recompile_limit_hit=True,
+                suppress_errors=False,
+            ),
+            torch._inductor.config.patch(assert_indirect_indexing=checked),
+        ):
+            yield
+    finally:
+        notices.setLevel(level)
 
 
 def _key(arg: object) -> object:
