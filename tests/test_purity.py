@@ -15,7 +15,6 @@ from benchnav.datagen.schema import FIELDS, entry_digests
 from benchnav.datagen.synth import appearance, slope
 from benchnav.datagen.synth.generate import generate
 from benchnav.planning import risk
-from benchnav.planning.planners import mppi
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.dwa import DWAConfig, score, velocity_window
 from benchnav.planning.problem import Problem
@@ -25,6 +24,7 @@ from benchnav.planning.world.world import World
 from tests import factories
 from tests.core.test_mixture import random_mixture
 from tests.factories import tiny_recipe
+from tests.planning.planners.driving import rollout_cost
 
 
 def same_after(call: Callable[[], object], *given: torch.Tensor | np.ndarray) -> None:
@@ -96,7 +96,7 @@ def test_parts_of_planners() -> None:
     costs, goals = astar.edge_costs(problem), np.zeros((2, 16, 16), dtype=bool)
     same_after(lambda: gridgraph.cost_to_go(costs, goals, (16, 16)), costs, goals)
     mean, noise, target = torch.rand(2, 12, 2), torch.randn(12, 2, 5), problem.goal_m
-    same_after(lambda: mppi.rollout_cost(problem, problem.start, mean, noise, target), mean, noise, *maps)
+    same_after(lambda: rollout_cost(problem, problem.start, mean, noise, target), mean, noise, *maps)
     velocity, config = torch.zeros(2, 2), DWAConfig()
     same_after(lambda: velocity_window(problem, velocity, config), velocity, *maps)
     window = velocity_window(problem, velocity, config)

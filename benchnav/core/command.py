@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Literal, get_origin
 
 from benchnav.core.errors import BenchnavError, ConfigError
@@ -193,24 +192,23 @@ def _read_arguments(
     Raises:
         ConfigError: something given is unknown or of another type.
     """
-    options, arguments = command.options, SimpleNamespace()  # by name, which later ones begin from
+    options = command.options
+    arguments: dict[str, Any] = {}  # from which later ones begin
     for file in [value for path, value in flags if path == ["config"]]:
-        settings = read_options(options, _read_config(command, file), of(file), base=arguments)
-        vars(arguments).update(settings)
+        arguments |= read_options(options, _read_config(command, file), of(file), now=arguments)
     given: dict[str, Any] = {}
     for (name, *keys), value in sorted(flags, key=lambda flag: len(flag[0])):
         if name in options:
-            now = given.get(name, getattr(arguments, name, options[name].default))
+            now = given.get(name, arguments.get(name, options[name].default))
             given[name] = _merged(name, options[name].kind, now, keys, value)
     for name in command.positionals:
-        if options[name].kind == list[str] and (places or not hasattr(arguments, name)):
+        if options[name].kind == list[str] and (places or name not in arguments):
             given[name], places = list(places), []
         elif places:
             given[name], *places = places
     if places:
         raise ConfigError(f"Expected nothing more, got {' '.join(places)!r}. See `{program} --help`.")
-    vars(arguments).update(read_options(options, given, "--{}".format, base=arguments))
-    return vars(arguments)
+    return arguments | read_options(options, given, "--{}".format, now=arguments)
 
 
 def _read_words(program: str, command: Command, words: Sequence[str]) -> tuple[list[_Flag], list[str]]:

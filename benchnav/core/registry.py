@@ -32,13 +32,11 @@ from typing import Any
 
 import benchnav
 from benchnav.core.errors import ConfigError
+from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
+from benchnav.core.settings import Option as Option
 from benchnav.core.settings import (
-    NO_DEFAULT,
-    Option,
     call,
     config_class,
-    gone_options,
-    hint,
     list_options,
     load_yaml,
     of,
@@ -48,6 +46,7 @@ from benchnav.core.settings import (
     read,
     read_options,
 )
+from benchnav.core.settings import hint as hint
 from benchnav.core.sources import (
     attribute,
     digest_of,
@@ -59,25 +58,6 @@ from benchnav.core.sources import (
     load_file,
     moved,
 )
-
-__all__ = [
-    "KINDS",
-    "NO_DEFAULT",
-    "Found",
-    "Option",
-    "Part",
-    "check_base",
-    "complete",
-    "find",
-    "hint",
-    "make",
-    "names",
-    "option_files",
-    "options_of",
-    "read_part",
-    "register",
-    "take",
-]
 
 KINDS = ("planner", "model", "risk", "robot", "objective")
 
@@ -134,8 +114,8 @@ class Found:
         Raises:
             ConfigError: a file that it lists is not there.
         """
-        listed = [digest for pair in _listed_files(self.target) for digest in pair]
-        return digest_of(map(str.encode, (self.source_digest(), *listed))) if listed else self.source_digest()
+        source, listed = self.source_digest(), list(_listed_files(self.target))
+        return digest_of(map(str.encode, (source, *listed))) if listed else source
 
 
 _REGISTERED: dict[tuple[str, str], Any] = {}
@@ -188,7 +168,10 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
     source, value = _split_value(kind, text)
     options = dict(fields.get("options") or {})
     if value is not None:
-        name, option = _first_option(kind, source, text)
+        known = options_of(kind, find(kind, source).target)
+        if not known:
+            raise ConfigError(f"Expected {kind} {source!r} without a value, got {text!r}: it has no options.")
+        name, option = next(iter(known.items()))
         if name in options:
             raise ConfigError(f"Expected option {name!r} of {kind} {text!r} once, got {options[name]!r} too.")
         value = read(
@@ -306,7 +289,12 @@ def find(kind: str, source: str) -> Found:
         return _found_in_file(kind, Path(place), name)
     if colon and place:
         return _found_in_module(kind, place, name.partition("[")[0].strip())
-    raise _unknown(kind, source)
+    remedy = hint(source, names(kind))
+    if source.endswith(".py"):
+        remedy = f" Say which class or function of it: {source}:Name."
+    elif Path(f"{source}.py").is_file():
+        remedy = f" Did you mean './{source}.py:Name'?"
+    raise _unknown(kind, source, remedy)
 
 
 def options_of(kind: str, target: Any) -> dict[str, Option]:
@@ -343,15 +331,8 @@ def _split_value(kind: str, text: str) -> tuple[str, str | None]:
     return (head, tail) if colon and is_part else (text, None)
 
 
-def _first_option(kind: str, source: str, text: str) -> tuple[str, Option]:
-    known = options_of(kind, find(kind, source).target)
-    if not known:
-        raise ConfigError(f"Expected {kind} {source!r} without a value, got {text!r}: it has no options.")
-    return next(iter(known.items()))
-
-
 def _read_options(kind: str, part: Part, target: Any) -> dict[str, Any]:
-    gone = gone_options(target, _skipped(kind, target))
+    gone = getattr(config_class(target, _skipped(kind, target)) or target, "gone", {})
     return read_options(options_of(kind, target), part.options, of(f"{kind} {part.part!r}"), gone=gone)
 
 
@@ -362,15 +343,10 @@ def _skipped(kind: str, target: Any) -> tuple[str, ...]:
     return _GIVEN.get(kind, ())
 
 
-def _unknown(kind: str, source: str) -> ConfigError:
-    remedy = hint(source, names(kind))
-    if source.endswith(".py"):
-        remedy = f" Say which class or function of it: {source}:Name."
-    elif Path(f"{source}.py").is_file():
-        remedy = f" Did you mean './{source}.py:Name'?"
+def _unknown(kind: str, source: str, remedy: str, reason: str = "") -> ConfigError:
     return ConfigError(
         f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or path/to/file.py:Name, "
-        f"got {source!r}.{remedy}"
+        f"got {source!r}{reason}.{remedy}"
     )
 
 
@@ -378,21 +354,18 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
     try:
         module = importlib.import_module(place)
     except (Exception, SystemExit) as error:
-        if isinstance(error, ModuleNotFoundError) and f"{place}.".startswith(f"{error.name}."):
-            file = Path(*place.split(".")).with_suffix(".py")
-            if remedy := moved(error):
-                remedy = remedy.removeprefix(".")
-            elif file.is_file():
-                remedy = f" Did you mean './{file}:{name}'?"
-            else:
-                remedy = (
-                    hint(place, names(kind)) or " Install its package, or name a file: path/to/file.py:Name."
-                )
-            raise ConfigError(
-                f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or "
-                f"path/to/file.py:Name, got {place + ':' + name!r}, and there is no module {error.name!r}.{remedy}"
-            ) from error
-        raise ConfigError(f"module {place} could not be imported: {one_line(error)}{moved(error)}") from error
+        if not isinstance(error, ModuleNotFoundError) or not f"{place}.".startswith(f"{error.name}."):
+            line = f"{one_line(error)}{moved(error)}"
+            raise ConfigError(f"module {place} could not be imported: {line}") from error
+        file = Path(*place.split(".")).with_suffix(".py")
+        beside = f" Did you mean './{file}:{name}'?" if file.is_file() else hint(place, names(kind))
+        remedy = moved(error).removeprefix(".") or beside
+        raise _unknown(
+            kind,
+            f"{place}:{name}",
+            remedy or " Install its package, or name a file: path/to/file.py:Name.",
+            f", and there is no module {error.name!r}",
+        ) from error
     target = attribute(module, place, name)
     if place.partition(".")[0] == "benchnav":
         return Found(target=target, origin=f"benchnav {benchnav.__version__}", shipped=True)
@@ -419,8 +392,8 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
     return Found(target=target, origin=f"file {path}", source_digest=source)
 
 
-def _listed_files(target: Any) -> Iterator[tuple[str, str]]:
-    """What a part lists as `files`, each with its digest."""
+def _listed_files(target: Any) -> Iterator[str]:
+    """What a part lists as `files`, each followed by its digest."""
     listed = getattr(target, "files", ())
     if not listed or not isinstance(listed, list | tuple) or "files" in parameters(target):
         return
@@ -432,7 +405,7 @@ def _listed_files(target: Any) -> Iterator[tuple[str, str]]:
             raise ConfigError(
                 f"Expected `files` of {target.__qualname__} in {folder}, got {name!r}, which is not there."
             )
-        yield name, digest
+        yield from (name, digest)
 
 
 def option_files(kind: str, part: Part) -> dict[str, str]:
@@ -444,8 +417,6 @@ def option_files(kind: str, part: Part) -> dict[str, str]:
     Raises:
         ConfigError: an option names a folder that holds the working folder.
     """
-    if not part.options:
-        return {}
     written = getattr(find(kind, part.part).target, "writes", ())
     found = {}
     for text in _texts([value for name, value in part.options.items() if name not in written]):
@@ -462,10 +433,9 @@ def option_files(kind: str, part: Part) -> dict[str, str]:
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """All texts in a value of plain data."""
-    if isinstance(value, str):
-        if value:
-            yield value
+    """All texts in a value of plain data that say something."""
+    if isinstance(value, str) and value:
+        yield value
     elif isinstance(value, Mapping | list | tuple):
         for inner in value.values() if isinstance(value, Mapping) else value:
             yield from _texts(inner)

@@ -89,11 +89,6 @@ def config_class(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Any
     return dataclass_in(_types(target).get("config"))
 
 
-def gone_options(target: Callable[..., Any], skipped: Iterable[str] = ()) -> Mapping[str, str]:
-    """Options that were once there and what does their work now: `gone` of a class or of its `config`."""
-    return getattr(config_class(target, skipped) or target, "gone", {})
-
-
 def parameters(target: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """Parameters that have names of their own; a class without a constructor has none."""
     if inspect.isclass(target) and target.__init__ is object.__init__:
@@ -156,7 +151,8 @@ def read(kind: Any, value: Any, name: Naming, key: str = "", now: Any = NO_DEFAU
     config, origin, members = dataclass_in(kind), get_origin(kind), get_args(kind)
     if config and isinstance(value, Mapping):
         base = now if isinstance(now, config) else None
-        given = read_options(list_options(config), value, name, key, base, gone_options(config))
+        before = {f.name: getattr(base, f.name) for f in fields(base)} if base is not None else None
+        given = read_options(list_options(config), value, name, key, before, getattr(config, "gone", {}))
         return call(name(key), partial(replace, base) if base else config, given)
     if origin is dict and dataclass_in(members[1]) and isinstance(value, Mapping):
         if not all(isinstance(inner, str) for inner in value):
@@ -180,7 +176,7 @@ def read_options(
     given: Mapping[str, Any],
     name: Naming,
     key: str = "",
-    base: Any = None,
+    now: Mapping[str, Any] | None = None,
     gone: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Gives options of their types, by name.
@@ -190,7 +186,7 @@ def read_options(
         given: plain data by option.
         name: what users call a key.
         key: where they stand, with dots; empty for the whole.
-        base: a value whose attributes are what is not given.
+        now: what is not given, by name; without it an option that has no default is to be given.
         gone: options that were once there, with what does their work now.
 
     Raises:
@@ -203,12 +199,11 @@ def read_options(
             remedy = f" {gone[option]}" if option in gone else hint(option, known)
             raise ConfigError(f"Expected keys of {name(key)} {among}, got {option!r}.{remedy}")
     for option, about in known.items():
-        if about.default is NO_DEFAULT and option not in given and base is None:
+        if about.default is NO_DEFAULT and option not in given and now is None:
             raise ConfigError(f"Expected {name(inner + option)} as {in_words(about.kind)}, got none.")
+    before = {option: about.default for option, about in known.items()} | dict(now or {})
     return {
-        option: read(
-            known[option].kind, value, name, inner + option, getattr(base, option, known[option].default)
-        )
+        option: read(known[option].kind, value, name, inner + option, before[option])
         for option, value in given.items()
     }
 
@@ -283,13 +278,9 @@ def _names(items: Sequence[Any]) -> list[str]:
 def _parsed(kind: Any, value: Any) -> Any:
     from jsonargparse import ArgumentError
 
-    is_list = any(get_origin(member) in (list, tuple) for member in members_of(kind))
-    if (
-        isinstance(value, str)
-        and is_list
-        and str not in members_of(kind)
-        and not value.lstrip().startswith(("[", "("))
-    ):
+    members = members_of(kind)
+    is_list = str not in members and any(get_origin(member) in (list, tuple) for member in members)
+    if is_list and isinstance(value, str) and not value.lstrip().startswith(("[", "(")):
         value = f"[{value}]"
     try:
         parser = _parser(kind)
@@ -329,7 +320,7 @@ def plain(value: Any) -> Any:
         return value.name
     if isinstance(value, PurePath):
         return str(value)
-    if isinstance(value, bool | int | float | str | NoneType):
+    if value is None or isinstance(value, int | float | str):
         return value
     raise ConfigError(f"Expected plain data (numbers, text, lists, mappings), got {value!r}.")
 

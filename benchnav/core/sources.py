@@ -24,28 +24,29 @@ from benchnav.core.shipped import PACKAGE
 
 # Modules and names of earlier versions, with what users import from today.
 _MOVED = {
-    **dict.fromkeys(("errors", "grid", "mixture", "registry", "terrain"), "benchnav"),
-    "files": "benchnav.core.store",
-    **{name: f"benchnav.core.{name}" for name in ("copula", "cvar", "device", "gridgraph", "rng")},
-    "drawing": "benchnav.core.figures",
-    **{f"datagen.{name}": "benchnav.datagen" for name in ("create", "generate", "maps", "scenario", "store")},
-    "datagen.latent": "benchnav.datagen.recipe.latent",
-    **{f"models.predictor.{name}": "benchnav.models" for name in ("Model", "ModelFamily", "predict")},
-    "models.predictor.Model": "benchnav.models, as TraversabilityModel,",
-    "models.contract": "benchnav.testing",
-    **{f"models.{name}": f"benchnav.models.nets.{name}" for name in ("classifier", "mdn", "network")},
-    **{f"models.{name}": "benchnav.models.quality.measure" for name in ("calibration", "evaluate")},
-    "models.scores": "benchnav.models.quality.scores",
-    "planning.env": "benchnav.env",
-    "planning.env_batch": "benchnav.env.batch",
-    **{f"planning.planners.{name}": "benchnav.testing" for name in ("check", "contract")},
-    **{f"planning.planners.{name}": "benchnav.planning" for name in ("astar_dwa", "astar_mppi")},
-    **{f"planning.planners.{name}": f"benchnav.planning.planners.astar.{name}" for name in ("dwa", "guided")},
-    "planning.mppi": "benchnav.planning",
-    "planning.pure_pursuit": "benchnav.planning.planners.cl_rrt.pursuit",
-    "testing.side_effects": "benchnav.testing.breaches",
-    **{f"eval.{name}": "benchnav.eval" for name in ("condition", "runner", "suite", "trial")},
-    "eval.run.steps": "benchnav.eval",
+    old: place + old.rpartition(".")[2] if place.endswith(".") else place
+    for place, names in {
+        "benchnav": "errors grid mixture registry terrain",
+        "benchnav.core.": "copula cvar device gridgraph rng",
+        "benchnav.core.figures": "drawing",
+        "benchnav.core.store": "files",
+        "benchnav.datagen": "datagen.create datagen.generate datagen.maps datagen.scenario datagen.store",
+        "benchnav.datagen.recipe.": "datagen.latent",
+        "benchnav.env": "planning.env",
+        "benchnav.env.batch": "planning.env_batch",
+        "benchnav.eval": "eval.condition eval.runner eval.suite eval.trial eval.run.steps",
+        "benchnav.models": "models.predictor.ModelFamily models.predictor.predict",
+        "benchnav.models, as TraversabilityModel,": "models.predictor.Model",
+        "benchnav.models.nets.": "models.classifier models.mdn models.network",
+        "benchnav.models.quality.": "models.scores",
+        "benchnav.models.quality.measure": "models.calibration models.evaluate",
+        "benchnav.planning": "planning.mppi planning.planners.astar_dwa planning.planners.astar_mppi",
+        "benchnav.planning.planners.astar.": "planning.planners.dwa planning.planners.guided",
+        "benchnav.planning.planners.cl_rrt.pursuit": "planning.pure_pursuit",
+        "benchnav.testing": "models.contract planning.planners.check planning.planners.contract",
+        "benchnav.testing.breaches": "testing.side_effects",
+    }.items()
+    for old in names.split()
 }
 
 
@@ -139,10 +140,8 @@ def digest_of_path(path: Path) -> str:
     """
     try:
         if path.is_dir():
-            inner = sorted(
-                file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts
-            )
-            pairs = ((file.relative_to(path).as_posix(), digest_of_path(file)) for file in inner)
+            files = sorted(f for f in path.rglob("*") if f.is_file() and "__pycache__" not in f.parts)
+            pairs = ((file.relative_to(path).as_posix(), digest_of_path(file)) for file in files)
             return digest_of(item.encode() for pair in pairs for item in pair)
         if not path.is_file():
             return ""
@@ -156,7 +155,7 @@ def digest_of_path(path: Path) -> str:
 
 def digest_of_file_part(path: Path, content: bytes) -> str:
     """Digest of a file that stands alone and of the modules that it imports; see `imported_sources`."""
-    return _digest_of_sources({"": content} | imported_sources(path.parent, [("", content)]))
+    return _digest_of_sources({"": content} | imported_sources(path.parent, "", content))
 
 
 def digest_of_target(target: Callable[..., Any]) -> str:
@@ -183,9 +182,9 @@ def digest_of_modules(names: Iterable[str]) -> str:
         found |= {place.as_posix(): _read_source(file) for place, file in files}
         module = sys.modules.get(name)
         file = Path(getattr(module, "__file__", None) or "")
-        if module is not None and file.is_file():
+        if file.is_file():
             within = getattr(module, "__package__", "") or ""
-            found |= imported_sources(file.parent, [(within, file.read_bytes())])
+            found |= imported_sources(file.parent, within, file.read_bytes())
     return _digest_of_sources(found)
 
 
@@ -229,29 +228,32 @@ def _digest_of_sources(found: Mapping[str, bytes]) -> str:
     return digest_of(item for name in sorted(found) for item in (name.encode(), found[name]))
 
 
-def imported_sources(near: Path, modules: list[tuple[str, bytes]]) -> dict[str, bytes]:
-    """Sources of all that modules import, and of what that imports, wherever in the code an import stands.
+def imported_sources(near: Path, package: str, content: bytes) -> dict[str, bytes]:
+    """Sources of all that a module imports, and of what that imports, wherever in the code an import stands.
 
     The standard library, installed distributions and benchnav itself are left out: `run.json` has their versions and
     digests. Nothing is imported by this, and names that are put together at run time are not seen.
 
     Args:
         near: folder in which an imported file may lie besides `sys.path`.
-        modules: for each its package, empty for none, and its source.
+        package: of the module, empty for none.
+        content: its source.
 
     Returns:
         By the name of the module.
     """
     found: dict[str, bytes] = {}
-    todo = list(modules)
+    todo = [(package, content)]
     while todo:
         package, content = todo.pop()
         for name in _imports(content, package):
             if name in found or name.partition(".")[0] in (*sys.stdlib_module_names, "benchnav"):
                 continue
             spec = _spec(name, near)
-            path = Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
-            if spec is None or path is None or not path.is_file() or _is_installed(path):
+            if spec is None or not spec.has_location or not spec.origin:
+                continue
+            path = Path(spec.origin)
+            if not path.is_file() or any(map(path.is_relative_to, _installed_folders())):
                 continue
             found[name] = _read_source(path)
             if path.suffix == ".py":
@@ -294,10 +296,6 @@ def _spec(name: str, near: Path) -> ModuleSpec | None:
     except (ImportError, ValueError):
         spec = None
     return spec or PathFinder.find_spec(name, [str(near)])
-
-
-def _is_installed(path: Path) -> bool:
-    return any(path.is_relative_to(folder) for folder in _installed_folders())
 
 
 @cache

@@ -148,7 +148,13 @@ def connected(scheduler: str) -> Iterator[Any]:
         raise ConfigError(
             f"Expected Dask for a cluster, got: {error}. Install it: pip install 'benchnav[dask]'"
         ) from error
-    _check_address(scheduler)
+    place = urlparse(scheduler)
+    try:
+        known = place.scheme in ("tcp", "tls") and place.hostname and place.port
+    except ValueError:  # a port that is no number
+        known = False
+    if not known:
+        raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")
     with ExitStack() as stack:
         stack.enter_context(quiet("distributed", "distributed.client"))
         try:
@@ -166,13 +172,3 @@ def connected(scheduler: str) -> Iterator[Any]:
                 f"`dask worker {scheduler} --nworkers N --nthreads 1`."
             ) from error
         yield client
-
-
-def _check_address(scheduler: str) -> None:
-    place = urlparse(scheduler)
-    try:
-        known = place.scheme in ("tcp", "tls") and place.hostname and place.port
-    except ValueError:  # a port that is no number
-        known = False
-    if not known:
-        raise ConfigError(f"Expected `scheduler` tcp://HOST:PORT, got {scheduler!r}.")

@@ -4,8 +4,7 @@ A stateful shell over the Simulation, with NumPy at the boundary; the Gymnasium 
 over this. Letters in shapes: B sub-environments, H×W cells, S state and A action dimensions.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective, distance
-from benchnav.planning.problem import Task, heading_to
+from benchnav.planning.problem import Task, heading_to, map_tensors
 from benchnav.planning.robots import Robot
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
@@ -116,7 +115,7 @@ class EnvBatch:
         # Only what began anew is built: the others keep their maps and noise.
         index = torch.from_numpy(members)
         self._simulation.exchange_(index, fresh)
-        self._now = _each(self._now, lambda name, value: value.index_copy(0, index, getattr(start, name)))
+        self._now = map_tensors(lambda now, new: now.index_copy(0, index, new), self._now, start)
 
     def step(
         self, actions: np.ndarray, hold: np.ndarray | None = None
@@ -135,14 +134,14 @@ class EnvBatch:
         """
         simulation, now = self._current()
         given = torch.as_tensor(actions, dtype=torch.float32)
-        if given.shape != (len(self._map), *self._low.shape):
-            expected = [len(self._map), *self._low.shape]
+        expected = [len(self._map), *self._low.shape]
+        if list(given.shape) != expected:
             raise ConfigError(f"Expected actions of shape {expected}, got {list(given.shape)}.")
         waits = torch.zeros_like(now.running) if hold is None else torch.from_numpy(hold)
         action = given.clamp(self._low, self._high)
         moved, met = simulation.step(now, action)
-        self._now = _each(
-            moved, lambda name, value: torch.where(_beside(waits, value), getattr(now, name), value)
+        self._now = map_tensors(
+            lambda old, new: torch.where(waits[:, None] if new.ndim > 1 else waits, old, new), now, moved
         )
         reward = self._shaped(now) if self._objective is None else self._minus_cost(now, action, met)
         outcome = self._now.outcome
@@ -195,10 +194,9 @@ class EnvBatch:
     def _shaped(self, before: SimulationState) -> Tensor:
         """Progress less time, and a prize or fine at the end, shape [B]."""
         _, now = self._current()
-        reward = self._distance_m(before) - self._distance_m(now)
-        reward = reward + TIME_REWARD_PER_S * self._task.robot.dt_s
-        reward = reward + SUCCESS_REWARD * (now.outcome == Outcome.SUCCESS)
-        return reward + LOST_REWARD * _lost(now.outcome)
+        gained_m = self._distance_m(before) - self._distance_m(now)
+        driven = gained_m + TIME_REWARD_PER_S * self._task.robot.dt_s
+        return driven + SUCCESS_REWARD * (now.outcome == Outcome.SUCCESS) + LOST_REWARD * _lost(now.outcome)
 
     def _minus_cost(self, before: SimulationState, action: Tensor, met: Tensor) -> Tensor:
         """Minus J's stage cost, shape [B]."""
@@ -231,16 +229,6 @@ class EnvBatch:
 
     def _distance_m(self, now: SimulationState) -> Tensor:
         return distance(now.state, self._goal_m())
-
-
-def _each(now: SimulationState, change: Callable[[str, Tensor], Tensor]) -> SimulationState:
-    """A state of the simulation with every tensor changed, given its name."""
-    return SimulationState(**{f.name: change(f.name, getattr(now, f.name)) for f in fields(now)})
-
-
-def _beside(which: Tensor, value: Tensor) -> Tensor:
-    """Members, bool [B], with as many dimensions as `value`."""
-    return which.view(-1, *[1] * (value.ndim - 1))
 
 
 def _lost(outcome: Tensor) -> Tensor:

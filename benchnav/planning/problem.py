@@ -4,9 +4,10 @@ It holds what is *predicted* alone: the truth stays with the simulation. Letters
 cells, K components, S state and A action dimensions, *K any further dimensions.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -40,8 +41,24 @@ class Task:
     rules: Rules = field(default_factory=Rules)
 
 
+class Batch:
+    """The base of dataclasses whose tensors have the episodes as their first dimension."""
+
+    def select(self, members: Tensor) -> Self:
+        """Keeps some episodes, by index, int64, shape [M]."""
+        return map_tensors(lambda value: value[members], self)
+
+    def clone(self) -> Self:
+        """A copy that shares no tensor."""
+        return map_tensors(torch.clone, self)
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same on a device."""
+        return map_tensors(lambda value: value.to(device), self)
+
+
 @dataclass(frozen=True, kw_only=True)
-class Problem:
+class Problem(Batch):
     """A batch of navigation problems on maps of one grid; `pose_problem` makes one.
 
     Args:
@@ -168,22 +185,6 @@ class Problem:
         """J of the last state, and the penalty of ground that is not free; shapes as for `stage_cost`."""
         return terminal_cost(self.objective, state, self.ground_at(state), target)
 
-    def select(self, members: Tensor) -> "Problem":
-        """Keeps some episodes of the batch.
-
-        Args:
-            members: indices, shape [M].
-        """
-        return with_tensors(self, lambda value: value[members])
-
-    def clone(self) -> "Problem":
-        """A copy that shares no tensor."""
-        return with_tensors(self, torch.clone)
-
-    def to(self, device: torch.device | str) -> "Problem":
-        """The problem on a device."""
-        return with_tensors(self, lambda value: value.to(device))
-
 
 def motion_traversability(ground: Tensor, min_traversability: float) -> Tensor:
     """λ̂ that motion is given: at least `min_traversability` on the map, 0 off it.
@@ -256,15 +257,16 @@ def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
     return torch.cat((position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1)
 
 
-def with_tensors(value: T, change: Any) -> T:
-    """Changes every tensor of a dataclass and of the tuples and dataclasses in it, but for the task's."""
+def map_tensors(change: Callable[..., Tensor], *values: T) -> T:
+    """Applies a function to the tensors that have one place in dataclasses of a kind, but for those of a task.
+
+    What is no tensor is the first one's.
+    """
     changed: dict[str, Any] = {}
-    for each in fields(value):  # type: ignore[arg-type]
-        item = getattr(value, each.name)
-        if isinstance(item, Tensor):
-            changed[each.name] = change(item)
-        elif isinstance(item, tuple) and any(isinstance(one, Tensor) for one in item):
-            changed[each.name] = tuple(change(one) for one in item)
-        elif is_dataclass(item) and not isinstance(item, Task | Grid):
-            changed[each.name] = with_tensors(item, change)
-    return replace(value, **changed)  # type: ignore[type-var]
+    for each in fields(values[0]):  # type: ignore[arg-type]
+        items = [getattr(value, each.name) for value in values]
+        if isinstance(items[0], Tensor):
+            changed[each.name] = change(*items)
+        elif is_dataclass(items[0]) and not isinstance(items[0], Task | Grid):
+            changed[each.name] = map_tensors(change, *items)
+    return replace(values[0], **changed)  # type: ignore[type-var]

@@ -78,7 +78,30 @@ class Robot(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unicycle(Robot):
+class _Vehicle(Robot):
+    """What the shipped robots share: a speed within bounds, and a state that is or begins with the pose."""
+
+    dt_s: float = 0.1
+    speed_mps: tuple[float, float] = (0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Refuses a time step or a speed that allows no motion."""
+        if not self.dt_s > 0:
+            raise ConfigError(f"Expected `dt_s` > 0, got {self.dt_s}.")
+        _check_bounds("speed_mps", self.speed_mps)
+
+    @property
+    def top_speed_mps(self) -> float:
+        """Greatest |v|."""
+        return max(map(abs, self.speed_mps))
+
+    def initial_state(self, pose: Tensor) -> Tensor:
+        """The pose itself; see `Robot`."""
+        return pose.clone()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unicycle(_Vehicle):
     """The paper's unicycle: traversability scales both the linear and the angular velocity.
 
     State (x, y, θ), action (v, ω). Source: paper IV-A.
@@ -89,13 +112,12 @@ class Unicycle(Robot):
         turn_rate_radps: least and greatest angular velocity ω.
     """
 
-    dt_s: float = 0.1
-    speed_mps: tuple[float, float] = (0.0, 1.0)
     turn_rate_radps: tuple[float, float] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
         """Refuses a time step or bounds that allow no motion."""
-        _check(self, speed_mps=self.speed_mps, turn_rate_radps=self.turn_rate_radps)
+        super().__post_init__()
+        _check_bounds("turn_rate_radps", self.turn_rate_radps)
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -111,15 +133,6 @@ class Unicycle(Robot):
     def action_high(self) -> tuple[float, ...]:
         """Greatest (v, ω)."""
         return self.speed_mps[1], self.turn_rate_radps[1]
-
-    @property
-    def top_speed_mps(self) -> float:
-        """Greatest |v|."""
-        return max(map(abs, self.speed_mps))
-
-    def initial_state(self, pose: Tensor) -> Tensor:
-        """The pose itself; see `Robot`."""
-        return pose.clone()
 
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Advances one time step; see `Robot`."""
@@ -171,7 +184,7 @@ class DifferentialDrive(Unicycle):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bicycle(Robot):
+class Bicycle(_Vehicle):
     """A kinematic bicycle, referred to the rear axle: it turns only while it drives.
 
     State (x, y, θ), action (v, δ) with θ' = v tan(δ) / wheelbase; traversability scales v, and with it the
@@ -184,14 +197,12 @@ class Bicycle(Robot):
         wheelbase_m: distance of the axles.
     """
 
-    dt_s: float = 0.1
-    speed_mps: tuple[float, float] = (0.0, 1.0)
     steering_rad: float = 0.6
     wheelbase_m: float = 0.5
 
     def __post_init__(self) -> None:
         """Refuses a robot that cannot move or turn."""
-        _check(self, speed_mps=self.speed_mps)
+        super().__post_init__()
         if not 0 < self.steering_rad < math.pi / 2 or not self.wheelbase_m > 0:
             raise ConfigError(
                 "Expected `steering_rad` in (0, π/2) and `wheelbase_m` > 0, "
@@ -213,15 +224,6 @@ class Bicycle(Robot):
         """Greatest (v, δ)."""
         return self.speed_mps[1], self.steering_rad
 
-    @property
-    def top_speed_mps(self) -> float:
-        """Greatest |v|."""
-        return max(map(abs, self.speed_mps))
-
-    def initial_state(self, pose: Tensor) -> Tensor:
-        """The pose itself; see `Robot`."""
-        return pose.clone()
-
     def __call__(self, state: Tensor, action: Tensor, traversability: Tensor) -> Tensor:
         """Advances one time step; see `Robot`."""
         turn_rate = action[..., 0] * action[..., 1].tan() / self.wheelbase_m
@@ -235,6 +237,11 @@ def _drive(state: Tensor, speed: Tensor, turn_rate: Tensor, scale: Tensor) -> tu
     return x + moved * heading.cos(), y + moved * heading.sin(), heading + scale * turn_rate
 
 
+def steps_in(time_s: float, dt_s: float) -> int:
+    """Time steps in so many seconds, to the nearest number, one at least."""
+    return max(1, round(time_s / dt_s))
+
+
 def component_wise(values: Tensor) -> Tensor:
     """The same states or actions, shape [*B, S], laid out in memory as `Robot` returns them, see `_stack`."""
     return values.movedim(-1, 0).contiguous().movedim(0, -1)
@@ -245,9 +252,6 @@ def _stack(parts: tuple[Tensor, ...]) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*parts)).movedim(0, -1)
 
 
-def _check(robot: Unicycle | Bicycle, **bounds: tuple[float, float]) -> None:
-    if not robot.dt_s > 0:
-        raise ConfigError(f"Expected `dt_s` > 0, got {robot.dt_s}.")
-    for name, (low, high) in bounds.items():
-        if not low < high:
-            raise ConfigError(f"Expected `{name}` as (least, greatest), got {(low, high)}.")
+def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
+    if not bounds[0] < bounds[1]:
+        raise ConfigError(f"Expected `{name}` as (least, greatest), got {bounds}.")

@@ -2,8 +2,8 @@
 
 import pickle
 import random
-from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,9 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.planning.planners.boundary import find_tensor_fault
 
+SEED = 20240229
 TOLERANCE = 1e-5  # between an answer for one alone and in a batch
 NOTHING = object()  # what a call that raised has answered
 
@@ -39,36 +41,46 @@ class Breaches:
 
     def expect_tensor(self, what: str, values: Any, like: Tensor, shape: tuple[int, ...]) -> bool:
         """Expects finite numbers of a shape, in the dtype and on the device of another tensor."""
-        wanted, got = f"{like.dtype} of shape {list(shape)} on {like.device}", type(values).__name__
-        if isinstance(values, Tensor):
-            got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
-        fits = self.expect(got == wanted, f"Expected {what} as {wanted}, got {got}.")
+        fault = find_tensor_fault(what, values, like.dtype, shape, like.device)
+        fits = self.expect(not fault, fault)
         return fits and self.expect(bool(values.isfinite().all()), f"Expected finite {what}, got others.")
 
+    def batches(self, device: torch.device | str) -> Iterator["Draws"]:
+        """Goes through the dtypes and leading dimensions to be tried, each of which is a place."""
+        for dtype in (torch.float32, torch.float64):
+            for leading in ((6,), (6, 5), (6, 5, 2)):
+                self.place = f"*B = {list(leading)}, {dtype}"
+                like = torch.zeros(1, dtype=dtype, device=device)
+                yield Draws(leading, like, torch.Generator().manual_seed(SEED))
+
     def try_function(
-        self, what: str, act: Callable[..., Any], given: Mapping[str, Tensor], shape: tuple[int, ...]
+        self,
+        what: str,
+        act: Callable[..., Any],
+        given: Mapping[str, Any],
+        is_of_use: Callable[[Any], bool],
+        tolerance: float = TOLERANCE,
     ) -> Any:
         """Tries a pure function of a batch: twice, and for the last of the batch alone.
 
         Args:
             what: its name, for people.
             act: the function.
-            given: its arguments by name, the batch first, of one dtype and device, which the answer is to have too.
-            shape: of the answer.
+            given: its arguments by name: tensors, the batch first, or values that `select` takes members from.
+            is_of_use: whether there is a point in trying on, given the answer.
+            tolerance: by how much answers alone and in a batch may differ.
 
         Returns:
             The answer; `NOTHING` where it is of no use.
         """
-        answer = self.watch(what, partial(act, **given), **given)
-        like = next(iter(given.values()))
-        if answer is NOTHING or not self.expect_tensor(f"what `{what}` gives", answer, like, shape):
+        answer = self.watch(what, lambda: act(**given), **given)
+        if answer is NOTHING or not is_of_use(answer):
             return NOTHING
-        self.expect(
-            same(act(**given), answer), f"Expected the same from `{what}` when asked again, got another."
-        )
-        alone = self.watch(what, lambda: act(**{name: value[-1:] for name, value in given.items()}))
-        told = f"Expected the same from `{what}` for an episode alone and in a batch, got another."
-        self.expect(close(alone, answer[-1:], TOLERANCE), told)
+        again = f"Expected the same from `{what}` when asked again, got another."
+        self.expect(same(act(**given), answer), again)
+        alone = self.watch(what, lambda: act(**{name: _last(value) for name, value in given.items()}))
+        breach = f"Expected the same from `{what}` for one alone and in a batch, got another."
+        self.expect(same(alone, _last(answer), tolerance), breach)
         return answer
 
     def watch(self, what: str, act: Callable[[], Any], **given: Any) -> Any:
@@ -92,7 +104,7 @@ class Breaches:
             self.expect(False, f"Expected an answer from `{what}`, got {named}")
         after = dict(_leaves(given))
         changed = [name for name, leaf in before.items() if not same(leaf, after.get(name))]
-        listed = ", ".join(changed[:3]) + (", …" if len(changed) > 3 else "")
+        listed = ", ".join(changed[:3])
         self.expect(
             not changed, f"Expected `{what}` to leave its arguments as they were, got another {listed}."
         )
@@ -120,20 +132,46 @@ class Breaches:
         )
 
 
-def same(first: Any, second: Any) -> bool:
-    """Tells whether two values are the same, tensors by what they hold: NaN equals NaN."""
+@dataclass(frozen=True)
+class Draws:
+    """Draws arguments of functions of a batch.
+
+    Args:
+        leading: their leading dimensions *B.
+        like: gives their dtype and device.
+        generator: source of randomness.
+    """
+
+    leading: tuple[int, ...]
+    like: Tensor
+    generator: torch.Generator
+
+    def uniform(self, low: Sequence[float], high: Sequence[float]) -> Tensor:
+        """Uniform numbers between bounds of length N, shape [*B, N]."""
+        least, most = self.like.new_tensor(low), self.like.new_tensor(high)
+        share = torch.rand(*self.leading, len(least), generator=self.generator).to(self.like)
+        return least + (most - least) * share
+
+
+def same(first: Any, second: Any, tolerance: float = 0.0) -> bool:
+    """Tells whether two values are the same, tensors by what they hold: NaN equals NaN.
+
+    Args:
+        first: anything; dataclasses field by field.
+        second: anything.
+        tolerance: by how much tensors, then of any dtype, may differ.
+    """
+    if is_dataclass(first) and type(first) is type(second):
+        return all(same(getattr(first, f.name), getattr(second, f.name), tolerance) for f in fields(first))
     if not isinstance(first, Tensor) or not isinstance(second, Tensor):
         return type(first) is type(second) and bool(first == second)
-    if first.shape != second.shape or first.dtype != second.dtype:
+    if first.shape != second.shape or not (tolerance or first.dtype == second.dtype):
         return False
-    return bool(((first == second) | (first.isnan() & second.isnan())).all())
+    return torch.allclose(first.double(), second.double(), tolerance, tolerance, equal_nan=True)
 
 
-def close(values: Any, expected: Tensor, tolerance: float) -> bool:
-    """Tells whether something is a tensor near another of any dtype: NaN equals NaN."""
-    if not isinstance(values, Tensor) or values.shape != expected.shape:
-        return False
-    return torch.allclose(values.double(), expected.double(), tolerance, tolerance, equal_nan=True)
+def _last(value: Any) -> Any:
+    return value[-1:] if isinstance(value, Tensor) else value.select(torch.tensor([-1]))
 
 
 def _leaves(value: Any, name: str = "", seen: set[int] | None = None) -> Iterator[tuple[str, Any]]:

@@ -21,7 +21,7 @@ from benchnav.datagen.recipe.recipe import Split, load_recipe
 from benchnav.datagen.synth.generate import generate
 from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import load_model
-from benchnav.testing.breaches import NOTHING, Breaches, close
+from benchnav.testing.breaches import NOTHING, Breaches, same
 
 SHAPES = ((32, 32), (20, 37))
 TOLERANCE = 1e-4
@@ -66,40 +66,36 @@ def check_model(
 
 
 def _try(model: TraversabilityModel, terrain: Terrain, tolerance: float, breaches: Breaches) -> None:
-    last = torch.tensor([_MAPS - 1], device=terrain.rgb.device)
-    answers: list[TraversabilityMixture] = []
-    for maps in (terrain, terrain, terrain.select(last)):
-        act = partial(predict, model, maps)
-        mixture = breaches.watch("predict", act, observation=maps.observe(), truth=maps.truth)
-        if mixture is NOTHING:
-            return
-        for value in _values(mixture).values():
-            told = f"Expected parameters on the observation's device {maps.rgb.device}, got {value.device}."
-            if not breaches.expect(value.device == maps.rgb.device, told):
-                return
-        _check_values(mixture, tolerance, breaches)
-        answers.append(mixture)
-    whole, again, alone = answers
-    told = "Expected the same answer for the same maps, got another when asked again."
-    breaches.expect(_alike(whole, again, 0), told)
-    told = "Expected of a map alone what was predicted of it in a batch, got something else."
-    breaches.expect(_alike(alone, whole.select(last), tolerance), told)
-    _check_classes(model, terrain, whole, tolerance, breaches)
+    is_sound = partial(_is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches)
+    given = {"observation": terrain}
+    mixture = breaches.try_function(
+        "predict", lambda observation: predict(model, observation), given, is_sound, tolerance
+    )
+    if mixture is not NOTHING:
+        _check_classes(model, terrain, mixture, tolerance, breaches)
 
 
-def _check_values(mixture: TraversabilityMixture, tolerance: float, breaches: Breaches) -> None:
-    """Tells what is wrong with a mixture by itself; its shape is known to fit."""
-    values, expect = _values(mixture), breaches.expect
+def _is_sound(
+    mixture: TraversabilityMixture, device: torch.device, tolerance: float, breaches: Breaches
+) -> bool:
+    """Tells what is wrong with a mixture by itself, whose shape is known to fit; false where it lies elsewhere."""
+    expect = breaches.expect
+    values = {"weights": mixture.weights, "means": mixture.means, "stds": mixture.stds}
+    for value in values.values():
+        breach = f"Expected parameters on the observation's device {device}, got {value.device}."
+        if not expect(value.device == device, breach):
+            return False
     dtypes = sorted({str(value.dtype) for value in values.values()})
     is_float = len(dtypes) == 1 and mixture.weights.is_floating_point()
     expect(is_float, f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.")
     for name, value in values.items():
         expect(bool(value.isfinite().all()), f"Expected finite `{name}`, got some that are not.")
-    for name in ("weights", "stds"):
-        expect(not bool((values[name] < 0).any()), f"Expected `{name}` ≥ 0, got some below.")
+        below = name != "means" and bool((value < 0).any())
+        expect(not below, f"Expected `{name}` ≥ 0, got some below.")
     sums = mixture.weights.double().sum(1)
-    is_whole = close(sums, torch.ones_like(sums), tolerance)
+    is_whole = same(sums, torch.ones_like(sums), tolerance)
     expect(is_whole, "Expected `weights` that sum to 1 over the components, got other sums.")
+    return True
 
 
 def _check_classes(
@@ -111,14 +107,14 @@ def _check_classes(
 ) -> None:
     """Tells where what a model says of classes does not fit its mixture."""
     names, group, expect = len(model.class_names), mixture.group, breaches.expect
-    components = mixture.weights.shape[1] if group is None else max(group) + 1
+    components = mixture.weights.shape[1]
     if group is None:
-        told = f"Expected a name in `class_names` for each of {components} components, got {names}."
-        fits = names == components
+        fits = names in (0, components)
+        breach = f"Expected a name in `class_names` for each of {components} components, got {names}."
     else:
-        told = f"Expected classes in `group` under {names}, the number of `class_names`, got {max(group)}."
-        fits = names >= components
-    if names and not expect(fits, told):
+        fits = names == 0 or names > max(group)
+        breach = f"Expected classes in `group` under {names}, the number of `class_names`, got {max(group)}."
+    if not expect(fits, breach):
         return
     act = partial(model.member_probabilities, terrain.observe())
     members = breaches.watch("member_probabilities", act, observation=terrain.observe())
@@ -132,10 +128,8 @@ def _check_classes(
     if expect(fits, f"Expected `member_probabilities` of shape {shape}, got {got}."):
         # A class that weighs more on average does not weigh less in the end, in any cell.
         falls = weights.gather(1, members.mean(0).argsort(1, descending=True)).diff(dim=1) <= tolerance
-        told = (
-            "Expected class probabilities in the order of the average of `member_probabilities`, got another."
-        )
-        expect(bool(falls.all()), told)
+        order = "in the order of the average of `member_probabilities`"
+        expect(bool(falls.all()), f"Expected class probabilities {order}, got another.")
 
 
 def _make_terrain(recipe: str, height: int, width: int, device: torch.device) -> Terrain:
@@ -153,12 +147,3 @@ def _make_terrain(recipe: str, height: int, width: int, device: torch.device) ->
         splits={"contract": Split(scenario=name, maps=_MAPS)},
     )
     return terrain_of(generate(made, "contract", np.arange(_MAPS)), made).to(device)
-
-
-def _values(mixture: TraversabilityMixture) -> dict[str, Tensor]:
-    return {"weights": mixture.weights, "means": mixture.means, "stds": mixture.stds}
-
-
-def _alike(first: TraversabilityMixture, second: TraversabilityMixture, tolerance: float) -> bool:
-    pairs = zip(_values(first).values(), _values(second).values(), strict=True)
-    return all(close(*pair, tolerance) for pair in pairs)

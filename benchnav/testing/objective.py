@@ -1,6 +1,7 @@
 """The contract of objectives, tried on random states, actions and ground. Letters in shapes: *B leading."""
 
-import math
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -8,12 +9,8 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.planning.free_space import Rules
-from benchnav.planning.objective import Objective
-from benchnav.planning.robots import Robot, Unicycle
-from benchnav.testing.breaches import NOTHING, Breaches
-from benchnav.testing.robot import LEADING, draw
-
-_SEED = 20240229
+from benchnav.planning.robots import Unicycle
+from benchnav.testing.breaches import NOTHING, Breaches, Draws
 
 
 def check_objective(objective: Any, robot: Any = None, device: torch.device | str = "cpu") -> None:
@@ -35,35 +32,26 @@ def check_objective(objective: Any, robot: Any = None, device: torch.device | st
     driven, rules = registry.take("robot", robot or Unicycle()), Rules()
     made = registry.take("objective", objective, robot=driven, goal_radius_m=rules.goal_radius_m)
     breaches = Breaches("objective", type(made).__name__)
-    for dtype in (torch.float32, torch.float64):
-        for leading in LEADING:
-            breaches.place = f"*B = {list(leading)}, {dtype}"
-            like = torch.zeros(1, dtype=dtype, device=device)
-            _try(made, driven, leading, rules.min_traversability, like, breaches)
+    for draws in breaches.batches(device):
+
+        def trial(method: str, draws: Draws = draws, **given: Tensor) -> Any:
+            is_cost = partial(
+                breaches.expect_tensor, f"what `{method}` gives", like=draws.like, shape=draws.leading
+            )
+            return breaches.try_function(method, getattr(made, method), given, is_cost)
+
+        pose = draws.uniform((0, 0, -3), (9, 9, 3)).reshape(-1, 3)
+        state = driven.initial_state(pose).reshape(*draws.leading, -1)
+        ground = torch.linspace(0, 1, len(pose)).to(pose).reshape(draws.leading)
+        one_each = replace(draws, leading=(draws.leading[0], *[1] * (len(draws.leading) - 1)))
+        target = one_each.uniform((0, 0), (9, 9))
+        action = draws.uniform(driven.action_low, driven.action_high)
+        trial("stage", state=state, action=action, traversability=ground, target=target)
+        trial("terminal", state=state, traversability=ground, target=target)
+        grade = draws.uniform([-1], [1])[..., 0]
+        cost = trial("path_cost", traversability=ground.clamp(min=rules.min_traversability), grade=grade)
+        breaches.expect(
+            cost is NOTHING or bool((cost > 0).all()),
+            "Expected costs above 0 from `path_cost`, got others. Let no metre of a path be free.",
+        )
     breaches.refuse()
-
-
-def _try(
-    objective: Objective,
-    robot: Robot,
-    leading: tuple[int, ...],
-    least: float,
-    like: Tensor,
-    breaches: Breaches,
-) -> None:
-    generator = torch.Generator().manual_seed(_SEED)
-    pose = draw((0, 0, -3), (9, 9, 3), (math.prod(leading),), like, generator)
-    state = robot.initial_state(pose).reshape(*leading, -1)
-    ground = torch.linspace(0, 1, len(pose)).to(like).reshape(leading)
-    target = draw((0, 0), (9, 9), (leading[0], *[1] * (len(leading) - 1)), like, generator)
-    ended = {"state": state, "traversability": ground, "target": target}
-    action = draw(robot.action_low, robot.action_high, leading, like, generator)
-    breaches.try_function("stage", objective.stage, {**ended, "action": action}, leading)
-    breaches.try_function("terminal", objective.terminal, ended, leading)
-    grade = draw([-1], [1], leading, like, generator)[..., 0]
-    metre = {"traversability": ground.clamp(min=least), "grade": grade}
-    cost = breaches.try_function("path_cost", objective.path_cost, metre, leading)
-    above = cost is NOTHING or bool((cost > 0).all())
-    breaches.expect(
-        above, "Expected costs above 0 from `path_cost`, got others. Let no metre of a path be free."
-    )

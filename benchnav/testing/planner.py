@@ -66,7 +66,7 @@ def check_planner(
     """
     made = registry.take("planner", planner)
     breaches = Breaches("planner", type(made).__name__)
-    named = made.steers is None or (isinstance(made.steers, tuple) and all(map(_are_texts, made.steers)))
+    named = made.steers is None or (isinstance(made.steers, tuple) and all(map(_are_lines, made.steers)))
     breaches.expect(named, f"Expected `steers` as tuples of action names, got {made.steers!r}.")
     breaches.expect(isinstance(made.blind, bool), f"Expected `blind` of type bool, got {made.blind!r}.")
     breaches.refuse()
@@ -87,8 +87,8 @@ def check_planner(
     breaches.refuse()
 
 
-def _are_texts(values: Any) -> bool:
-    return isinstance(values, tuple) and all(isinstance(value, str) for value in values)
+def _are_lines(values: Any) -> bool:
+    return isinstance(values, tuple) and all(isinstance(line, str) and "\n" not in line for line in values)
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class _Trial:
         alone, plan_state = problem.select(last), self.begin(problem.select(last))
         for step, action in tried[:_STEPS]:
             breach = "Expected for an episode alone the action that it got in a batch, got another."
-            plan_state = self.expect_action(breach, _of(step, last), action[last], plan_state, alone, False)
+            plan_state = self.expect_action(breach, step.select(last), action[last], plan_state, alone, False)
         act = partial(self.planner.select, following, two)
         kept = NOTHING if following is NOTHING else self.breaches.watch("select", act, plan_state=following)
         if kept is not NotImplemented:
@@ -135,7 +135,7 @@ class _Trial:
                 "Expected of episodes that `select` keeps the actions that they got among all, got others."
             )
             step, action = tried[1]
-            self.expect_action(breach, _of(step, two), action[two], kept, problem.select(two), False)
+            self.expect_action(breach, step.select(two), action[two], kept, problem.select(two), False)
         self.begin(_with_other_prediction(problem.select(two)))
         self.expect_action(
             "Expected the first step's action to be the same after other steps and problems, got another. "
@@ -191,9 +191,9 @@ class _Trial:
         watch, expect, task = self.breaches.watch, self.breaches.expect, self.problem.task
         follows = watch("follows", lambda: self.planner.follows(task))
         remarks = watch("remarks", lambda: self.planner.remarks(task))
-        is_line = follows is NOTHING or (isinstance(follows, str) and "\n" not in follows)
+        is_line = follows is NOTHING or _are_lines((follows,))
         expect(is_line, "Expected `follows` to give a single line, got something else.")
-        are_lines = remarks is NOTHING or (_are_texts(remarks) and "\n" not in "".join(remarks))
+        are_lines = remarks is NOTHING or _are_lines(remarks)
         expect(are_lines, "Expected `remarks` to give a tuple of single lines, got something else.")
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:
@@ -210,10 +210,6 @@ class _Trial:
     def check_layers(self, plan: Plan) -> None:
         for fault in find_layer_faults(plan, self.problem):
             self.breaches.expect(False, fault)
-
-
-def _of(step: Step, members: Tensor) -> Step:
-    return replace(step, state=step.state[members], traversability=step.traversability[members])
 
 
 def _with_other_prediction(problem: Problem) -> Problem:

@@ -1,6 +1,7 @@
 """The contract of robots, tried on random states and actions. Letters in shapes: *B leading, S state, A action."""
 
 import math
+from functools import partial
 from typing import Any
 
 import torch
@@ -8,11 +9,7 @@ from torch import Tensor
 
 from benchnav.core import registry
 from benchnav.planning.robots import Robot
-from benchnav.testing.breaches import NOTHING, Breaches, close, same
-
-LEADING = ((6,), (6, 5), (6, 5, 2))
-
-_SEED = 20240229
+from benchnav.testing.breaches import NOTHING, Breaches, Draws, same
 
 
 def check_robot(robot: Any, device: torch.device | str = "cpu", stands_at_zero: bool = True) -> None:
@@ -45,42 +42,34 @@ def check_robot(robot: Any, device: torch.device | str = "cpu", stands_at_zero: 
     limited = rates is None or (len(rates) == count and min(rates) > 0)
     breaches.expect(limited, f"Expected `action_rates` > 0 of {count} actions, got {rates}.")
     breaches.refuse()
-    for dtype in (torch.float32, torch.float64):
-        for leading in LEADING:
-            breaches.place = f"*B = {list(leading)}, {dtype}"
-            _drive(made, leading, torch.zeros(1, dtype=dtype, device=device), stands_at_zero, breaches)
+    for draws in breaches.batches(device):
+        _drive(made, draws, stands_at_zero, breaches)
     breaches.refuse()
 
 
-def draw(low: Any, high: Any, leading: tuple[int, ...], like: Tensor, generator: torch.Generator) -> Tensor:
-    """Uniform numbers between bounds of length N, shape [*B, N], in the dtype and on the device of a tensor."""
-    least, most = like.new_tensor(low), like.new_tensor(high)
-    return least + (most - least) * torch.rand(*leading, len(least), generator=generator).to(like)
-
-
-def _drive(
-    robot: Robot, leading: tuple[int, ...], like: Tensor, stands_at_zero: bool, breaches: Breaches
-) -> None:
-    generator, expect = torch.Generator().manual_seed(_SEED), breaches.expect
-    pose = draw((0, 0, -3), (9, 9, 3), (math.prod(leading),), like, generator)
+def _drive(robot: Robot, draws: Draws, stands_at_zero: bool, breaches: Breaches) -> None:
+    expect, dtype = breaches.expect, draws.like.dtype
+    pose = draws.uniform((0, 0, -3), (9, 9, 3)).reshape(-1, 3)
     state = breaches.watch("initial_state", lambda: robot.initial_state(pose), pose=pose)
     begins = isinstance(state, Tensor) and same(state[..., :3], pose)
-    if not expect(
-        begins, f"Expected initial states in {like.dtype} that begin with the pose (x, y, θ), got others."
-    ):
+    breach = f"Expected initial states in {dtype} that begin with the pose (x, y, θ), got others."
+    if not expect(begins, breach):
         return
-    state = state.reshape(*leading, -1)
+    state = state.reshape(*draws.leading, -1)
     for _ in range(3):
-        action = draw(robot.action_low, robot.action_high, leading, like, generator)
-        ground = draw([0], [1], leading, like, generator)[..., 0]
-        given = {"state": state, "action": action, "traversability": ground}
-        moved = breaches.try_function("F", robot, given, state.shape)
+        action, ground = draws.uniform(robot.action_low, robot.action_high), draws.uniform([0], [1])[..., 0]
+        moved = breaches.try_function(
+            "F",
+            robot,
+            {"state": state, "action": action, "traversability": ground},
+            partial(breaches.expect_tensor, "what `F` gives", like=draws.like, shape=state.shape),
+        )
         if moved is NOTHING:
             return
         way = torch.linalg.vector_norm((moved - state)[..., :2], dim=-1)
         reach = 1.001 * robot.top_speed_mps * robot.dt_s
         expect(bool((way <= reach).all()), "Expected no step longer than `top_speed_mps` allows, got one.")
         stood = robot(state, action, torch.zeros_like(ground))
-        held = not stands_at_zero or close(stood[..., :2], state[..., :2], 1e-6)
+        held = not stands_at_zero or same(stood[..., :2], state[..., :2], 1e-6)
         expect(held, "Expected no way made on ground of λ = 0, got some. Say so with `stands_at_zero=False`.")
         state = moved

@@ -101,7 +101,7 @@ def test_what_is_not_imported_does_not(part: Path, name: str) -> None:
 
 def test_the_standard_library_and_what_is_installed_have_versions_instead(part: Path) -> None:
     content = PART + "import torch.nn, json, pytest, benchnav.core.errors\n"
-    modules = imported_sources(part.parent, [("", content.encode())])
+    modules = imported_sources(part.parent, "", content.encode())
     assert "late_aid" in modules
     assert not {name.partition(".")[0] for name in modules} & {
         "numpy",

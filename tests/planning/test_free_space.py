@@ -9,10 +9,11 @@ from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.planning.free_space import PENALTY, FreeSpace, Rules, cells_at_goal
 from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.astar.dwa import DWAConfig, held_paths, score
-from benchnav.planning.planners.mppi import rollout_cost, rollout_path
+from benchnav.planning.planners.astar.dwa import DWAConfig, score
+from benchnav.planning.planners.planner import rollout_path
 from benchnav.planning.problem import Problem
 from tests import factories
+from tests.planning.planners.driving import held_paths, rollout_cost
 
 
 def doubtful(mean: Tensor) -> TraversabilityMixture:

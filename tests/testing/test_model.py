@@ -178,8 +178,8 @@ BAD = {
     "PyTorch's seed": (meddling(lambda _: torch.manual_seed(54321)), "PyTorch's global generator"),
     "NumPy's generator": (meddling(lambda _: np.random.rand()), "NumPy's global generator"),  # noqa: NPY002
     "Python's generator": (meddling(lambda _: random.random()), "Python's global generator"),
-    "another answer": (Forgetful(), "got another when asked again"),
-    "an answer of the batch": (changed(of_batch), "Expected of a map alone"),
+    "another answer": (Forgetful(), "Expected the same from `predict` when asked again"),
+    "an answer of the batch": (changed(of_batch), "Expected the same from `predict` for one alone"),
     "too many names": (Misnamed(), "each of 2 components, got 3"),
     "members without names": (Nameless(), "`class_names` beside"),
     "members of another shape": (with_members(lambda weights: weights), "shape [M, 3, 2, 32, 32], got [3, 2, 32, 32]"),

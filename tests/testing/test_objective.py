@@ -41,7 +41,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "a path that is free": (changed("path_cost", lambda cost, *_: cost - 1), "Expected costs above 0 from `path_cost`"),
     "a path that pays": (changed("path_cost", lambda cost, *_: -cost), "Expected costs above 0 from `path_cost`"),
     "writes into the target": (changed("stage", lambda cost, *g: g[-1].zero_() is None or cost), "got another"),
-    "of λ̂ = 0 infinite": (changed("stage", lambda cost, s, ground, *_: cost / ground), "Expected finite what `stage`"),
+    "of λ̂ = 0 infinite": (changed("stage", lambda cost, *g: cost / g[2]), "Expected finite what `stage`"),
     **{
         f"{method}: {name}": (changed(method, change), expected.format(method))
         for method in METHODS
@@ -51,7 +51,7 @@ BAD: dict[str, tuple[Any, str]] = {
             ("knows [B] alone", lambda cost, *_: cost.flatten(), "[*B = [6, 5], torch.float32"),
             ("single precision", lambda cost, *_: cost.float(), "[*B = [6], torch.float64"),
             ("no number", lambda cost, *_: cost * torch.nan, "Expected finite what `{}` gives"),
-            ("a cost of the batch", lambda cost, *_: cost + cost.mean(), "the same from `{}` for an episode alone"),
+            ("a cost of the batch", lambda cost, *_: cost + cost.mean(), "the same from `{}` for one alone"),
             ("PyTorch's generator", lambda cost, *_: cost + 0 * torch.rand(1).to(cost), "PyTorch's global generator"),
             ("writes into λ̂", lambda cost, *g: [v.mul_(0.5) for v in g] and cost, "got another"),
         )

@@ -40,8 +40,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "below 0": (changed(lambda mean, _: -mean - 0.1), "λ̂ in [0, 1]"),
     "no number": (changed(lambda mean, _: mean * torch.nan), "λ̂ in [0, 1]"),
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
-    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "Expected of a map alone the λ̂"),
-    "another λ̂": (Forgetful(), "Expected the same λ̂ when asked again"),
+    "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "the same from `risk` for one alone"),
+    "another λ̂": (Forgetful(), "Expected the same from `risk` when asked again"),
     "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another mixture"),
     "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
     "NumPy's generator": (changed(lambda mean, _: mean + 0 * np.random.rand()), "NumPy's global"),  # noqa: NPY002

@@ -11,16 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.planning.planners.planner import Plan, Planner, Step
+from benchnav.planning.planners.planner import LAYERS, Plan, Planner, Step
 from benchnav.planning.problem import Problem
 
 NOT_FINITE = "Expected finite actions, got some that are not."
 
-# Dimensions of each layer of a `Plan`; the first is B, the last holds x and y.
-_LAYERS = {"path": 3, "samples": 4, "reference": 3, "tree": 4}
 
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Answer:
     """What a planner said, made safe.
 
@@ -66,24 +63,17 @@ def act(planner: Planner[Any], step: Step, plan_state: Any, problem: Problem) ->
         The answer. A wrong type, shape, dtype or device makes every episode faulty, an action that is not
         finite its own alone.
     """
-    given = replace(step, state=step.state.clone(), traversability=step.traversability.clone())
-    said = planner.plan(given, plan_state)
-    standing = standing_actions(problem)
-    fault = find_fault(said, problem)
-    if fault:
+    said = planner.plan(step.clone(), plan_state)
+    standing, nothing = standing_actions(problem), Plan.empty(len(problem), step.state.device)
+    if fault := find_fault(said, problem):
         everyone = torch.ones_like(step.traversability, dtype=torch.bool)
-        nothing = Plan.empty(len(problem), step.state.device)
-        return Answer(action=standing, plan_state=plan_state, plan=nothing, faulty=everyone, reason=fault)
+        return Answer(standing, plan_state, nothing, everyone, fault)
     action, following, plan = said
     faulty = ~action.detach().isfinite().all(dim=1)
     if find_layer_faults(plan, problem):
-        plan = Plan.empty(len(problem), step.state.device, status=plan.status)
+        plan = replace(nothing, status=plan.status)
     return Answer(
-        action=torch.where(faulty[:, None], standing, action.detach()),
-        plan_state=following,
-        plan=plan,
-        faulty=faulty,
-        reason=NOT_FINITE,
+        torch.where(faulty[:, None], standing, action.detach()), following, plan, faulty, NOT_FINITE
     )
 
 
@@ -104,18 +94,23 @@ def find_fault(said: Any, problem: Problem) -> str:
         return f"Expected (action, plan_state, Plan) from `plan`, got {got}."
     action, _, plan = said
     batch, like = len(problem), problem.start
-    shape = [batch, len(problem.robot.action_low)]
-    if not isinstance(action, Tensor):
-        return f"Expected actions as a tensor of shape {shape}, got {type(action).__name__}."
-    if list(action.shape) != shape:
-        return f"Expected actions of shape {shape}, got {list(action.shape)}."
-    if action.dtype != like.dtype:
-        return f"Expected actions of the states' dtype {like.dtype}, got {action.dtype}."
-    if action.device != like.device:
-        return f"Expected actions on the states' device {like.device}, got {action.device}."
+    if fault := find_tensor_fault(
+        "actions", action, like.dtype, (batch, len(problem.robot.action_low)), like.device
+    ):
+        return fault
     if not isinstance(plan, Plan):
         return f"Expected a Plan beside the actions, got {type(plan).__name__}."
-    return _status_fault(plan.status, batch, like.device)
+    return find_tensor_fault("`Plan.status`", plan.status, torch.int64, (batch,), like.device)
+
+
+def find_tensor_fault(
+    what: str, values: Any, dtype: torch.dtype, shape: tuple[int, ...], device: torch.device
+) -> str:
+    """Tells in one line what makes something another tensor than is expected; empty where nothing does."""
+    wanted, got = f"{dtype} of shape {list(shape)} on {device}", type(values).__name__
+    if isinstance(values, Tensor):
+        got = f"{values.dtype} of shape {list(values.shape)} on {values.device}"
+    return "" if got == wanted else f"Expected {what} as {wanted}, got {got}."
 
 
 def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
@@ -126,25 +121,10 @@ def find_layer_faults(plan: Plan, problem: Problem) -> list[str]:
         problem: B problems.
     """
     faults = []
-    for name, dimensions in _LAYERS.items():
-        layer = getattr(plan, name)
-        if not isinstance(layer, Tensor):
-            faults.append(f"Expected `Plan.{name}` as a tensor, got {type(layer).__name__}.")
-        elif layer.ndim != dimensions or layer.shape[0] != len(problem) or layer.shape[-1] != 2:
-            between = ", ".join(["M", "N"][4 - dimensions :])
-            faults.append(
-                f"Expected `Plan.{name}` of shape [{len(problem)}, {between}, 2], got {list(layer.shape)}."
-            )
+    for name, inner in LAYERS.items():
+        layer, batch = getattr(plan, name), len(problem)
+        got = list(layer.shape) if isinstance(layer, Tensor) else type(layer).__name__
+        fits = isinstance(layer, Tensor) and layer.ndim == len(inner) + 2
+        if not fits or (layer.shape[0], layer.shape[-1]) != (batch, 2):
+            faults.append(f"Expected `Plan.{name}` of shape [{batch}, {', '.join(inner)}, 2], got {got}.")
     return faults
-
-
-def _status_fault(status: Any, batch: int, device: torch.device) -> str:
-    if not isinstance(status, Tensor):
-        return f"Expected `Plan.status` as a tensor of shape [{batch}], got {type(status).__name__}."
-    if list(status.shape) != [batch]:
-        return f"Expected `Plan.status` of shape [{batch}], got {list(status.shape)}."
-    if status.dtype != torch.int64:
-        return f"Expected `Plan.status` as int64, got {status.dtype}."
-    if status.device != device:
-        return f"Expected `Plan.status` on the states' device {device}, got {status.device}."
-    return ""

@@ -59,8 +59,10 @@ class Fused(Generic[R]):
 
     def __call__(self, *args: Any) -> R:
         """Calls the function."""
-        if self.compiled is None and not self._wanted(args[0]):
-            self.compiled = False
+        if self.compiled is None:
+            worth = worth_compiling(self._rollouts, self._least, args[0].device)
+            if torch._dynamo.config.disable or not worth:
+                self.compiled = False
         if self.compiled is False:
             return self._function(*args)
         if self._fused is None:
@@ -98,27 +100,18 @@ class Fused(Generic[R]):
             torch.get_num_threads(),
         ]
         for place, arg in enumerate(args):
-            if not isinstance(arg, torch.Tensor):
-                found.append(_key(arg))
-            elif place in self._batched:
-                found.append((arg.shape[0] > 1, arg.shape[1:], arg.dtype, arg.device))
+            if isinstance(arg, torch.Tensor):
+                shape = (len(arg) > 1, arg.shape[1:]) if place in self._batched else arg.shape
+                found.append((shape, arg.dtype, arg.device))
             else:
-                found.append((arg.shape, arg.dtype, arg.device))
+                found.append(_key(arg))
         return tuple(found)
 
-    def _mark(self, args: tuple[object, ...]) -> None:
+    def _mark(self, args: tuple[Any, ...]) -> None:
         """Lets the number of episodes be any, but one."""
         for place in self._batched:
-            tensor = args[place]
-            assert isinstance(tensor, torch.Tensor)
-            if len(tensor) > 1:
-                torch._dynamo.maybe_mark_dynamic(tensor, 0)
-
-    def _wanted(self, example: object) -> bool:
-        assert isinstance(example, torch.Tensor)
-        return (
-            worth_compiling(self._rollouts, self._least, example.device) and not torch._dynamo.config.disable
-        )
+            if len(args[place]) > 1:
+                torch._dynamo.maybe_mark_dynamic(args[place], 0)
 
 
 @contextmanager

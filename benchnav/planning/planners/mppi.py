@@ -32,9 +32,9 @@ from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.noise import NoiseBank, draw_bank
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step, check_finite
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
-from benchnav.planning.robots import Robot, component_wise
+from benchnav.planning.robots import Robot, component_wise, steps_in
 
 # A chunk of the horizon compiles in seconds and runs as fast as the whole of it unrolled.
 _CHUNK_STEPS = 10
@@ -78,14 +78,6 @@ class MPPIConfig:
         if self.noise is not None and not (self.noise and all(0 < scale < math.inf for scale in self.noise)):
             raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
 
-    def steps(self, dt_s: float) -> int:
-        """Steps T of the horizon for a time step."""
-        return max(1, round(self.horizon_s / dt_s))
-
-    def scale(self, low: Tensor, high: Tensor) -> Tensor:
-        """Standard deviations of the noise for actions within bounds [A], shape [A]."""
-        return self.noise_share * (high - low) if self.noise is None else low.new_tensor(self.noise)
-
 
 @dataclass(frozen=True)
 class MPPIState:
@@ -106,7 +98,7 @@ class MPPIState:
     step: int
 
 
-class MPPI(Planner[MPPIState], LocalPlanner[MPPIState]):
+class MPPI(LocalPlanner[MPPIState]):
     """Model predictive path integral control: sampled action sequences, weighed by their cost.
 
     Args:
@@ -142,13 +134,10 @@ class MPPI(Planner[MPPIState], LocalPlanner[MPPIState]):
             )
         seed = int(torch.randint(2**62, (), generator=generator))
         low, high = problem.action_bounds
-        mean = problem.start.new_zeros(len(problem), config.steps(problem.dt_s), len(names))
-        scale = config.scale(low, high)
-        return MPPIState(problem, mean, scale, draw_bank(seed, mean.shape[1], config.samples, scale), 0)
-
-    def plan(self, step: Step, plan_state: MPPIState) -> tuple[Tensor, MPPIState, Plan]:
-        """Solves one step toward the goal; see `Planner`."""
-        return self.plan_toward(step, plan_state, plan_state.problem.goal_m)
+        horizon = steps_in(config.horizon_s, problem.dt_s)
+        mean = problem.start.new_zeros(len(problem), horizon, len(names))
+        scale = config.noise_share * (high - low) if config.noise is None else low.new_tensor(config.noise)
+        return MPPIState(problem, mean, scale, draw_bank(seed, horizon, config.samples, scale), 0)
 
     def plan_toward(
         self, step: Step, plan_state: MPPIState, target_m: Tensor
@@ -165,9 +154,8 @@ class MPPI(Planner[MPPIState], LocalPlanner[MPPIState]):
             config.temperature, config.temperature_share,
         )  # fmt: skip
         shifted = torch.cat((updated[:, 1:], updated[:, -1:]), dim=1)
-        plan = Plan.empty(len(problem), step.state.device)
-        if step.draw:
-            plan = _drawn(problem, step.state, updated, mean, noise, weights)
+        layers = _drawn(problem, step.state, updated, mean, noise, weights) if step.draw else {}
+        plan = Plan.empty(len(problem), step.state.device, **layers)
         return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
 
     def select(self, plan_state: MPPIState, members: Tensor) -> MPPIState:
@@ -189,23 +177,6 @@ def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:
     return torch.einsum("bta,tak->bk", mean / scale**2, noise)
 
 
-def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor) -> Tensor:
-    """Sums J and the penalty of ground that is not free along sampled action sequences.
-
-    Args:
-        problem: B problems.
-        state: initial states, shape [B, S].
-        mean: mean action sequences, shape [B, T, A].
-        noise: added to every mean and clipped to the action bounds, shape [T, A, K].
-        target_m: (x, y) to be reached, shape [B, 2].
-
-    Returns:
-        Cost of each sequence, shape [B, K].
-    """
-    states, cost = roll_out(problem, state, mean, noise, target_m, advance_chunk)
-    return cost + problem.terminal_cost(states, target_m[:, None])
-
-
 def roll_out(
     problem: Problem,
     state: Tensor,
@@ -214,7 +185,15 @@ def roll_out(
     target_m: Tensor,
     advance: Callable[..., tuple[Tensor, Tensor]],
 ) -> tuple[Tensor, Tensor]:
-    """Rolls sampled action sequences out; arguments as for `rollout_cost`, and `advance_chunk` or the same compiled.
+    """Rolls sampled action sequences out, summing J and the penalty of ground that is not free.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        mean: mean action sequences, shape [B, T, A].
+        noise: added to every mean and clipped to the action bounds, shape [T, A, K].
+        target_m: (x, y) to be reached, shape [B, 2].
+        advance: `advance_chunk` or the same compiled.
 
     Returns:
         The last states, shape [B, K, S], and the cost but for theirs, shape [B, K].
@@ -230,25 +209,6 @@ def roll_out(
             problem.task.rules.min_traversability,
         )  # fmt: skip
     return states, cost
-
-
-def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
-    """Positions along action sequences, the first included.
-
-    Args:
-        problem: B problems.
-        state: initial states, shape [B, S].
-        actions: shape [B, T, A, K].
-
-    Returns:
-        Shape [B, K, T + 1, 2].
-    """
-    states = state[:, None].expand(-1, actions.shape[-1], -1)
-    positions = [states[..., :2]]
-    for action in actions.movedim(-1, 2).unbind(1):
-        states = problem.robot(states, action, problem.traversability_at(states))
-        positions.append(states[..., :2])
-    return torch.stack(positions, dim=2)
 
 
 def advance_chunk(
@@ -312,9 +272,9 @@ def _perturb(mean: Tensor, noise: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 def _drawn(
     problem: Problem, state: Tensor, updated: Tensor, mean: Tensor, noise: Tensor, weights: Tensor
-) -> Plan:
+) -> dict[str, Tensor]:
     """The path of the updated mean, and those of the best samples about the mean before."""
     best = weights.topk(min(_DRAWN_SAMPLES, weights.shape[1]), dim=1).indices
     samples = _perturb(mean[..., None], noise[..., best].movedim(2, 0), *problem.action_bounds)
     paths = rollout_path(problem, state, torch.cat((updated[..., None], samples), dim=3))
-    return Plan.empty(len(problem), state.device, path=paths[:, 0], samples=paths[:, 1:])
+    return {"path": paths[:, 0], "samples": paths[:, 1:]}

@@ -7,7 +7,7 @@ S state and A action dimensions.
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Generic, TypeVar
 
@@ -15,8 +15,11 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.problem import Problem, Task
+from benchnav.planning.problem import Batch, Problem, Task
 from benchnav.planning.robots import Robot
+
+# What a `Plan` draws, with the dimensions of each layer between that of the episodes and (x, y).
+LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}
 
 
 class PlanStatus(IntEnum):
@@ -28,7 +31,7 @@ class PlanStatus(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
+class Step(Batch):
     """What a planner is told at each step.
 
     Args:
@@ -67,18 +70,15 @@ class Plan:
     @classmethod
     def empty(cls, batch: int, device: torch.device | str = "cpu", **known: Tensor) -> "Plan":
         """Makes a plan with status OK and nothing to draw but what is given."""
-        blank: dict[str, Tensor] = {
-            "status": torch.zeros(batch, dtype=torch.int64, device=device),
-            "path": torch.empty(batch, 0, 2, device=device),
-            "samples": torch.empty(batch, 0, 0, 2, device=device),
-            "reference": torch.empty(batch, 0, 2, device=device),
-            "tree": torch.empty(batch, 0, 0, 2, device=device),
+        blank = {
+            name: torch.empty(batch, *[0] * len(inner), 2, device=device) for name, inner in LAYERS.items()
         }
-        return cls(**{**blank, **known})
+        status = torch.zeros(batch, dtype=torch.int64, device=device)
+        return cls(**{"status": status, **blank, **known})
 
     def lines(self, member: int) -> dict[str, Tensor]:
         """What is drawn of one episode, by layer: polylines, shape [lines, N, 2]."""
-        layers = {f.name: getattr(self, f.name)[member] for f in fields(self) if f.name != "status"}
+        layers = {name: getattr(self, name)[member] for name in LAYERS}
         return {name: layer if layer.dim() == 3 else layer[None] for name, layer in layers.items()}
 
 
@@ -148,20 +148,18 @@ class Planner(ABC, Generic[State]):
         return ()
 
 
-class LocalPlanner(ABC, Generic[State]):
-    """The base class of local planners: planners that are told where to go at each step."""
+class LocalPlanner(Planner[State]):
+    """The base class of local planners: planners that are told where to go at each step.
+
+    Its plan states have a `problem`; by itself it plans toward the goal.
+    """
 
     name: str
     """What tables call it."""
 
-    @property
-    def compiled(self) -> bool | None:
-        """See `Planner`."""
-        return None
-
-    @abstractmethod
-    def init(self, problem: Problem, generator: torch.Generator) -> State:
-        """Prepares to plan; see `Planner`."""
+    def plan(self, step: Step, plan_state: Any) -> tuple[Tensor, State, Plan]:
+        """Plans toward the goal; see `Planner`."""
+        return self.plan_toward(step, plan_state, plan_state.problem.goal_m)
 
     @abstractmethod
     def plan_toward(self, step: Step, plan_state: State, target_m: Tensor) -> tuple[Tensor, State, Plan]:
@@ -211,3 +209,22 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
             f"Expected a robot with actions {actions} for planner {name!r}, got {type(robot).__name__} with "
             f"({', '.join(robot.action_names)}). Take a planner that samples actions, such as mppi."
         )
+
+
+def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:
+    """Positions along action sequences, the first included.
+
+    Args:
+        problem: B problems.
+        state: initial states, shape [B, S].
+        actions: shape [B, T, A, K].
+
+    Returns:
+        Shape [B, K, T + 1, 2].
+    """
+    states = state[:, None].expand(-1, actions.shape[-1], -1)
+    positions = [states[..., :2]]
+    for action in actions.movedim(-1, 2).unbind(1):
+        states = problem.robot(states, action, problem.traversability_at(states))
+        positions.append(states[..., :2])
+    return torch.stack(positions, dim=2)

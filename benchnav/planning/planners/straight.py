@@ -25,6 +25,13 @@ _CREEP = 0.3
 STEERS = ((SPEED, TURN_RATE), (SPEED, STEERING))
 
 
+def turn_toward(state: Tensor, target_m: Tensor) -> Tensor:
+    """Angles from the headings of states [*B, S] to positions [*B, 2], in [−π, π), shape [*B]."""
+    offset = target_m - state[..., :2]
+    missing = torch.atan2(offset[..., 1], offset[..., 0]) - state[..., 2]
+    return torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
+
+
 def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     """Actions that turn toward a target and drive at it, once the robot looks there.
 
@@ -36,15 +43,13 @@ def steer_toward(state: Tensor, target_m: Tensor, robot: Robot) -> Tensor:
     Returns:
         Actions within the bounds, shape [B, 2].
     """
-    offset = target_m - state[:, :2]
-    missing = torch.atan2(offset[:, 1], offset[:, 0]) - state[:, 2]
-    missing = torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
+    missing = turn_toward(state, target_m)
     low, high, rates = robot.action_low, robot.action_high, robot.action_rates
     # A robot of limited acceleration has to be able to end its turn in time.
     gain = _TURN_GAIN if rates is None else min(_TURN_GAIN, 2 * rates[1] / high[1])
     least = 0.0 if TURN_RATE in robot.action_names else _CREEP
     aligned = high[0] * (1 - missing.abs() / _AWAY_RAD).clamp(min=least)
-    speed = torch.minimum(aligned, _APPROACH * torch.linalg.vector_norm(offset, dim=1))
+    speed = torch.minimum(aligned, _APPROACH * torch.linalg.vector_norm(target_m - state[:, :2], dim=1))
     actions = zip((speed, gain * missing), low, high, strict=True)
     return torch.stack([action.clamp(least, most) for action, least, most in actions], dim=1)
 

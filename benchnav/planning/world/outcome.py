@@ -8,6 +8,8 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+from benchnav.planning.robots import steps_in
+
 STUCK_WINDOW_S = 10.0
 STUCK_DISTANCE_M = 0.5
 
@@ -47,7 +49,7 @@ def tell_standstill(
     """
     if driven_m.shape[1] == 0:
         return outcome
-    window = max(1, round(STUCK_WINDOW_S / dt_s))
+    window = steps_in(STUCK_WINDOW_S, dt_s)
     back = torch.arange(-window, 1, device=steps.device)
     place = (steps[:, None] + back).clamp(min=0)
     recent = positions_m.gather(1, place[..., None].expand(-1, -1, 2))

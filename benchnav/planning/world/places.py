@@ -11,10 +11,11 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from benchnav.core.grid import Grid
+from benchnav.planning.problem import Batch
 
 
 @dataclass(frozen=True, kw_only=True)
-class Places:
+class Places(Batch):
     """Where episodes begin and end.
 
     Args:
@@ -26,22 +27,6 @@ class Places:
     start_m: Tensor
     goal_m: Tensor
     reference_time_s: Tensor
-
-    def select(self, members: Tensor) -> "Places":
-        """Keeps some episodes, by index, shape [M]."""
-        return Places(
-            start_m=self.start_m[members],
-            goal_m=self.goal_m[members],
-            reference_time_s=self.reference_time_s[members],
-        )
-
-    def to(self, device: torch.device | str) -> "Places":
-        """The same on a device."""
-        return Places(
-            start_m=self.start_m.to(device),
-            goal_m=self.goal_m.to(device),
-            reference_time_s=self.reference_time_s.to(device),
-        )
 
 
 def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:

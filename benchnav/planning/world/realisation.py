@@ -13,7 +13,6 @@ from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError
-from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.planning.world.frozen import draw_frozen
@@ -62,7 +61,10 @@ class Realisation:
         if self.field is not None:
             self._ground = terrain.grid.pad(self.field, outside=0.0)[:, None]
             return
-        self._ground = _padded_parameters(terrain.truth, terrain.grid)
+        truth, grid = terrain.truth, terrain.grid
+        parameters = torch.cat((truth.weights, truth.means, truth.stds), dim=1)
+        # Framed for lookups, shape [B, 3·K, N].
+        self._ground = torch.stack([grid.pad(layer, outside=0.0) for layer in parameters.unbind(1)], dim=1)
         # A stream each, so that another time budget leaves the noise of the first steps as it is.
         first = np.zeros(1, dtype=np.int64)
         noise = [rng.normal(rng.stream_key(key, int(i)), first, (steps,)) for i in maps]
@@ -124,9 +126,3 @@ def check_known(terrain: Terrain, world: World) -> None:
             "Expected maps with λ in every cell for `noise` 'stored', got some that were not observed. "
             "Take `noise` 'resampled'."
         )
-
-
-def _padded_parameters(truth: TraversabilityMixture, grid: Grid) -> Tensor:
-    """Weights, means and stds framed for lookups, shape [B, 3·K, N]."""
-    maps = torch.cat((truth.weights, truth.means, truth.stds), dim=1)
-    return torch.stack([grid.pad(layer, outside=0.0) for layer in maps.unbind(1)], dim=1)

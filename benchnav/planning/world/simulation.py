@@ -13,6 +13,7 @@ from torch import Tensor
 from benchnav.core.terrain import Terrain
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Task
+from benchnav.planning.robots import steps_in
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.realisation import Realisation
@@ -56,6 +57,8 @@ class Simulation:
         robot: F.
         time_budget_s: T of each episode, shape [B].
         steps: T in time steps, int64, shape [B].
+        field: the λ of every cell where it stays what it is, shape [B, H, W]; None where it is resampled.
+        attempts: how many fields were drawn until ground joined start and goal, int64, shape [B].
     """
 
     def __init__(
@@ -74,14 +77,11 @@ class Simulation:
         self._grid, self._goal_m, self._goal_radius_m = terrain.grid, places.goal_m, task.rules.goal_radius_m
         most = int(self.steps.max())
         self._realisation = Realisation(terrain, world, places, most, noise_key, maps)
+        # Which `exchange_` changes in place.
+        self.field, self.attempts = self._realisation.field, self._realisation.attempts
         self._immobile = world.immobile
         self._low = places.goal_m.new_tensor(task.robot.action_low)
         self._high = places.goal_m.new_tensor(task.robot.action_high)
-
-    @property
-    def field(self) -> Tensor | None:
-        """The λ of every cell where it stays what it is, shape [B, H, W]; None where it is resampled."""
-        return self._realisation.field
 
     @property
     def immobilising(self) -> Tensor:
@@ -90,11 +90,6 @@ class Simulation:
             size = (len(self._goal_m), *self._grid.shape)
             return torch.zeros(size, dtype=torch.bool, device=self._goal_m.device)
         return self.field < self._immobile.below
-
-    @property
-    def attempts(self) -> Tensor:
-        """How many fields were drawn until ground joined start and goal, int64, shape [B]."""
-        return self._realisation.attempts
 
     def init(self, start: Tensor) -> SimulationState:
         """Puts the robots at their initial states, shape [B, S]."""
@@ -122,7 +117,7 @@ class Simulation:
         held = now.held
         if self._immobile is not None:
             held = torch.where(traversability < self._immobile.below, held + 1, 0)
-            most = max(1, round(self._immobile.for_s / self.robot.dt_s))
+            most = steps_in(self._immobile.for_s, self.robot.dt_s)
             outcome = torch.where(held >= most, Outcome.IMMOBILISED, outcome)
         outcome = torch.where(inside, outcome, Outcome.OUT_OF_BOUNDS)
         outcome = torch.where(arrived, Outcome.SUCCESS, outcome)

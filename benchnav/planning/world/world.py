@@ -70,7 +70,7 @@ class World:
                 "Expected either `time_budget_s` or `time_budget_ratio`, got "
                 f"{self.time_budget_s} and {self.time_budget_ratio}."
             )
-        for name in ("time_budget_s", "time_budget_ratio"):
+        for name in _BUDGETS:
             value = getattr(self, name)
             if value is not None and not 0 < value < float("inf"):
                 raise ConfigError(f"Expected `{name}` > 0 and finite, got {value}.")

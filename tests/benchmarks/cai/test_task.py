@@ -8,7 +8,7 @@ from benchmarks.cai.ground import DIRT, VEGETATION
 from benchmarks.cai.task import ROVER, Setup, pose, predict, tail_share
 from benchmarks.cai.world import draw_vegetation
 from benchnav.core.errors import ConfigError
-from benchnav.planning.planners.mppi import rollout_cost
+from tests.planning.planners.driving import rollout_cost
 
 VEGETATED = draw_vegetation(0, np.arange(2), 0.4)
 

@@ -10,7 +10,8 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
 from benchnav.core import rng
-from benchnav.planning.planners.planner import Step
+from benchnav.planning.planners.mppi import advance_chunk, roll_out
+from benchnav.planning.planners.planner import Step, rollout_path
 from benchnav.planning.problem import Problem
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World
@@ -78,3 +79,14 @@ def fake_cuda(problem: Problem) -> Iterator[Problem]:
 
 def on_cuda(*tensors: Tensor) -> bool:
     return all(tensor.device.type == "cuda" for tensor in tensors)
+
+
+def rollout_cost(problem: Problem, state: Tensor, mean: Tensor, noise: Tensor, target_m: Tensor) -> Tensor:
+    """J and the penalty of ground that is not free along MPPI's sampled action sequences, shape [B, K]."""
+    states, cost = roll_out(problem, state, mean, noise, target_m, advance_chunk)
+    return cost + problem.terminal_cost(states, target_m[:, None])
+
+
+def held_paths(problem: Problem, state: Tensor, pairs: Tensor, steps: int) -> Tensor:
+    """Positions along pairs (v, ω) [B, M, 2] that are held, the first included, shape [B, M, T + 1, 2]."""
+    return rollout_path(problem, state, pairs.mT[:, None].expand(-1, steps, -1, -1))

@@ -97,27 +97,27 @@ def test_a_learned_policys_graph_is_not_kept() -> None:
 WHOLE = {
     "nothing": ((None,), "Expected (action, plan_state, Plan) from `plan`, got NoneType."),
     "two values": ((ahead(), None), "got 2 values."),
-    "a list": (([[1.0, 0.0]] * BATCH, None, Plan.empty(BATCH)), "tensor of shape [3, 2], got list."),
-    "one action for all": ((ahead()[:1], None, Plan.empty(BATCH)), "Expected actions of shape [3, 2], got [1, 2]."),
-    "one number an action": ((ahead()[:, :1], None, Plan.empty(BATCH)), "got [3, 1]."),
-    "doubles": ((ahead().double(), None, Plan.empty(BATCH)), "dtype torch.float32, got torch.float64."),
-    "elsewhere": ((ahead().to("meta"), None, Plan.empty(BATCH)), "device cpu, got meta."),
+    "a list": (([[1.0, 0.0]] * BATCH, None, Plan.empty(BATCH)), "of shape [3, 2] on cpu, got list."),
+    "one action for all": ((ahead()[:1], None, Plan.empty(BATCH)), "got torch.float32 of shape [1, 2] on cpu."),
+    "one number an action": ((ahead()[:, :1], None, Plan.empty(BATCH)), "got torch.float32 of shape [3, 1] on cpu."),
+    "doubles": ((ahead().double(), None, Plan.empty(BATCH)), "got torch.float64 of shape [3, 2] on cpu."),
+    "elsewhere": ((ahead().to("meta"), None, Plan.empty(BATCH)), "got torch.float32 of shape [3, 2] on meta."),
     "no plan": ((ahead(), None, None), "Expected a Plan beside the actions, got NoneType."),
     "a status for all": (
         (ahead(), None, Plan.empty(BATCH, status=torch.zeros(1, dtype=torch.int64))),
-        "`Plan.status` of shape [3], got [1].",
+        "`Plan.status` as torch.int64 of shape [3] on cpu, got torch.int64 of shape [1] on cpu.",
     ),
     "a status by name": (
         (ahead(), None, replace(Plan.empty(BATCH), status=PlanStatus.OK)),
-        "`Plan.status` as a tensor of shape [3], got PlanStatus.",
+        "of shape [3] on cpu, got PlanStatus.",
     ),
     "a status of floats": (
         (ahead(), None, Plan.empty(BATCH, status=torch.zeros(BATCH))),
-        "`Plan.status` as int64, got torch.float32.",
+        "got torch.float32 of shape [3] on cpu.",
     ),
     "a status elsewhere": (
         (ahead(), None, Plan.empty(BATCH, status=torch.zeros(BATCH, dtype=torch.int64, device="meta"))),
-        "device cpu, got meta.",
+        "got torch.int64 of shape [3] on meta.",
     ),
 }  # fmt: skip
 
@@ -157,7 +157,7 @@ def test_layers_that_cannot_be_drawn_are_left_out_and_harm_no_episode() -> None:
     samples = replace(Plan.empty(BATCH), samples=torch.rand(BATCH, 4, 2), tree=None)  # type: ignore[arg-type]
     assert find_layer_faults(samples, problem()) == [
         "Expected `Plan.samples` of shape [3, M, N, 2], got [3, 4, 2].",
-        "Expected `Plan.tree` as a tensor, got NoneType.",
+        "Expected `Plan.tree` of shape [3, E, N, 2], got NoneType.",
     ]
 
 

@@ -15,7 +15,7 @@ from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
-from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda
+from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, rollout_cost
 
 SMALL = MPPIConfig(samples=256, horizon_s=2)
 
@@ -27,7 +27,7 @@ def test_rollout_cost_equals_a_loop_over_samples() -> None:
     target = problem.goal_m + 0.3
     mean = torch.rand(2, 13, 2, generator=generator(1))
     noise = torch.randn(13, 2, 5, generator=generator(2))
-    cost = mppi.rollout_cost(problem, problem.start, mean, noise, target)
+    cost = rollout_cost(problem, problem.start, mean, noise, target)
     for b in range(2):
         for k in range(5):
             x, y, heading = problem.start[b].tolist()
@@ -64,7 +64,7 @@ def test_the_mean_is_moved_by_the_softmax_average_of_the_noise(
     state = replace(state, mean=torch.rand(state.mean.shape, generator=generator(4)))
     action, following, _ = planner.plan(first(problem), state)
     noise = state.noise.at(state.step)
-    cost = mppi.rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)[0].double()
+    cost = rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)[0].double()
     for step in range(20):
         for axis, scale in enumerate(config.noise):
             cost += control_cost * state.mean[0, step, axis] * noise[step, axis] / scale**2
@@ -223,7 +223,7 @@ def test_the_whole_control_cost_takes_actions_back_to_rest() -> None:
     for share in (1.0, 0.5):
         planner = MPPI(replace(config, control_cost=share * 0.7))
         state = replace(planner.init(problem, generator()), mean=mean)
-        weighed = mppi.rollout_cost(problem, problem.start, mean, state.noise.at(0), problem.goal_m)
+        weighed = rollout_cost(problem, problem.start, mean, state.noise.at(0), problem.goal_m)
         assert (weighed == 0).all()
         planner._advance.compiled = planner._weigh.compiled = False
         action, following, _ = planner.plan(first(problem), state)
@@ -328,7 +328,7 @@ def test_a_low_temperature_takes_the_best_sample() -> None:
     state = planner.init(problem, generator())
     action, _, _ = planner.plan(first(problem), state)
     noise = state.noise.at(state.step)
-    cost = mppi.rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)
+    cost = rollout_cost(problem, problem.start, state.mean, noise, problem.goal_m)
     best = noise[0, :, cost.argmin()].clamp(torch.tensor([0.0, -1.0]), torch.tensor([1.0, 1.0]))
     torch.testing.assert_close(action[0], best, atol=1e-3, rtol=0)
 
@@ -367,5 +367,5 @@ def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPa
         planner = MPPI(replace(SMALL, control_cost=0.1))
         action, state, plan = planner.plan(first(problem, draw=True), state)
         assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)
-        cost = mppi.rollout_cost(problem, problem.start, state.mean, bank.at(1), problem.goal_m)
+        cost = rollout_cost(problem, problem.start, state.mean, bank.at(1), problem.goal_m)
         assert on_cuda(cost)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchnav.core import gridgraph
 from benchnav.core.errors import ConfigError
+from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
 from benchnav.planning.problem import Problem
@@ -55,23 +56,23 @@ def edge_costs(problem: Problem) -> Tensor:
     )
     length_m = cells * problem.grid.resolution_m
     grade = (elevation[:, target] - elevation[:, source]) / length_m
-    metre = problem.objective.path_cost
-    at_source, at_target = metre(traversability[:, source], grade), metre(traversability[:, target], grade)
-    for found in (at_source, at_target):
-        if not isinstance(found, Tensor) or found.shape != grade.shape:
-            got = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
+    objective = problem.objective
+    expected = f"Expected `path_cost` of {type(objective).__name__}"
+    per_m = [objective.path_cost(traversability[:, cell], grade) for cell in (source, target)]
+    for cost in per_m:
+        if not isinstance(cost, Tensor) or cost.shape != grade.shape:
+            got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
             raise ConfigError(
-                f"Expected `path_cost` of {type(problem.objective).__name__} of the shape of λ̂ and grade, "
-                f"{list(grade.shape)}, got {got}. Give a cost for each piece of a path."
+                f"{expected} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. "
+                "Give a cost for each piece of a path."
             )
-    least, most = torch.stack((at_source, at_target)).aminmax()
+    least, most = torch.stack(per_m).aminmax()
     if not 0 < least <= most < torch.inf:
         raise ConfigError(
-            f"Expected `path_cost` of {type(problem.objective).__name__} as finite numbers > 0, got {least:g} "
-            f"to {most:g}. Let no metre of a path be free."
+            f"{expected} as finite numbers > 0, got {least:g} to {most:g}. Let no metre of a path be free."
         )
     penalty = PENALTY * (not_free[:, source] + not_free[:, target])
-    return 0.5 * length_m * (at_source + at_target) + 0.5 * length_m * penalty
+    return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
 
 
 def search(problem: Problem) -> CostToGo:
@@ -86,17 +87,26 @@ def search(problem: Problem) -> CostToGo:
         Cost to go, of the problem's dtype and device.
     """
     grid, goal_m = problem.grid, problem.goal_m.cpu()
-    rows, columns = torch.meshgrid(torch.arange(grid.height), torch.arange(grid.width), indexing="ij")
-    centres = torch.stack(grid.centre_of(rows, columns), dim=-1)
-    goals = distance(centres, goal_m[:, None, None]) < problem.goal_radius_m
+    centres = cell_centres(grid, torch.arange(grid.height * grid.width))
+    goals = distance(centres, goal_m[:, None]) < problem.goal_radius_m
     # On coarse grids no centre may be that near; the goal's own cell always counts.
-    row, column = grid.cell_of(goal_m[:, 0], goal_m[:, 1])
-    goals[torch.arange(len(problem)), row, column] = True
-    cost, following = gridgraph.cost_to_go(edge_costs(problem).cpu().numpy(), goals.numpy(), grid.shape)
-    stay = np.arange(following.shape[1])
-    following = np.where(following == gridgraph.NO_CELL, stay, following)
+    goals.scatter_(1, cell_at(grid, goal_m)[:, None], True)
+    costs, shape = edge_costs(problem).cpu().numpy(), grid.shape
+    cost, following = gridgraph.cost_to_go(costs, goals.unflatten(1, shape).numpy(), shape)
+    following = np.where(following == gridgraph.NO_CELL, np.arange(following.shape[1]), following)
     start = problem.start
     return CostToGo(torch.from_numpy(cost).to(start), torch.from_numpy(following).to(start.device))
+
+
+def cell_at(grid: Grid, state: Tensor) -> Tensor:
+    """Flat indices of the cells in which states [*B, S] or positions lie, int64, shape [*B]."""
+    row, column = grid.cell_of(state[..., 0], state[..., 1])
+    return row * grid.width + column
+
+
+def cell_centres(grid: Grid, cell: Tensor) -> Tensor:
+    """(x, y) of the centres of cells, by flat index [*B], shape [*B, 2]."""
+    return torch.stack(grid.centre_of(cell // grid.width, cell % grid.width), dim=-1)
 
 
 def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
@@ -110,10 +120,17 @@ def path_cells(field: CostToGo, cell: Tensor, count: int) -> Tensor:
     Returns:
         Flat indices from the first cell on, the last repeated, int64, shape [B, count].
     """
-    cells = [cell]
+    cells = [cell[:, None]]
     for _ in range(count - 1):
-        cells.append(field.following.gather(1, cells[-1][:, None])[:, 0])
-    return torch.stack(cells, dim=1)
+        cells.append(field.following.gather(1, cells[-1]))
+    return torch.cat(cells, dim=1)
+
+
+def cell_points(problem: Problem, field: CostToGo, cells: Tensor) -> Tensor:
+    """(x, y) of the centres of cells, of the goal where a path ends, shape [B, N, 2], from flat indices [B, N]."""
+    ended = field.following.gather(1, cells) == cells
+    centres = cell_centres(problem.grid, cells).to(problem.start)
+    return torch.where(ended[..., None], problem.goal_m[:, None], centres)
 
 
 def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) -> Tensor:
@@ -129,10 +146,5 @@ def path_points(problem: Problem, field: CostToGo, state: Tensor, count: int) ->
         (x, y) of the robot, of the centre of each cell after its own, and of the goal, repeated, shape
         [B, count, 2].
     """
-    grid = problem.grid
-    row, column = grid.cell_of(state[:, 0], state[:, 1])
-    cells = path_cells(field, row * grid.width + column, count)
-    centres = torch.stack(grid.centre_of(cells // grid.width, cells % grid.width), dim=-1).to(state)
-    ended = field.following.gather(1, cells) == cells
-    points = torch.where(ended[..., None], problem.goal_m[:, None], centres)
-    return torch.cat((state[:, None, :2], points[:, 1:]), dim=1)
+    cells = path_cells(field, cell_at(problem.grid, state), count)
+    return torch.cat((state[:, None, :2], cell_points(problem, field, cells[:, 1:])), dim=1)

@@ -21,15 +21,16 @@ from torch import Tensor
 from benchnav.core.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite, rollout_path
+from benchnav.planning.planners.straight import turn_toward
 from benchnav.planning.problem import (
+    Batch,
     Problem,
     motion_traversability,
     predicted_traversability,
     stage_cost,
-    with_tensors,
 )
-from benchnav.planning.robots import Robot, component_wise
+from benchnav.planning.robots import Robot, component_wise, steps_in
 
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10
@@ -71,13 +72,9 @@ class DWAConfig:
         """Refuses an empty window, and weights that mean nothing."""
         check_finite("DWA", self, ("speeds", "turn_rates", "horizon_s"), ("heading_weight", "arrival_m"))
 
-    def steps(self, dt_s: float) -> int:
-        """The horizon in steps T of so many seconds."""
-        return max(1, round(self.horizon_s / dt_s))
-
 
 @dataclass(frozen=True)
-class DWAState:
+class DWAState(Batch):
     """What DWA carries from step to step.
 
     Args:
@@ -122,43 +119,33 @@ class DWA(LocalPlanner[DWAState]):
         window = velocity_window(problem, plan_state.velocity, self.config)
         cost = score(problem, step.state, window, target_m, self.config, self._rollout)
         best = cost.argmin(dim=1)[:, None, None]
-        action = window.gather(1, best.expand(-1, 1, 2))[:, 0]
-        plan = Plan.empty(len(problem), step.state.device)
+        layers = {}
         if step.draw:
-            drawn = held_paths(problem, step.state, window, self.config.steps(problem.dt_s))
-            path = drawn.gather(1, best[..., None].expand(-1, 1, *drawn.shape[2:]))[:, 0]
-            plan = Plan.empty(len(problem), step.state.device, path=path, samples=drawn[:, :, ::_DRAW_EVERY])
-        return action, plan_state, plan
+            held = window.mT[:, None].expand(-1, steps_in(self.config.horizon_s, problem.dt_s), -1, -1)
+            drawn = rollout_path(problem, step.state, held)
+            path = drawn.take_along_dim(best[..., None], 1)[:, 0]
+            layers = {"path": path, "samples": drawn[:, :, ::_DRAW_EVERY]}
+        plan = Plan.empty(len(problem), step.state.device, **layers)
+        return window.take_along_dim(best, 1)[:, 0], plan_state, plan
 
     def commit_action(self, plan_state: DWAState, action: Tensor) -> DWAState:
         """Notes the velocities that the robots now have; see `LocalPlanner`."""
-        least, most = reachable(plan_state.problem, plan_state.velocity)
-        return DWAState(plan_state.problem, torch.clamp(action, least, most))
+        problem = plan_state.problem
+        return DWAState(problem, action.clamp(*reachable(problem, plan_state.velocity)))
 
     def select(self, plan_state: DWAState, members: Tensor) -> DWAState:
         """Keeps some episodes; see `Planner`."""
-        return with_tensors(plan_state, lambda value: value[members])
+        return plan_state.select(members)
 
 
 def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:
-    """Least and greatest velocities within one step's reach: the bounds where the robot has no limits.
-
-    Args:
-        problem: for its robot's bounds, limits and time step.
-        velocity: current (v, ω), shape [B, 2].
-
-    Returns:
-        Two of shape [B, 2].
-    """
-    rates, bounds = problem.robot.action_rates, problem.action_bounds
-    if rates is None:
-        return bounds[0].expand_as(velocity), bounds[1].expand_as(velocity)
+    """Least and greatest velocities within one step's reach, from (v, ω) now, each of shape [B, 2]."""
+    speed, turn_rate = velocity.unbind(1)
     # Numbers, for a tensor made of them would be sent to the device at every step.
-    reach = [rate * problem.dt_s for rate in rates]
-    ends = [
-        torch.stack([velocity[:, axis] + sign * reach[axis] for axis in range(2)], dim=1) for sign in (-1, 1)
-    ]
-    return ends[0].clamp(*bounds), ends[1].clamp(*bounds)
+    reach, turn_reach = (rate * problem.dt_s for rate in problem.robot.action_rates or (math.inf, math.inf))
+    least = torch.stack((speed - reach, turn_rate - turn_reach), dim=1)
+    most = torch.stack((speed + reach, turn_rate + turn_reach), dim=1)
+    return least.clamp(*problem.action_bounds), most.clamp(*problem.action_bounds)
 
 
 def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Tensor:
@@ -172,71 +159,12 @@ def velocity_window(problem: Problem, velocity: Tensor, config: DWAConfig) -> Te
     Returns:
         Pairs (v, ω) within the bounds, shape [B, M, 2].
     """
-    least, most = reachable(problem, velocity)
-
-    def spread(axis: int, count: int) -> Tensor:
-        share = torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
-        return least[:, axis, None] + (most - least)[:, axis, None] * share
-
-    speeds, turn_rates = spread(0, config.speeds), spread(1, config.turn_rates)
-    pairs = torch.stack(torch.broadcast_tensors(speeds[:, :, None], turn_rates[:, None, :]), dim=-1)
-    return pairs.flatten(1, 2)
-
-
-def score(
-    problem: Problem,
-    state: Tensor,
-    window: Tensor,
-    target_m: Tensor,
-    config: DWAConfig,
-    advance: Callable[..., tuple[Tensor, Tensor, Tensor]] | None = None,
-) -> Tensor:
-    """Rolls out the window's pairs and sums their costs.
-
-    Args:
-        problem: B problems.
-        state: shape [B, S].
-        window: pairs (v, ω), shape [B, M, 2].
-        target_m: way-points (x, y), shape [B, 2].
-        config: settings.
-        advance: `rollout` or the same compiled.
-
-    Returns:
-        Cost of each pair, shape [B, M].
-    """
-    advance, target = advance or rollout, target_m[:, None].contiguous()
-    states = component_wise(state[:, None].expand(-1, window.shape[1], -1))
-    pairs = component_wise(window)
-    cost = torch.zeros_like(window[..., 0])
-    under_way = torch.ones_like(cost, dtype=torch.bool)
-    steps = config.steps(problem.dt_s)
-    for first in range(0, steps, _CHUNK_STEPS):
-        states, cost, under_way = advance(
-            states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
-            problem.objective, problem.task.rules.min_traversability, config.arrival_m,
-            min(_CHUNK_STEPS, steps - first),
-        )  # fmt: skip
-    terminal = problem.terminal_cost(states, target)
-    weight = config.heading_weight * standing_cost(problem, state, target_m, steps)
-    return cost + (terminal + weight[:, None] * _heading_error(state, states, target)) * under_way
-
-
-def standing_cost(problem: Problem, state: Tensor, target_m: Tensor, steps: int) -> Tensor:
-    """What J costs robots that stand for the horizon, without penalties; the unit of the heading's weight.
-
-    Args:
-        problem: B problems.
-        state: shape [B, S].
-        target_m: (x, y), shape [B, 2].
-        steps: T.
-
-    Returns:
-        Its size, for a J may be negative, shape [B].
-    """
-    standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
-    traversability = predicted_traversability(problem.ground_at(state))
-    stage = problem.objective.stage(state, standing, traversability, target_m)
-    return (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
+    least, most = (bound[:, None] for bound in reachable(problem, velocity))
+    shares = [
+        torch.linspace(0, 1, count, device=velocity.device, dtype=velocity.dtype)
+        for count in (config.speeds, config.turn_rates)
+    ]
+    return least + (most - least) * torch.cartesian_prod(*shares)
 
 
 def rollout(
@@ -253,23 +181,47 @@ def rollout(
     return component_wise(states), cost, under_way
 
 
-def held_paths(problem: Problem, state: Tensor, window: Tensor, horizon: int) -> Tensor:
-    """Positions along the window's pairs, the first included, shape [B, M, T + 1, 2]."""
-    states = state[:, None].expand(-1, window.shape[1], -1)
-    positions = [states[..., :2]]
-    for _ in range(horizon):
-        states = problem.robot(states, window, problem.traversability_at(states))
-        positions.append(states[..., :2])
-    return torch.stack(positions, dim=2)
+def score(
+    problem: Problem,
+    state: Tensor,
+    window: Tensor,
+    target_m: Tensor,
+    config: DWAConfig,
+    advance: Callable[..., tuple[Tensor, Tensor, Tensor]] = rollout,
+) -> Tensor:
+    """Rolls out the window's pairs and sums their costs.
 
+    Args:
+        problem: B problems.
+        state: shape [B, S].
+        window: pairs (v, ω), shape [B, M, 2].
+        target_m: way-points (x, y), shape [B, 2].
+        config: settings.
+        advance: `rollout` or the same compiled.
 
-def _heading_error(state: Tensor, last: Tensor, target: Tensor) -> Tensor:
-    """Angle from the last heading to the way-point as seen from where the robot is now, rad, shape [B, M].
-
-    It is not wrapped: a turn past the way-point counts as such, else a robot that spins would find
-    another round as good as stopping.
+    Returns:
+        Cost of each pair, shape [B, M].
     """
-    offset = target - state[:, None, :2]
-    missing = torch.atan2(offset[..., 1], offset[..., 0]) - state[:, None, 2]
-    missing = torch.remainder(missing + math.pi, 2 * math.pi) - math.pi
-    return (missing - (last[..., 2] - state[:, None, 2])).abs()
+    target = target_m[:, None].contiguous()
+    states = component_wise(state[:, None].expand(-1, window.shape[1], -1))
+    pairs = component_wise(window)
+    cost = torch.zeros_like(window[..., 0])
+    under_way = torch.ones_like(cost, dtype=torch.bool)
+    steps = steps_in(config.horizon_s, problem.dt_s)
+    for first in range(0, steps, _CHUNK_STEPS):
+        states, cost, under_way = advance(
+            states, cost, under_way, pairs, problem.padded_ground, target, problem.grid, problem.robot,
+            problem.objective, problem.task.rules.min_traversability, config.arrival_m,
+            min(_CHUNK_STEPS, steps - first),
+        )  # fmt: skip
+    # The unit of the heading's weight: the size of what J, without penalties, costs robots that stand for the horizon.
+    standing = problem.start.new_zeros(len(problem), 2).clamp(*problem.action_bounds)
+    traversability = predicted_traversability(problem.ground_at(state))
+    stage = problem.objective.stage(state, standing, traversability, target_m)
+    unit = (steps * stage + problem.objective.terminal(state, traversability, target_m)).abs()
+    # From the last heading to the way-point as seen from where the robot is now. It is not wrapped: a turn past the
+    # way-point counts as such, else a robot that spins would find another round as good as stopping.
+    state = state[:, None]
+    heading_error = (turn_toward(state, target) - (states[..., 2] - state[..., 2])).abs()
+    weight = config.heading_weight * unit
+    return cost + (problem.terminal_cost(states, target) + weight[:, None] * heading_error) * under_way

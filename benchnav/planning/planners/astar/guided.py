@@ -6,7 +6,7 @@ robot that its local planner holds in place is steered along the path. Source: p
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -17,10 +17,9 @@ from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step, check_finite
 from benchnav.planning.planners.straight import steer_toward
-from benchnav.planning.problem import Problem, Task, with_tensors
+from benchnav.planning.problem import Batch, Problem, Task
 
 Local = TypeVar("Local")
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +40,7 @@ class GuideConfig:
 
 
 @dataclass(frozen=True)
-class GuidedState(Generic[Local]):
+class GuidedState(Batch, Generic[Local]):
     """What a guided planner carries from step to step.
 
     Args:
@@ -99,13 +98,9 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     def init(self, problem: Problem, generator: torch.Generator) -> GuidedState[Local]:
         """Searches the maps; see `Planner`."""
         task = replace(problem.task, objective=toward_waypoints(problem.objective))
-        return GuidedState(
-            problem=problem,
-            field=astar.search(problem),
-            ground=ground_costs(problem),
-            local=self.local.init(replace(problem, task=task), generator),
-            recovery=Recovery.none(problem.start),
-        )
+        local = self.local.init(replace(problem, task=task), generator)
+        recovery = Recovery.none(problem.start)
+        return GuidedState(problem, astar.search(problem), ground_costs(problem), local, recovery)
 
     def plan(self, step: Step, plan_state: GuidedState[Local]) -> tuple[Tensor, GuidedState[Local], Plan]:
         """Follows the cheapest path; see `Planner`."""
@@ -128,14 +123,6 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
         """Keeps some episodes; see `Planner`."""
-
-        def keep(tensors: T) -> T:
-            return with_tensors(tensors, lambda value: value[members])
-
-        return GuidedState(
-            problem=plan_state.problem.select(members),
-            field=keep(plan_state.field),
-            ground=keep(plan_state.ground),
-            local=self.local.select(plan_state.local, members),
-            recovery=keep(plan_state.recovery),
-        )
+        local = self.local.select(plan_state.local, members)
+        shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
+        return replace(shared.select(members), local=local)

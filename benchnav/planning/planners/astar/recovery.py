@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.astar.astar import CostToGo
+from benchnav.planning.planners.astar.astar import CostToGo, cell_at, cell_centres, cell_points, path_cells
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Robot
 
@@ -105,28 +105,18 @@ def aim(
         The recovery with the targets of this step.
     """
     grid = problem.grid
-
-    def after(cell: Tensor) -> Tensor:
-        return field.following.gather(1, cell[:, None])[:, 0]
-
-    def centre(cell: Tensor) -> Tensor:
-        return torch.stack(grid.centre_of(cell // grid.width, cell % grid.width), dim=-1).to(state)
-
-    def point(cell: Tensor) -> Tensor:
-        return torch.where((after(cell) == cell)[:, None], problem.goal_m, centre(cell))
-
     arrived = distance(state, recovery.target_m) < _REACHED * grid.resolution_m
-    at_point = (recovery.target_m == point(recovery.cell)).all(dim=1)
-    cell = torch.where(arrived & at_point, after(recovery.cell), recovery.cell)
-    target = torch.where(arrived[:, None], point(cell), recovery.target_m)
+    ahead = path_cells(field, recovery.cell, 2)
+    points = cell_points(problem, field, ahead)
+    on = (arrived & (recovery.target_m == points[:, 0]).all(dim=1)).long()[:, None]
+    cell = ahead.gather(1, on)[:, 0]
+    target = torch.where(arrived[:, None], points.take_along_dim(on[..., None], 1)[:, 0], recovery.target_m)
 
-    row, column = grid.cell_of(state[:, 0], state[:, 1])
-    own = row * grid.width + column
-    first = after(own)
-    gate = 0.5 * (centre(own) + centre(first))
-    first_m = torch.where(straight[:, None], point(first), gate)
+    ahead = path_cells(field, cell_at(grid, state), 2)
+    gate = 0.5 * cell_centres(grid, ahead).to(state).sum(dim=1)
+    first_m = torch.where(straight[:, None], cell_points(problem, field, ahead)[:, 1], gate)
     return replace(
         recovery,
         target_m=torch.where(begun[:, None], target, first_m),
-        cell=torch.where(begun, cell, first),
+        cell=torch.where(begun, cell, ahead[:, 1]),
     )

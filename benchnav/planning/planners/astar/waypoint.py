@@ -14,6 +14,7 @@ from torch import Tensor
 
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
+from benchnav.planning.planners.astar.astar import cell_at, cell_centres
 from benchnav.planning.problem import Problem
 
 # A straight line may cost this much more than the path that it shortens.
@@ -31,14 +32,16 @@ class GroundCosts:
         path_cost: cost of a metre, from λ̂ and grade.
         traversability: λ̂, shape [B, (H + 2)·(W + 2)].
         penalty_per_m: of ground that is not free, shape [B, (H + 2)·(W + 2)].
-        gradient: rise of a metre along x and along y, each of shape [B, (H + 2)·(W + 2)].
+        rise_x: of a metre along x, shape [B, (H + 2)·(W + 2)].
+        rise_y: of a metre along y, shape [B, (H + 2)·(W + 2)].
     """
 
     grid: Grid
     path_cost: Callable[[Tensor, Tensor], Tensor]
     traversability: Tensor
     penalty_per_m: Tensor
-    gradient: tuple[Tensor, Tensor]
+    rise_x: Tensor
+    rise_y: Tensor
 
 
 def ground_costs(problem: Problem) -> GroundCosts:
@@ -50,7 +53,8 @@ def ground_costs(problem: Problem) -> GroundCosts:
         problem.objective.path_cost,
         grid.pad(problem.traversability, outside=1.0),
         grid.pad(PENALTY * (~problem.free).to(problem.risk_map), outside=PENALTY),
-        (grid.pad(along_x, outside=0.0), grid.pad(along_y, outside=0.0)),
+        grid.pad(along_x, outside=0.0),
+        grid.pad(along_y, outside=0.0),
     )
 
 
@@ -75,9 +79,9 @@ def line_costs(ground: GroundCosts, start_m: Tensor, end_m: Tensor, crossings: i
     def at_pieces(padded: Tensor) -> Tensor:
         return ground.grid.lookup(padded, middle[..., 0], middle[..., 1])
 
-    rises = [at_pieces(along) * offset[..., axis, None] for axis, along in enumerate(ground.gradient)]
+    rise = at_pieces(ground.rise_x) * offset[..., :1] + at_pieces(ground.rise_y) * offset[..., 1:]
     # Of a line without length any grade will do: it costs nothing.
-    grade = sum(rises) / length.clamp(min=1e-9)
+    grade = rise / length.clamp(min=1e-9)
     per_m = ground.path_cost(at_pieces(ground.traversability), grade)
     return ((per_m + at_pieces(ground.penalty_per_m)) * share * length).sum(dim=-1)
 
@@ -96,9 +100,8 @@ def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -
     """
     grid = ground.grid
     robot, ahead = points_m[:, :1], points_m[:, 1:]
-    row, column = grid.cell_of(robot[..., 0], robot[..., 1])
     # Half-way to the next cell's centre lies the edge or the corner that the two cells share.
-    gate = 0.5 * (torch.stack(grid.centre_of(row, column), dim=-1).to(robot) + ahead[:, :1])
+    gate = 0.5 * (cell_centres(grid, cell_at(grid, robot)).to(robot) + ahead[:, :1])
     count = ahead.shape[1]
     # Straight lines to each point, the path's legs, and the first leg by way of the gate.
     begin = torch.cat((robot.expand_as(ahead), ahead[:, :-1], robot, gate), dim=1)
@@ -114,18 +117,16 @@ def choose_waypoint(ground: GroundCosts, points_m: Tensor, lookahead_m: float) -
     rank = torch.arange(count, device=ahead.device)
     worth = lines <= _SHORT_CUT * path
     farthest = torch.where(worth & near, rank, 0).amax(dim=1)
-    return ahead.gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0], worth[:, 0]
+    return ahead.take_along_dim(farthest[:, None, None], 1)[:, 0], worth[:, 0]
 
 
 def _grid_cuts(start_m: Tensor, offset_m: Tensor, resolution_m: float, crossings: int) -> Tensor:
     """Shares of a line at which it begins, crosses the grid's lines, and ends; sorted, [B, J, 2·crossings + 2]."""
     lines = torch.arange(crossings, device=start_m.device) + 1
-    cuts = [torch.zeros_like(start_m[..., :1]), torch.ones_like(start_m[..., :1])]
-    for axis in (0, 1):
-        begin, along = start_m[..., axis, None], offset_m[..., axis, None]
-        low = torch.minimum(begin, begin + along)
-        crossed = ((low / resolution_m).floor() + lines) * resolution_m
-        # A line along this axis's grid lines crosses none of them: not a number, or infinite.
-        share = (crossed - begin) / along
-        cuts.append(share.nan_to_num(1.0, 1.0, 1.0).clamp(0, 1))
-    return torch.cat(cuts, dim=-1).sort(dim=-1).values
+    begin, along = start_m[..., None], offset_m[..., None]
+    low = torch.minimum(begin, begin + along)
+    crossed = ((low / resolution_m).floor() + lines) * resolution_m
+    # A line along an axis's grid lines crosses none of them: not a number, or infinite.
+    shares = ((crossed - begin) / along).nan_to_num(1.0, 1.0, 1.0).clamp(0, 1).flatten(2)
+    ends = torch.zeros_like(shares[..., :1]), torch.ones_like(shares[..., :1])
+    return torch.cat((*ends, shares), dim=-1).sort(dim=-1).values

@@ -44,11 +44,17 @@ from torch import Tensor
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import TravelTime, distance
-from benchnav.planning.planners.cl_rrt.edges import SPACING_M, ClosedLoop
-from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
-from benchnav.planning.planners.cl_rrt.tree import Route, map_tensors, no_route, search
+from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
+from benchnav.planning.planners.cl_rrt.pursuit import (
+    SPACING_M,
+    FollowerConfig,
+    PathFollower,
+    Reference,
+    Tracking,
+)
+from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step, check_finite
-from benchnav.planning.problem import Problem, Task, with_tensors
+from benchnav.planning.problem import Batch, Problem, Task, map_tensors
 from benchnav.planning.robots import SPEED, TURN_RATE
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
@@ -102,7 +108,7 @@ class CLRRTConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CLRRTState:
+class CLRRTState(Batch):
     """What CL-RRT carries from step to step.
 
     Args:
@@ -167,7 +173,7 @@ class CLRRT(Planner[CLRRTState]):
         Raises:
             ConfigError: the robot cannot follow references, or none of the turning radius.
         """
-        config, tightest_m = self.config, self._tightest_m(self._follower(problem))
+        config, tightest_m = self.config, self._follower(problem).tightest_m
         if config.turning_radius_m < tightest_m:
             raise ConfigError(
                 f"Expected `turning_radius_m` ≥ {tightest_m:g}, the radius of the robot's tightest turn, "
@@ -213,7 +219,7 @@ class CLRRT(Planner[CLRRTState]):
 
     def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
         """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
-        return with_tensors(plan_state, lambda values: values[members])
+        return plan_state.select(members)
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
         """Moves the progress to where the robots are, on to the next edge where one is done."""
@@ -257,7 +263,7 @@ class CLRRT(Planner[CLRRTState]):
         tracking = now.tracking
         return replace(
             now,
-            route=_update(now.route, members, map_tensors(lambda values: values[taken], route)),
+            route=map_tensors(lambda old, new: old.index_copy(0, members, new[taken]), now.route, route),
             edge=now.edge.index_fill(0, members, 0),
             tracking=replace(tracking, progress_m=tracking.progress_m.index_fill(0, members, 0)),
             failures=now.failures.index_copy(0, due, failures),
@@ -269,18 +275,17 @@ class CLRRT(Planner[CLRRTState]):
         """Grows trees from root states [M, S] of some episodes and takes the best path of each."""
         config, everyone = self.config, len(members) == len(now.problem)
         loop = self._closed_loop(now.problem if everyone else now.problem.select(members), failures)
-        tracking = map_tensors(lambda values: values[members], now.tracking)
         key = rng.stream_key(now.seed, "cl_rrt", now.step)
         draws = rng.uniform(key, np.zeros(1, dtype=np.int64), (config.rounds, config.expansions_per_round, 3))
         chance = torch.from_numpy(draws[0]).to(root)
         sample_m = chance[..., :2] * root.new_tensor(now.problem.grid.extent_m)
         goal_edges = math.ceil(config.goal_bias * config.expansions_per_round)
-        return search(loop, root, tracking, sample_m, chance[..., 2], goal_edges)
+        return search(loop, root, now.tracking.select(members), sample_m, chance[..., 2], goal_edges)
 
     def _closed_loop(self, problem: Problem, failures: Tensor) -> ClosedLoop:
         """What trees are grown with after so many failed plans, int64 [B]."""
         config, follower = self.config, self._follower(problem)
-        least_m = max(self._tightest_m(follower), min(config.turning_radius_m, SPACING_M))
+        least_m = max(follower.tightest_m, min(config.turning_radius_m, SPACING_M))
         tries = failures % config.most_failures
         return ClosedLoop(
             problem=problem,
@@ -294,20 +299,9 @@ class CLRRT(Planner[CLRRTState]):
     def _follower(self, problem: Problem) -> PathFollower:
         return PathFollower(self.config.follower, problem.robot)
 
-    @staticmethod
-    def _tightest_m(follower: PathFollower) -> float:
-        return follower.speed_mps[0] / follower.turn_rate_radps
-
-
-def _update(route: Route, members: Tensor, new: Route) -> Route:
-    """Puts new routes in the place of those of some episodes, indices of shape [M]."""
-    if len(members) == len(route.status):
-        return new
-    return map_tensors(lambda old, changed: old.index_copy(0, members, changed), route, new)
-
 
 def _reference(route: Route, edge: Tensor) -> Reference:
     """References of one edge [B] of each path."""
     batch, depth, count, _ = route.rows.shape
     path = torch.arange(batch, device=edge.device) * depth + edge.clamp(max=depth - 1)
-    return Reference(route.rows.reshape(-1, 4), path * count, count, SPACING_M)
+    return Reference(route.rows.reshape(-1, 4), path * count, count)

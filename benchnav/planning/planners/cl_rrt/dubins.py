@@ -11,28 +11,9 @@ Letters in shapes: N points, G segments.
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-
-
-@dataclass(frozen=True)
-class Segments:
-    """Arcs and straights, one after another.
-
-    Args:
-        curvature: signed, positive to the left, in 1/m, shape [*B, G].
-        length_m: shape [*B, G].
-    """
-
-    curvature: Tensor
-    length_m: Tensor
-
-    @property
-    def total_m(self) -> Tensor:
-        """Length of the whole path, shape [*B]."""
-        return self.length_m.sum(dim=-1)
 
 
 def dubins_length_to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> Tensor:
@@ -41,32 +22,31 @@ def dubins_length_to_point(start: Tensor, point: Tensor, radius: float | Tensor)
     return (arc + rest) * radius
 
 
-def dubins_segments_to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> Segments:
+def dubins_segments_to_point(start: Tensor, point: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
     """Finds the shortest path from poses to points at which any heading will do.
 
     Args:
         start: poses (x, y, θ) in metres and radians, shape [*B, 3].
         point: positions (x, y), shape [*B, 2]; the leading dimensions of both broadcast.
-        radius: least turning radius in metres, a number or a tensor that broadcasts to [*B].
+        radius: least turning radius in metres, broadcasts to [*B].
 
     Returns:
-        Two segments, an arc and a straight or two arcs.
+        Curvatures, positive to the left, in 1/m, and lengths in metres of two segments, an arc and a straight or
+        two arcs, each of shape [*B, 2].
     """
-    radius = torch.as_tensor(radius, dtype=start.dtype, device=start.device)
     arc, rest, side, inside = _to_point(start, point, radius)
-    first = torch.where(inside, -side, side)
-    return Segments(
-        torch.stack((first, torch.where(inside, side, 0)), dim=-1) / radius[..., None],
-        torch.stack((arc, rest), dim=-1) * radius[..., None],
-    )
+    sides = torch.where(inside, -side, side), torch.where(inside, side, 0)
+    radius = radius[..., None]
+    return torch.stack(sides, dim=-1) / radius, torch.stack((arc, rest), dim=-1) * radius
 
 
-def sample_segments(start: Tensor, segments: Segments, spacing: float, count: int) -> Tensor:
+def sample_segments(start: Tensor, curvature: Tensor, length_m: Tensor, spacing: float, count: int) -> Tensor:
     """Samples paths by arc length.
 
     Args:
         start: poses (x, y, θ) in metres and radians, shape [*B, 3].
-        segments: of shape [*B, G].
+        curvature: of the segments, shape [*B, G].
+        length_m: of the segments, shape [*B, G].
         spacing: arc length from one point to the next in metres.
         count: number of points N; those past the end repeat the end pose.
 
@@ -76,29 +56,25 @@ def sample_segments(start: Tensor, segments: Segments, spacing: float, count: in
     arc = torch.arange(count, dtype=start.dtype, device=start.device) * spacing
     x, y, heading = (start[..., i, None] for i in range(3))
     begin, at_begin = torch.zeros_like(heading), heading
-    for curvature, length in zip(segments.curvature.unbind(-1), segments.length_m.unbind(-1), strict=True):
-        within = torch.minimum((arc - begin).clamp(min=0), length[..., None])
-        half_turn = within * (0.5 * curvature[..., None])
+    for bend, length in zip(curvature[..., None].unbind(-2), length_m[..., None].unbind(-2), strict=True):
+        within = torch.minimum((arc - begin).clamp(min=0), length)
+        half_turn = within * (0.5 * bend)
         chord = within * torch.sinc(half_turn / math.pi)
         x = x + chord * (at_begin + half_turn).cos()
         y = y + chord * (at_begin + half_turn).sin()
         heading = heading + 2 * half_turn
-        begin = begin + length[..., None]
-        at_begin = at_begin + (curvature * length)[..., None]
+        begin = begin + length
+        at_begin = at_begin + bend * length
     return torch.stack((x, y, heading), dim=-1)
-
-
-def _to_frame(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Positions seen from poses, ahead and to the left, in units of the radius."""
-    scale = 1 / radius
-    offset_x, offset_y = (point[..., 0] - start[..., 0]) * scale, (point[..., 1] - start[..., 1]) * scale
-    cos, sin = start[..., 2].cos(), start[..., 2].sin()
-    return offset_x * cos + offset_y * sin, offset_y * cos - offset_x * sin
 
 
 def _to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Lengths of both segments in radii, the side of the point (±1), whether its circle holds it."""
-    x, y = _to_frame(start, point, radius)
+    # The point as the pose has it, ahead and to the left, in radii.
+    scale = 1 / radius
+    offset_x, offset_y = (point[..., 0] - start[..., 0]) * scale, (point[..., 1] - start[..., 1]) * scale
+    cos, sin = start[..., 2].cos(), start[..., 2].sin()
+    x, y = offset_x * cos + offset_y * sin, offset_y * cos - offset_x * sin
     side = torch.where(y < 0, -1.0, 1.0).to(y)
     y = y.abs()
     power = x * x + y * (y - 2)  # of the point over the left circle, centre (0, 1)

@@ -23,10 +23,10 @@ from torch import Tensor
 
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
-from benchnav.planning.planners.cl_rrt.pursuit import PathFollower, Reference, Tracking
+from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, PathFollower, Reference, Tracking
 from benchnav.planning.problem import Problem, motion_traversability
+from benchnav.planning.robots import steps_in
 
-SPACING_M = 0.1  # between the points of a reference
 DRAWN_M = 0.5  # between the drawn points of an edge
 _CHECK_STEPS = 8  # between looks at whether all edges of a round have ended
 
@@ -82,8 +82,8 @@ class Edges:
     """Edges that were driven.
 
     Args:
+        at: where the closed loop stands at its end.
         kept: whether anything is left of the edge, bool, shape [B, R].
-        end: where it ends.
         time_s: its duration, shape [B, R].
         blocked_m: metres of it on ground that is not free, shape [B, R].
         arrived: it ends at the goal, bool, shape [B, R].
@@ -91,8 +91,8 @@ class Edges:
         drawn: positions along it, NaN past its end, shape [B, R, P, 2].
     """
 
+    at: LoopState
     kept: Tensor
-    end: LoopState
     time_s: Tensor
     blocked_m: Tensor
     arrived: Tensor
@@ -111,9 +111,10 @@ def draw_references(loop: ClosedLoop, pose: Tensor, target_m: Tensor) -> tuple[R
     Returns:
         The references, and the length of each path, shape [B, R]; references run straight on past it.
     """
-    segments = dubins_segments_to_point(pose, target_m, loop.radius_m[:, None])
-    poses = sample_segments(pose, segments, SPACING_M, loop.reference_points)
-    return Reference.along(poses, segments.total_m, SPACING_M), segments.total_m
+    curvature, lengths_m = dubins_segments_to_point(pose, target_m, loop.radius_m[:, None])
+    poses = sample_segments(pose, curvature, lengths_m, SPACING_M, loop.reference_points)
+    length_m = lengths_m.sum(dim=-1)
+    return Reference.along(poses, length_m), length_m
 
 
 def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Tensor) -> Edges:
@@ -142,7 +143,7 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
     )
     return Edges(
         kept=last > 0,
-        end=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
+        at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),
         time_s=last.to(path) * problem.dt_s,
         blocked_m=_at(_blocked_m(path, free), last),
         arrived=_at(at_goal, last),
@@ -162,7 +163,7 @@ def _simulate(loop: ClosedLoop, begin: LoopState, reference: Reference, end_m: T
     state, tracking, progress = begin.state, begin.tracking, torch.zeros_like(end_m)
     was_free, collided = begin.free, torch.zeros_like(begin.free)
     log: list[tuple[Tensor, ...]] = []
-    for step in range(max(1, round(loop.edge_time_s / problem.dt_s)) + 1):
+    for step in range(steps_in(loop.edge_time_s, problem.dt_s) + 1):
         progress = follower.advance(reference, state, progress)
         ground = problem.ground_at(state)
         free = ground > 0
@@ -191,8 +192,7 @@ def _first(condition: Tensor) -> Tensor:
 
 def _at(log: Tensor, step: Tensor) -> Tensor:
     """Picks from the first dimension: a log [T, B, R, *F] at steps [B, R] gives [B, R, *F]."""
-    index = step.reshape(1, *step.shape, *[1] * (log.dim() - 3))
-    return log.gather(0, index.expand(1, *log.shape[1:]))[0]
+    return log.take_along_dim(step.reshape(1, *step.shape, *[1] * (log.dim() - 3)), 0)[0]
 
 
 def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:
@@ -211,6 +211,6 @@ def _thin(path: Tensor, progress: Tensor, last: Tensor, count: int) -> Tensor:
     along = progress.movedim(0, -1).contiguous()
     step = torch.searchsorted(along, level.expand(*last.shape, -1).contiguous())
     step = torch.minimum(step, last[..., None])
-    thinned = path.movedim(0, 2).gather(2, step[..., None].expand(-1, -1, -1, 2))
+    thinned = path.movedim(0, 2).take_along_dim(step[..., None], 2)
     used = torch.nn.functional.pad(step[..., :-1] < last[..., None], (1, 0), value=True)
     return torch.where(used[..., None], thinned, math.nan)

@@ -22,8 +22,10 @@ from torch import Tensor
 
 from benchnav.core.errors import ConfigError
 from benchnav.planning.planners.planner import check_finite
+from benchnav.planning.problem import Batch
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
+SPACING_M = 0.1  # between the points of a reference
 _LEAST_CURVATURE = 1e-6
 _LEAST_SQUARE_M2 = 1e-6
 
@@ -59,33 +61,30 @@ class Reference:
     """Paths to follow, kept as rows of one table so that a lookup is one gather.
 
     Args:
-        rows: points (x, y, cos θ, sin θ) of all paths, equally spaced, shape [R, 4].
+        rows: points (x, y, cos θ, sin θ) of all paths, `SPACING_M` apart, shape [R, 4].
         first: row at which each path begins, int64, shape [*B].
         count: points N of a path.
-        spacing_m: arc length from one point to the next.
     """
 
     rows: Tensor
     first: Tensor
     count: int
-    spacing_m: float
 
     @classmethod
-    def along(cls, poses: Tensor, length_m: Tensor, spacing_m: float) -> "Reference":
+    def along(cls, poses: Tensor, length_m: Tensor) -> "Reference":
         """Makes references that run straight on past the ends of their paths.
 
         Args:
-            poses: (x, y, θ) by arc length, past the end the end pose, shape [*B, N, 3].
+            poses: (x, y, θ) each `SPACING_M` on, past the end the end pose, shape [*B, N, 3].
             length_m: length of each path, shape [*B].
-            spacing_m: arc length from one point to the next.
         """
         *batch, count, _ = poses.shape
-        arc = torch.arange(count, dtype=poses.dtype, device=poses.device) * spacing_m
+        arc = torch.arange(count, dtype=poses.dtype, device=poses.device) * SPACING_M
         beyond = (arc - length_m[..., None]).clamp(min=0)
         cos, sin = poses[..., 2].cos(), poses[..., 2].sin()
         rows = torch.stack((poses[..., 0] + beyond * cos, poses[..., 1] + beyond * sin, cos, sin), dim=-1)
         first = torch.arange(math.prod(batch), device=poses.device).reshape(batch) * count
-        return cls(rows.reshape(-1, 4), first, count, spacing_m)
+        return cls(rows.reshape(-1, 4), first, count)
 
     def at(self, arc_m: Tensor) -> Tensor:
         """Looks up the last point at or before an arc length, which must lie on the path.
@@ -93,12 +92,12 @@ class Reference:
         Returns:
             (x, y, cos θ, sin θ), shape [*B, 4].
         """
-        row = self.first + (arc_m * (1 / self.spacing_m)).long()
+        row = self.first + (arc_m * (1 / SPACING_M)).long()
         return self.rows.index_select(0, row.flatten()).reshape(*row.shape, 4)
 
 
 @dataclass(frozen=True)
-class Tracking:
+class Tracking(Batch):
     """What a follower carries from step to step.
 
     Args:
@@ -145,6 +144,7 @@ class PathFollower:
         self.speed_mps = low[0], high[0]
         self.wanted_mps = high[0] if config.speed_mps is None else min(config.speed_mps, high[0])
         self.turn_rate_radps = min(-low[1], high[1])
+        self.tightest_m = low[0] / self.turn_rate_radps  # radius of the tightest turn
         rates = robot.action_rates
         build_up_s = self.turn_rate_radps / rates[1] if rates else 0.0
         self.lookahead_m = max(config.lookahead_m, max(config.lookahead_s, build_up_s) * self.wanted_mps)
@@ -161,9 +161,9 @@ class PathFollower:
             The new progress, no further than leaves the look-ahead point on the reference.
         """
         near_x, near_y, cos, sin = reference.at(progress_m).unbind(-1)
-        at = (progress_m * (1 / reference.spacing_m)).floor() * reference.spacing_m
+        at = (progress_m * (1 / SPACING_M)).floor() * SPACING_M
         projected = at + (state[..., 0] - near_x) * cos + (state[..., 1] - near_y) * sin
-        last = (reference.count - 1) * reference.spacing_m - self.lookahead_m
+        last = (reference.count - 1) * SPACING_M - self.lookahead_m
         return torch.maximum(progress_m, projected).clamp(max=last)
 
     def act(

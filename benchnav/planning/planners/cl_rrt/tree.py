@@ -18,29 +18,26 @@ points of an edge.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import (
     DRAWN_M,
-    SPACING_M,
     ClosedLoop,
     Edges,
     LoopState,
     draw_references,
     drive,
 )
-from benchnav.planning.planners.cl_rrt.pursuit import Tracking
+from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.planner import PlanStatus
-
-T = TypeVar("T")
+from benchnav.planning.problem import map_tensors
 
 _EXPLORE = (0.7, 0.3)  # share of choices that explore, before and after a way to the goal is known
 _PARTIAL_GAIN_M = 0.5  # a partial path that leads no further than this toward the goal is none
@@ -49,32 +46,32 @@ _FAR_M = 1e4  # longer than any way on a map
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tree:
-    """Trees of B episodes. Node 0 is the root; every other is the end of the edge that leads to it.
+class Choice:
+    """Which edges a round tries.
 
     Args:
-        at: where the closed loop stands at each node, shapes [B, V, …].
-        time_s: simulated time from the root, inf for what is left of rejected edges, shape [B, V].
-        blocked_m: metres on ground that is not free from the root, shape [B, V].
-        to_goal_m: Dubins length on to the goal, inf where rejected, shape [B, V].
-        arrived: the node is at the goal, bool, shape [B, V].
-        parent: node at which the edge begins, int64, shape [B, V].
-        target_m: point that its reference leads to, shape [B, V, 2].
-        aimed: that point is the goal, bool, shape [B, V].
-        end_m: arc length along the reference at which the edge ends, shape [B, V].
-        drawn: positions along the edge, NaN past its end, shape [B, V, P, 2].
+        parent: node at which each begins, int64, shape [B, R].
+        target_m: point that its reference leads to, shape [B, R, 2].
+        aimed: that point is the goal, bool, shape [B, R].
     """
 
-    at: LoopState
-    time_s: Tensor
-    blocked_m: Tensor
-    to_goal_m: Tensor
-    arrived: Tensor
     parent: Tensor
     target_m: Tensor
     aimed: Tensor
-    end_m: Tensor
-    drawn: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tree(Choice, Edges):
+    """Trees of B episodes. Node 0 is the root; every other is the end of the edge that leads to it.
+
+    Edges are as they were chosen and driven, V in place of R, but that their times, inf where nothing is left of one,
+    and metres that are not free count from the root.
+
+    Args:
+        to_goal_m: Dubins length on to the goal, inf where nothing is left of the edge, shape [B, V].
+    """
+
+    to_goal_m: Tensor
 
     @property
     def cost(self) -> Tensor:
@@ -88,21 +85,6 @@ class Tree:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
-    """Which edges a round tries.
-
-    Args:
-        node: where each begins, int64, shape [B, R].
-        target_m: point that it is to reach, shape [B, R, 2].
-        aimed: that point is the goal, bool, shape [B, R].
-    """
-
-    node: Tensor
-    target_m: Tensor
-    aimed: Tensor
-
-
-@dataclass(frozen=True, kw_only=True)
 class Route:
     """What was planned for each episode.
 
@@ -112,7 +94,6 @@ class Route:
         rows: references of the edges, as `Reference` keeps them, shape [B, D, N, 4].
         end_m: arc length at which each reference is left for the next, shape [B, D].
         path: predicted positions, NaN where unused, shape [B, D·P, 2].
-        line: points of those references as far as they are driven, NaN where unused, shape [B, D·Q, 2].
         tree: predicted positions along all edges, NaN where unused, shape [B, E, P, 2].
     """
 
@@ -121,8 +102,16 @@ class Route:
     rows: Tensor
     end_m: Tensor
     path: Tensor
-    line: Tensor
     tree: Tensor
+
+    @property
+    def line(self) -> Tensor:
+        """Points of the references as far as they are driven, NaN where unused, shape [B, D·Q, 2]."""
+        points = self.rows[:, :, :: round(DRAWN_M / SPACING_M), :2]
+        arc_m = torch.arange(points.shape[2], device=points.device) * DRAWN_M
+        used = torch.arange(self.rows.shape[1], device=points.device) < self.depth[:, None]
+        driven = used[..., None] & (arc_m <= self.end_m[..., None])
+        return _pack(torch.where(driven[..., None], points, math.nan).flatten(1, 2))
 
 
 def search(
@@ -141,7 +130,7 @@ def search(
     tree = plant(loop, root, tracking)
     for points_m, chances in zip(sample_m, chance, strict=True):
         choice = choose(loop, tree, points_m, chances, goal_edges)
-        begin = stand(tree, choice.node)
+        begin = stand(tree, choice.parent)
         reference, length_m = draw_references(loop, begin.state[..., :3], choice.target_m)
         tree = add(loop, tree, choice, drive(loop, begin, reference, length_m))
     return best_route(loop, tree, len(sample_m))
@@ -149,23 +138,13 @@ def search(
 
 def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
     """A tree of the root alone; arguments as for `search`."""
-    zero = torch.zeros_like(root[:, :1])
-    false = torch.zeros_like(zero, dtype=torch.bool)
-    free = loop.problem.free_at(root)
-    begin = LoopState(state=root, tracking=tracking, free=free)
+    begin = LoopState(state=root, tracking=tracking, free=loop.problem.free_at(root))
     at = map_tensors(lambda values: values[:, None], begin)
-    return Tree(
-        at=at,
-        time_s=zero,
-        blocked_m=zero,
-        to_goal_m=_to_goal_m(loop, at.state),
-        arrived=false,
-        parent=torch.zeros_like(zero, dtype=torch.int64),
-        target_m=root[:, None, :2],
-        aimed=false,
-        end_m=zero,
-        drawn=root.new_full((len(root), 1, loop.drawn_points, 2), math.nan),
-    )
+    zero = torch.zeros_like(root[:, :1])
+    false, drawn = zero.bool(), zero.new_full((len(root), 1, loop.drawn_points, 2), math.nan)
+    choice = {"parent": zero.long(), "target_m": at.state[..., :2], "aimed": false}
+    driven = {"time_s": zero, "blocked_m": zero, "arrived": false, "end_m": zero, "drawn": drawn}
+    return Tree(at=at, kept=~false, to_goal_m=_to_goal_m(loop, at.state), **choice, **driven)
 
 
 def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_edges: int) -> Choice:
@@ -196,18 +175,16 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
     before_m = torch.where(explore[..., None], 0, spent_m[:, None]) + closed_m[:, None]
     node = (length_m + before_m).argmin(dim=-1)
     target_m = sample_m.expand(len(node), -1, -1)
-    lanes = min(goal_edges, tree.parent.shape[1])
-    if not lanes:
-        return Choice(node=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool))
 
     # Lines 13–20: the goal.
+    lanes = min(goal_edges, tree.parent.shape[1])
     tried = torch.zeros_like(tree.time_s).scatter_add(1, tree.parent, tree.aimed.to(tree.time_s)) > 0
     promise_m = tree.to_goal_m + closed_m + torch.where(found, spent_m, 0)
     promise_m, promising = torch.where(tried, math.inf, promise_m).topk(lanes, dim=1, largest=False)
-    aimed = torch.nn.functional.pad(promise_m < math.inf, (0, node.shape[1] - lanes))
-    promising = torch.nn.functional.pad(promising, (0, node.shape[1] - lanes))
+    others = (0, node.shape[1] - lanes)
+    aimed, promising = pad(promise_m < math.inf, others), pad(promising, others)
     return Choice(
-        node=torch.where(aimed, promising, node),
+        parent=torch.where(aimed, promising, node),
         target_m=torch.where(aimed[..., None], loop.problem.goal_m[:, None], target_m),
         aimed=aimed,
     )
@@ -220,19 +197,15 @@ def stand(tree: Tree, node: Tensor) -> LoopState:
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
     """The tree with the ends of edges as its next nodes, rejected ones too, so that tables stay of a size."""
-    time_s = torch.where(edges.kept, tree.time_s.gather(1, choice.node) + edges.time_s, math.inf)
-    new = Tree(
-        at=edges.end,
-        time_s=time_s,
-        blocked_m=tree.blocked_m.gather(1, choice.node) + edges.blocked_m,
-        to_goal_m=torch.where(edges.kept, _to_goal_m(loop, edges.end.state), math.inf),
-        arrived=edges.arrived & edges.kept,
-        parent=choice.node,
-        target_m=choice.target_m,
-        aimed=choice.aimed,
-        end_m=edges.end_m,
-        drawn=edges.drawn,
+    kept, parent = edges.kept, choice.parent
+    edges = replace(
+        edges,
+        time_s=torch.where(kept, tree.time_s.gather(1, parent) + edges.time_s, math.inf),
+        blocked_m=tree.blocked_m.gather(1, parent) + edges.blocked_m,
+        arrived=edges.arrived & kept,
     )
+    to_goal_m = torch.where(kept, _to_goal_m(loop, edges.at.state), math.inf)
+    new = Tree(**vars(choice), **vars(edges), to_goal_m=to_goal_m)
     return map_tensors(lambda old, added: torch.cat((old, added), dim=1), tree, new)
 
 
@@ -256,32 +229,32 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
     end_m = tree.end_m.gather(1, nodes)
     early = (order == 0) & ~found[:, None]
     crossed = loop.crossing & (tree.blocked_m.gather(1, chain[0][:, None])[:, 0] > 0)
-    status = torch.where(found & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL)
-    return _describe(loop, tree, status, nodes, torch.where(early, end_m - _MARGIN_M, end_m))
+
+    pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
+    reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
+    drawn = _take(tree.drawn.flatten(2), nodes).unflatten(-1, (-1, 2))
+    return Route(
+        status=torch.where(found & ~crossed, PlanStatus.OK, PlanStatus.PARTIAL),
+        depth=depth,
+        rows=reference.rows.reshape(*nodes.shape, -1, 4),
+        end_m=torch.where(early, end_m - _MARGIN_M, end_m),
+        path=_pack(torch.where((nodes > 0)[..., None, None], drawn, math.nan).flatten(1, 2)),
+        tree=torch.where(tree.kept[:, 1:, None, None], tree.drawn[:, 1:], math.nan),
+    )
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
     """Routes without a path, of the shapes that searched ones have."""
-    batch, start = len(loop.problem), loop.problem.start
-    points = rounds * len(range(0, loop.reference_points, round(DRAWN_M / SPACING_M)))
+    batch, start, points = len(loop.problem), loop.problem.start, loop.drawn_points
+    zero = start.new_zeros(batch).long()
     return Route(
-        status=torch.full((batch,), PlanStatus.PARTIAL, device=start.device),
-        depth=torch.zeros(batch, dtype=torch.int64, device=start.device),
+        status=torch.full_like(zero, PlanStatus.PARTIAL),
+        depth=zero,
         rows=start.new_zeros(batch, rounds, loop.reference_points, 4),
         end_m=start.new_zeros(batch, rounds),
-        path=start.new_full((batch, rounds * loop.drawn_points, 2), math.nan),
-        line=start.new_full((batch, points, 2), math.nan),
-        tree=start.new_full((batch, edges, loop.drawn_points, 2), math.nan),
+        path=start.new_full((batch, rounds * points, 2), math.nan),
+        tree=start.new_full((batch, edges, points, 2), math.nan),
     )
-
-
-def map_tensors(change: Callable[..., Tensor], *values: T) -> T:
-    """Applies a function to the tensors that have the same place in dataclasses of one kind."""
-    changed: dict[str, Any] = {}
-    for field in fields(values[0]):  # type: ignore[arg-type]
-        items = [getattr(value, field.name) for value in values]
-        changed[field.name] = map_tensors(change, *items) if is_dataclass(items[0]) else change(*items)
-    return type(values[0])(**changed)
 
 
 def _best_partial(tree: Tree) -> Tensor:
@@ -291,27 +264,6 @@ def _best_partial(tree: Tree) -> Tensor:
     return torch.where(remaining_m[:, 0] - least_m > _PARTIAL_GAIN_M, node, 0)
 
 
-def _describe(loop: ClosedLoop, tree: Tree, status: Tensor, nodes: Tensor, end_m: Tensor) -> Route:
-    """Describes paths through nodes, int64 [B, D], 0 past the end of each."""
-    used = (nodes > 0)[..., None]
-    pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
-    reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
-    rows = reference.rows.reshape(*nodes.shape, -1, 4)
-    points = rows[:, :, :: round(DRAWN_M / SPACING_M), :2]
-    arc_m = torch.arange(points.shape[2], device=rows.device) * DRAWN_M
-    driven = used & (arc_m <= end_m[..., None])
-    drawn = _take(tree.drawn.flatten(2), nodes).reshape(*nodes.shape, -1, 2)
-    return Route(
-        status=status,
-        depth=(nodes > 0).sum(dim=1),
-        rows=rows,
-        end_m=end_m,
-        path=_pack(torch.where(used[..., None], drawn, math.nan).flatten(1, 2)),
-        line=_pack(torch.where(driven[..., None], points, math.nan).flatten(1, 2)),
-        tree=torch.where(tree.time_s[:, 1:, None, None] < math.inf, tree.drawn[:, 1:], math.nan),
-    )
-
-
 def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
     """Dubins lengths from states [B, V, S] to the goals, shape [B, V]."""
     return dubins_length_to_point(state[..., :3], loop.problem.goal_m[:, None], loop.radius_m[:, None])
@@ -319,9 +271,7 @@ def _to_goal_m(loop: ClosedLoop, state: Tensor) -> Tensor:
 
 def _take(values: Tensor, index: Tensor) -> Tensor:
     """Picks from the second dimension: values [B, V, *F] at indices [B, R] give [B, R, *F]."""
-    if values.dim() == 2:
-        return values.gather(1, index)
-    return values.gather(1, index[..., None].expand(-1, -1, values.shape[-1]))
+    return values.take_along_dim(index if values.dim() == 2 else index[..., None], 1)
 
 
 def _pack(points: Tensor) -> Tensor:

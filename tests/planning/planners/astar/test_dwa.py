@@ -8,11 +8,11 @@ from benchnav.core.errors import ConfigError
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import dwa as dwa_module
-from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, held_paths, score, velocity_window
+from benchnav.planning.planners.astar.dwa import DWA, DWAConfig, DWAState, score, velocity_window
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
 from tests import factories
-from tests.planning.planners.driving import fake_cuda, first, generator, on_cuda, step_at
+from tests.planning.planners.driving import fake_cuda, first, generator, held_paths, on_cuda, step_at
 
 CONFIG = DWAConfig()
 

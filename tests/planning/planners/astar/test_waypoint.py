@@ -82,7 +82,7 @@ def costing(grid: Grid, maps: torch.Tensor) -> GroundCosts:
     """Flat free ground on which a metre costs what maps [B, H, W] say."""
     per_m = grid.pad(maps, outside=0.0)
     none = torch.zeros_like(per_m)
-    return GroundCosts(grid, lambda traversability, grade: traversability, per_m, none, (none, none))
+    return GroundCosts(grid, lambda traversability, grade: traversability, per_m, none, none, none)
 
 
 def numbered() -> GroundCosts:

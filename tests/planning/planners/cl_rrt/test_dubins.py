@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchnav.planning.planners.cl_rrt.dubins import (
-    Segments,
     dubins_length_to_point,
     dubins_segments_to_point,
     sample_segments,
@@ -96,9 +95,9 @@ def test_path_reaches_the_point_at_its_length_forward_and_no_tighter_than_the_ra
     spacing, radius = 0.02, 0.7
     start, point = random_poses(1000, 2, size_m), random_poses(1000, 3, size_m)[:, :2]
     length = dubins_length_to_point(start, point, radius)
-    segments = dubins_segments_to_point(start, point, radius)
-    torch.testing.assert_close(segments.total_m, length)
-    path = sample_segments(start, segments, spacing, math.ceil(float(length.max()) / spacing) + 1)
+    curvature, lengths = dubins_segments_to_point(start, point, tensor(radius))
+    torch.testing.assert_close(lengths.sum(-1), length)
+    path = sample_segments(start, curvature, lengths, spacing, math.ceil(float(length.max()) / spacing) + 1)
     torch.testing.assert_close(path[:, 0], start)
     torch.testing.assert_close(path[:, -1, :2], point)
     moved = path[:, 1:] - path[:, :-1]
@@ -114,8 +113,7 @@ def test_path_reaches_the_point_at_its_length_forward_and_no_tighter_than_the_ra
 
 
 def test_points_past_the_end_repeat_it() -> None:
-    segments = Segments(tensor(0, 1), tensor(1, 0))
-    path = sample_segments(tensor(0, 0, 0), segments, 0.25, 8)
+    path = sample_segments(tensor(0, 0, 0), tensor(0, 1), tensor(1, 0), 0.25, 8)
     torch.testing.assert_close(path[:5, 0], torch.arange(5) * tensor(0.25))
     torch.testing.assert_close(path[4:], tensor(1, 0, 0).expand(4, 3))
 
@@ -175,6 +173,6 @@ def test_leading_dimensions_and_radii_broadcast() -> None:
     lengths = dubins_length_to_point(start[:, None], point[None], radius[:, None])
     assert lengths.shape == (4, 5)
     torch.testing.assert_close(lengths[2, 3], dubins_length_to_point(start[2], point[3], 1.5))
-    segments = dubins_segments_to_point(start[:, None], point[None], radius[:, None])
-    torch.testing.assert_close(segments.total_m, lengths)
-    assert sample_segments(start[:, None], segments, 0.1, 7).shape == (4, 5, 7, 3)
+    curvature, parts = dubins_segments_to_point(start[:, None], point[None], radius[:, None])
+    torch.testing.assert_close(parts.sum(-1), lengths)
+    assert sample_segments(start[:, None], curvature, parts, 0.1, 7).shape == (4, 5, 7, 3)

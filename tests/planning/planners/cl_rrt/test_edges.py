@@ -74,16 +74,16 @@ def test_edge_is_what_controller_and_robot_do_step_by_step() -> None:
         steps += 1
     assert edges.kept.all()
     assert edges.time_s.item() == pytest.approx(steps * 0.1)
-    torch.testing.assert_close(edges.end.state, state)
-    torch.testing.assert_close(edges.end.tracking.position_m, before[..., :2])
-    torch.testing.assert_close(edges.end.tracking.integral, tracking.integral)
-    torch.testing.assert_close(edges.end.tracking.error_mps, tracking.error_mps)
+    torch.testing.assert_close(edges.at.state, state)
+    torch.testing.assert_close(edges.at.tracking.position_m, before[..., :2])
+    torch.testing.assert_close(edges.at.tracking.integral, tracking.integral)
+    torch.testing.assert_close(edges.at.tracking.error_mps, tracking.error_mps)
     torch.testing.assert_close(edges.end_m, progress)
     torch.testing.assert_close(
         known(edges.drawn[0, 0])[[0, -1]], torch.stack((torch.tensor([5.0, 7.0]), state[0, 0, :2]))
     )
     assert edges.blocked_m.item() == 0
-    assert edges.end.free.item()
+    assert edges.at.free.item()
 
 
 @pytest.mark.parametrize("step_m", [2.0, 4.0])
@@ -104,15 +104,15 @@ def test_edge_ends_after_its_greatest_duration(edge_time_s: float) -> None:
 def test_edge_ends_at_the_goal() -> None:
     edges = edge(make_loop(open_map()), (10.5, 8.0, 0.0), (15.0, 8.0), (10.5, 12.0))
     assert edges.arrived.tolist() == [[True, False]]
-    assert edges.end.state[0, 0, 0] == pytest.approx(12.0, abs=0.1)
+    assert edges.at.state[0, 0, 0] == pytest.approx(12.0, abs=0.1)
 
 
 def test_nearer_half_of_an_edge_that_would_enter_a_wall_stays() -> None:
     edges = edge(make_loop(walled_map()), (5.0, 4.0, 0.0), (9.9, 4.0))
     assert edges.kept.all()
-    assert edges.end.free.all()
+    assert edges.at.free.all()
     assert edges.blocked_m.item() == 0
-    assert edges.end.state[0, 0, 0] == pytest.approx(6.5, abs=0.1)  # free from 5 m to 8 m
+    assert edges.at.state[0, 0, 0] == pytest.approx(6.5, abs=0.1)  # free from 5 m to 8 m
 
 
 def test_edge_that_begins_at_a_wall_is_rejected() -> None:
@@ -122,23 +122,23 @@ def test_edge_that_begins_at_a_wall_is_rejected() -> None:
 
 def test_edge_that_may_cross_goes_on_and_counts_the_metres() -> None:
     edges = edge(make_loop(walled_map(), crossing=True), (7.0, 4.0, 0.0), (11.0, 4.0))
-    assert edges.end.state[0, 0, 0] == pytest.approx(11.0, abs=0.1)
+    assert edges.at.state[0, 0, 0] == pytest.approx(11.0, abs=0.1)
     assert edges.blocked_m.item() == pytest.approx(1.0, abs=0.1)
-    assert edges.end.free.item()
+    assert edges.at.free.item()
     # Ground that is not free moves a robot at least as `min_traversability` does.
     assert edges.time_s.item() == pytest.approx(3 / 0.8 + 1 / 0.3, abs=0.3)
 
 
 def test_edge_that_ends_in_a_wall_is_not_on_free_ground() -> None:
     edges = edge(make_loop(walled_map(), crossing=True), (7.0, 4.0, 0.0), (8.5, 4.0))
-    assert not edges.end.free.item()
+    assert not edges.at.free.item()
     assert edges.blocked_m.item() == pytest.approx(0.5, abs=0.1)
 
 
 @pytest.mark.parametrize("crossing", [False, True])
 def test_edge_collides_with_the_border_of_the_map(crossing: bool) -> None:
     edges = edge(make_loop(open_map(), crossing=crossing), (13.0, 4.0, 0.0), (17.5, 4.0))
-    assert edges.end.state[0, 0, 0] == pytest.approx(14.5, abs=0.1)
+    assert edges.at.state[0, 0, 0] == pytest.approx(14.5, abs=0.1)
 
 
 def test_each_episode_crosses_or_not_by_itself() -> None:
@@ -147,7 +147,7 @@ def test_each_episode_crosses_or_not_by_itself() -> None:
     state = torch.tensor([[[7.0, 4.0, 0.0]]] * 2)
     begin = LoopState(state=state, tracking=Tracking.standing(state), free=torch.ones(2, 1, dtype=torch.bool))
     reference, length_m = draw_references(loop, state, torch.tensor([[[11.0, 4.0]]] * 2))
-    end = drive(loop, begin, reference, length_m).end.state[:, 0, 0]
+    end = drive(loop, begin, reference, length_m).at.state[:, 0, 0]
     assert end[0] > 10.5
     assert end[1] < 8
 
@@ -157,7 +157,7 @@ def test_robot_on_ground_that_is_not_free_may_leave_it_but_not_enter_more() -> N
     maps[:, :, 22:24] = 0.1  # the next wall, at x = 11 m
     edges = edge(make_loop(maps), (8.5, 4.0, 0.0), (10.0, 4.0), (13.0, 4.0))
     assert edges.kept.all()
-    assert edges.end.free.tolist() == [[True, True]]
-    assert edges.end.state[0, 0, 0] == pytest.approx(10.0, abs=0.1)
-    assert edges.end.state[0, 1, 0] < 11
+    assert edges.at.free.tolist() == [[True, True]]
+    assert edges.at.state[0, 0, 0] == pytest.approx(10.0, abs=0.1)
+    assert edges.at.state[0, 1, 0] < 11
     torch.testing.assert_close(edges.blocked_m, torch.full((1, 2), 0.5), rtol=0, atol=0.1)

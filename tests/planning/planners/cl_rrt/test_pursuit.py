@@ -7,17 +7,21 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
-from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig, PathFollower, Reference, Tracking
+from benchnav.planning.planners.cl_rrt.pursuit import (
+    SPACING_M,
+    FollowerConfig,
+    PathFollower,
+    Reference,
+    Tracking,
+)
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
-
-SPACING_M = 0.1
 
 
 def line(length_m: float) -> Reference:
     """Along x from the origin."""
     x = torch.arange(round(length_m / SPACING_M) + 1) * SPACING_M
     poses = torch.stack((x, torch.zeros_like(x), torch.zeros_like(x)), dim=-1)
-    return Reference.along(poses[None], torch.tensor([length_m]), SPACING_M)
+    return Reference.along(poses[None], torch.tensor([length_m]))
 
 
 def circle(radius_m: float, turns: float) -> Reference:
@@ -25,7 +29,7 @@ def circle(radius_m: float, turns: float) -> Reference:
     arc = torch.arange(round(turns * math.tau * radius_m / SPACING_M) + 1) * SPACING_M
     angle = arc / radius_m
     poses = torch.stack((radius_m * angle.sin(), radius_m * (1 - angle.cos()), angle), dim=-1)
-    return Reference.along(poses[None], arc[-1:], SPACING_M)
+    return Reference.along(poses[None], arc[-1:])
 
 
 def drive(
@@ -112,7 +116,7 @@ def test_derivative_damps_a_change_of_speed() -> None:
 
 def test_reference_runs_straight_on_past_its_end() -> None:
     poses = torch.tensor([[[0.0, 0.0, 0.0], [0.1, 0.0, math.pi / 6], [0.1, 0.0, math.pi / 6]]])
-    reference = Reference.along(poses, torch.tensor([0.1]), SPACING_M)
+    reference = Reference.along(poses, torch.tensor([0.1]))
     expected = torch.tensor([0.1 + 0.1 * math.cos(math.pi / 6), 0.1 * math.sin(math.pi / 6)])
     torch.testing.assert_close(reference.at(torch.tensor([0.2]))[0, :2], expected)
 

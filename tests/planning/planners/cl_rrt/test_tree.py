@@ -16,13 +16,13 @@ from benchnav.planning.planners.cl_rrt.tree import (
     add,
     best_route,
     choose,
-    map_tensors,
     no_route,
     plant,
     search,
     stand,
 )
 from benchnav.planning.planners.planner import PlanStatus
+from benchnav.planning.problem import map_tensors
 from tests.planning.planners.cl_rrt.maps import known, make_loop, open_map, walled_map
 
 GAP = slice(24, 28)
@@ -38,7 +38,7 @@ def extended(loop: ClosedLoop, tree: Tree, nodes: list[int], targets: list[tuple
     node, target_m = torch.tensor([nodes] * batch), torch.tensor([targets] * batch)
     begin = stand(tree, node)
     reference, length_m = draw_references(loop, begin.state, target_m)
-    choice = Choice(node=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool))
+    choice = Choice(parent=node, target_m=target_m, aimed=torch.zeros_like(node, dtype=torch.bool))
     return add(loop, tree, choice, drive(loop, begin, reference, length_m))
 
 
@@ -78,9 +78,9 @@ def test_share_of_choices_that_explore(known_way: bool) -> None:
         tree = replace(way, arrived=arrived, time_s=time_s)
     chance = (torch.arange(1000) + 0.5) / 1000
     choice = choose(loop, tree, torch.tensor([8.0, 8.0]).expand(1000, 2), chance, 0)
-    explored = choice.node[0] == 1
+    explored = choice.parent[0] == 1
     assert explored.float().mean().item() == pytest.approx(0.3 if known_way else 0.7)
-    assert (choice.node[0][~explored] == 0).all()
+    assert (choice.parent[0][~explored] == 0).all()
 
 
 def test_nearest_is_by_dubins_length() -> None:
@@ -93,7 +93,7 @@ def test_nearest_is_by_dubins_length() -> None:
     point = torch.tensor([[2.5, 8.0]])
     lengths = dubins_length_to_point(tree.at.state[0], point, 1.0)
     assert lengths[1] < lengths[0]
-    assert choose(loop, tree, point, torch.zeros(1), 0).node.item() == 1
+    assert choose(loop, tree, point, torch.zeros(1), 0).parent.item() == 1
 
 
 def test_nodes_that_cannot_improve_on_the_best_way_are_left_out() -> None:
@@ -102,11 +102,11 @@ def test_nodes_that_cannot_improve_on_the_best_way_are_left_out() -> None:
     arrived, time_s = torch.tensor([[False, False, True]]), torch.tensor([[0.0, 18.0, 20.0]])
     tree = replace(tree, arrived=arrived, time_s=time_s)  # 5 m to the goal's rim: 18 s + 5 s > 20 s
     chance = torch.linspace(0, 0.99, 20)
-    assert (choose(loop, tree, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 3).node == 0).all()
+    assert (choose(loop, tree, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 3).parent == 0).all()
     soon = replace(tree, time_s=torch.tensor([[0.0, 14.0, 20.0]]))
-    assert (choose(loop, soon, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).node == 1).any()
+    assert (choose(loop, soon, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent == 1).any()
     dear = replace(soon, blocked_m=torch.tensor([[0.0, 0.1, 0.0]]))  # and the penalty counts
-    assert (choose(loop, dear, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).node == 0).all()
+    assert (choose(loop, dear, torch.tensor([8.0, 8.0]).expand(20, 2), chance, 0).parent == 0).all()
 
 
 def test_the_goals_share_goes_to_nodes_that_have_not_tried_it_the_nearest_first() -> None:
@@ -114,18 +114,18 @@ def test_the_goals_share_goes_to_nodes_that_have_not_tried_it_the_nearest_first(
     tree = extended(loop, planted(loop), [0, 0, 0], [(5.0, 8.0), (4.0, 8.0), (6.0, 8.0)])
     sample_m, chance = torch.tensor([[15.0, 1.0]]).expand(5, 2), torch.zeros(5)
     first = choose(loop, tree, sample_m, chance, 2)
-    assert first.node[0, :2].tolist() == [3, 1]
+    assert first.parent[0, :2].tolist() == [3, 1]
     assert first.aimed.tolist() == [[True, True, False, False, False]]
     torch.testing.assert_close(first.target_m[0, :2], loop.problem.goal_m.expand(2, 2))
     torch.testing.assert_close(first.target_m[0, 2:], sample_m[2:])
-    begin = stand(tree, first.node)
+    begin = stand(tree, first.parent)
     reference, length_m = draw_references(loop, begin.state, first.target_m)
     larger = add(loop, tree, first, drive(loop, begin, reference, length_m))
     again = choose(loop, larger, sample_m[:1].expand(9, 2), torch.zeros(9), 9)
     left = larger.to_goal_m[0].isfinite()
     left[[1, 3]] = False
-    assert sorted(again.node[0][again.aimed[0]].tolist()) == left.nonzero()[:, 0].tolist()
-    lengths = larger.to_goal_m[0][again.node[0][again.aimed[0]]]
+    assert sorted(again.parent[0][again.aimed[0]].tolist()) == left.nonzero()[:, 0].tolist()
+    lengths = larger.to_goal_m[0][again.parent[0][again.aimed[0]]]
     assert (lengths.diff() >= 0).all()
 
 
