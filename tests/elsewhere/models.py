@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchnav.core.device import CPU
+from benchnav.core.device import CPU, find_device
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models import cli
@@ -127,8 +127,8 @@ def test_each_command_uses_the_device_that_it_is_given(
         pass
 
     def begin(*given: Any, **named: Any) -> Any:
-        places = [value.place if isinstance(value, FitOptions) else value for value in given]
-        asked.append(next(value for value in places if isinstance(value, torch.device)))
+        names = [value.device if isinstance(value, FitOptions) else value for value in given]
+        asked.append(find_device(next(name for name in names if name in ("auto", "cpu", "cuda"))))
         raise Enough
 
     def measure(model: Any, dataset: Any, splits: Any, seed: int, device: torch.device) -> Any:
