@@ -51,8 +51,6 @@ def run_command(
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = _own_folder(out)
-    for planner, options in suite.planner_options.items():
-        _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     steps = run_suite(
         suite, folder, jobs, overwrite, planner_limit_s, _say, own, scheduler, device, reuse_code
     )
