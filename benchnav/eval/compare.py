@@ -260,11 +260,12 @@ def _left_out(pairs: Sequence[Pair]) -> list[str]:
 
 def _maps(maps: Sequence[int]) -> str:
     """Numbers of maps in words; runs of them by their ends."""
-    whole = len(maps) > 1 and maps[-1] - maps[0] == len(maps) - 1
-    if whole:
+    if len(maps) == 1:
+        return f"map {maps[0]}"
+    if maps[-1] - maps[0] == len(maps) - 1:
         return f"maps {maps[0]} to {maps[-1]}"
-    listed = ", ".join(map(str, maps[:_NAMED])) + (", …" if len(maps) > _NAMED else "")
-    return f"map {listed}" if len(maps) == 1 else f"{len(maps)} maps ({listed})"
+    more = ", …" if len(maps) > _NAMED else ""
+    return f"{len(maps)} maps ({', '.join(map(str, maps[:_NAMED]))}{more})"
 
 
 def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair]) -> list[str]:

@@ -162,20 +162,22 @@ def check_labels(conditions: Iterable[Condition]) -> None:
     Raises:
         ConfigError: there are such.
     """
-    known: dict[tuple[str, str], Any] = {}
+    known: dict[tuple[str, str], str] = {}
     labels: dict[tuple[str, str], str] = {}
     for condition in conditions:
-        for name, label in condition.labels.items():
+        value = condition.value
+        described = {name: value[name] for name in PART_KINDS} | {"world": [value["world"], value["rules"]]}
+        for name, about in described.items():
+            label, digest = condition.labels[name], text_digest(about)
             if label == NOT_USED:
                 continue
-            value = _labelled(condition, name)
-            if known.setdefault((name, label), value) != value:
+            if known.setdefault((name, label), digest) != digest:
                 raise ConfigError(
                     f"Expected a label for each {name}, got two settings that are both called {label!r}. "
                     f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
                 )
-            first = labels.setdefault((name, repr(value)), label)
-            if value is not None and first != label:
+            first = labels.setdefault((name, digest), label)
+            if first != label:
                 raise ConfigError(
                     f"Expected one label for one {name}, got {label!r} for what is called {first!r}. Write "
                     f"label: {first}."
@@ -262,12 +264,6 @@ def _as_run_once(condition: Condition) -> Condition:
             "it is resampled at each step. Take the world stakes, or `world.noise` frozen or stored."
         )
     return replace(condition, risk=any_risk)
-
-
-def _labelled(condition: Condition, name: str) -> Any:
-    if name == "world":
-        return condition.world, condition.rules
-    return condition.value[name] if name in PART_KINDS else None
 
 
 def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:

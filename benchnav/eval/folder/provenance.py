@@ -126,16 +126,13 @@ def describe_parts(condition: Condition) -> Code:
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
-    used: dict[tuple[str, str], int] = {}
-    for condition, extent in conditions.values():
-        place = condition.data, condition.split
-        used[place] = max(extent.maps, used.get(place, 0))
     described: dict[str, Any] = {}
-    for (data, split), count in used.items():
-        dataset = TerrainDataset(find_dataset(data))
-        about = described.setdefault(data, {"id": dataset.id, "maps": {}, "about": {}})
-        about["maps"][split] = map_digests(dataset, split, range(count))
-        about["about"][split] = dataset.about_digest(split)
+    for condition, extent in conditions.values():
+        dataset, split = TerrainDataset(find_dataset(condition.data)), condition.split
+        about = described.setdefault(condition.data, {"id": dataset.id, "maps": {}, "about": {}})
+        if extent.maps > len(about["maps"].get(split, ())):
+            about["maps"][split] = map_digests(dataset, split, range(extent.maps))
+            about["about"][split] = dataset.about_digest(split)
     return described
 
 
