@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -117,7 +118,9 @@ def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = No
         if config and default is not None:
             yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
         else:
-            kind = "" if option.kind is Any else f": {inspect.formatannotation(option.kind)}"
+            # A type as people write it in code, classes without their modules.
+            name_of_type = re.sub(r"(\w+\.)+", "", inspect.formatannotation(option.kind))
+            kind = "" if option.kind is Any else f": {name_of_type}"
             yield f"{prefix}{name}{kind}{_default(default)}"
 
 

@@ -102,9 +102,9 @@ def test_a_unit_is_the_same_on_another_device(
     unit = unit_of(dataset_path, **changes)
     used: set[torch.device] = set()
 
-    def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any) -> Any:
+    def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any, **options: Any) -> Any:
         used.update(value.device for value in (problem.start, problem.risk_map, simulation.steps))
-        return simulate_here(unit, problem, simulation, *given)
+        return simulate_here(unit, problem, simulation, *given, **options)
 
     simulate_here = units_of_run.simulate
     monkeypatch.setattr(units_of_run, "simulate", simulate)
