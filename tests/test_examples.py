@@ -41,7 +41,7 @@ def evaluate(dataset: Path, folder: Path, *flags: str) -> pd.DataFrame:
     command = [
         Path(sys.executable).with_name("benchnav-eval"), "run", "--data", dataset, "--model", "oracle",
         "--maps", "2", "--scenarios", "[std]", "--record", "none", "--jobs", "2", "--out", "run",
-        "--time_budget_s", "60",
+        "--world.time_budget_s", "60",
     ]  # fmt: skip
     done = subprocess.run(
         [*map(str, command), *flags], cwd=folder, capture_output=True, text=True, timeout=300
@@ -76,7 +76,7 @@ def test_a_robot_and_an_objective_of_ones_own_by_file(dataset_path: Path, tmp_pa
     assert len(path.read_text().splitlines()) < 40
     rows = evaluate(
         dataset_path, tmp_path, "--robots", f"[{path}:Tracked]", "--objectives", f"[{path}:Energy]",
-        "--planners", "[straight,astar_dwa,mppi]", "--risks", "[mean]", "--planner_options", "{mppi: {samples: 128}}",
+        "--planners", "[straight,astar_dwa,{part: mppi, options: {samples: 128}}]", "--risks", "[mean]",
     )  # fmt: skip
     assert set(rows["robot"]) == {"Tracked"}
     assert set(rows["objective"]) == {"Energy"}

@@ -26,10 +26,13 @@ NO_DEFAULT = inspect.Parameter.empty
 RENAMED = {
     "instance": "map",
     "instances": "maps",
+    "noise": "world.noise",
+    "planner_options": "planners",
     "recorded": "record",
     "slowest": "min_traversability",
     "split": "splits",
     "steps": "record",
+    "time_budget_s": "world.time_budget_s",
     "trials": "conditions",
 }
 
@@ -357,7 +360,7 @@ def hint(name: str, known: Iterable[str], prefix: str = "") -> str:
     known = list(known)
     old = re.split(r"[-.]", name)[-1]
     now = name.removesuffix(old) + RENAMED.get(old, old)
-    if now != name and now in known:
+    if now != name and {now, now.rpartition(".")[0]} & set(known):
         return f" It is now {prefix + now!r}."
     close = difflib.get_close_matches(name, known, n=1)
     return f" Did you mean {prefix + close[0]!r}?" if close else ""

@@ -2,11 +2,11 @@
 
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
-from types import NoneType, UnionType
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from typing import Any, NamedTuple
 
 from benchnav.core import registry
 from benchnav.core.errors import BenchnavError, ConfigError
@@ -118,18 +118,10 @@ def _option_lines(options: dict[str, Option], prefix: str = "", holder: Any = No
         if config and default is not None:
             yield from _option_lines(list_options(config), f"{prefix}{name}.", default)
         else:
-            kind = "" if option.kind is Any else f": {_type_name(option.kind)}"
+            # A type as people write it in code, classes without their modules.
+            name_of_type = re.sub(r"(\w+\.)+", "", inspect.formatannotation(option.kind))
+            kind = "" if option.kind is Any else f": {name_of_type}"
             yield f"{prefix}{name}{kind}{_default(default)}"
-
-
-def _type_name(kind: Any) -> str:
-    """A type as people write it in code."""
-    members = get_args(kind)
-    if get_origin(kind) in (Union, UnionType):
-        return " | ".join(map(_type_name, members))
-    if kind is NoneType:
-        return "None"
-    return kind.__name__ if isinstance(kind, type) and not members else str(kind).replace("typing.", "")
 
 
 def _default(value: Any) -> str:

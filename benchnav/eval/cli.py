@@ -51,8 +51,6 @@ def run_command(
     if planner_limit_s < 0:
         raise ConfigError(f"Expected `planner_limit_s` ≥ 0, got {planner_limit_s}.")
     folder = _own_folder(out)
-    for planner, options in suite.planner_options.items():
-        _say(f"{planner}: " + ", ".join(f"{name} = {value}" for name, value in options.items()))
     steps = run_suite(
         suite, folder, jobs, overwrite, planner_limit_s, _say, own, scheduler, device, reuse_code
     )
@@ -61,7 +59,7 @@ def run_command(
         return _finish(folder)
     print(f"shard {own} is finished in {folder}")
     print(f"merge:   {program('benchnav-eval')} merge OUT PART …, when all {own.of} are")
-    return _failed_shard(folder)
+    return _failed(folder)
 
 
 def merge(out: str, parts: list[str]) -> int:
@@ -246,28 +244,20 @@ def _print_replay(folder: Path) -> None:
 
 
 def _failed(folder: Path) -> int:
-    """Exit status of a finished run: 1 where a planner or model failed, which one line says."""
+    """Exit status of a finished run or shard: 1 where a planner or model failed, which one line says."""
     from benchnav.eval.folder.folder import EPISODES, ERRORS, read_table
-
-    rows = read_table(folder, EPISODES)
-    faults = rows[rows["outcome"].isin(["planner_error", "model_error"])]
-    if faults.empty:
-        return 0
-    counted = " and ".join(f"{count} in {kind}" for kind, count in faults["outcome"].value_counts().items())
-    _say(
-        f"episodes that ended by a fault of the code they ran: {counted}, the first by {faults['error'].iloc[0]}; "
-        f"see {folder / ERRORS}"
-    )
-    return 1
-
-
-def _failed_shard(folder: Path) -> int:
-    """Exit status of a finished shard, which has no table yet."""
-    from benchnav.eval.folder.folder import ERRORS
 
     if not (folder / ERRORS).exists():
         return 0
-    _say(f"some episodes ended by a fault of the code they ran; see {folder / ERRORS}")
+    said = "some episodes ended by a fault of the code they ran"
+    if (folder / EPISODES).exists():  # which a shard does not have
+        rows = read_table(folder, EPISODES)
+        faults = rows[rows["outcome"].isin(["planner_error", "model_error"])]
+        counts = faults["outcome"].value_counts()
+        counted = " and ".join(f"{count} in {kind}" for kind, count in counts.items())
+        first = faults["error"].iloc[0]
+        said = f"episodes that ended by a fault of the code they ran: {counted}, the first by {first}"
+    _say(f"{said}; see {folder / ERRORS}")
     return 1
 
 

@@ -4,7 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, combinations
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -75,15 +75,13 @@ def compare_runs(
     unlike = [_unlike_code(pair.members) for pair in pairs]
     # Versions and machines may differ between rows; what a label names may not.
     members = {member for pair in pairs for member in pair.members}
-    lines = _in_words([*chain.from_iterable(unlike), *_unlike_code(members, parts_alone=True)])
+    lines = _unlike_code(members, parts_alone=not any(unlike))
     if lines and by != "run" and not allow_different_code:
         raise ConfigError(
             f"Expected conditions that differ in their {by} alone, but the code that made them differs too: "
             f"{'; '.join(lines)}. Run them with one code, or pass --allow-different code to have it said in the table."
         )
-    table = compare(pairs, difference).assign(
-        different_code=["; ".join(_in_words(found)) for found in unlike]
-    )
+    table = compare(pairs, difference).assign(different_code=["; ".join(found) for found in unlike])
     shown = comparison_table(table, difference, by)
     notes = (*_about(pairs, table), *_left_out(pairs), *_no_partner(conditions, pairs), *shown.notes)
     notes += tuple(f"Different code: {line}." for line in lines)
@@ -167,28 +165,18 @@ def _chosen(conditions: Iterable[Compared], asked: Mapping[str, str]) -> list[Co
     return chosen
 
 
-def _unlike_code(conditions: Iterable[Compared], parts_alone: bool = False) -> list[tuple[str, str, str]]:
-    """What of the code that made conditions differs, by the two runs; of parts and our own sources alone, or of all."""
-    held = [
-        (run, {**code, "environment": {}} if parts_alone else code)
-        for condition in conditions
-        for run, code in condition.code.items()
-    ]
+def _unlike_code(conditions: Iterable[Compared], parts_alone: bool = False) -> list[str]:
+    """What of the code that made conditions differs, a line for two runs; perhaps of parts and sources alone."""
+    codes: dict[str, dict[str, dict[str, Any]]] = {}
+    for condition in conditions:
+        for run, code in condition.code.items():
+            held = codes.setdefault(run, {group: {} for group in code})
+            for group, known in code.items():
+                held[group] |= {} if parts_alone and group == "environment" else known
     return [
-        (first, second, name)
-        for (first, earlier), (second, now) in combinations(sorted(held, key=lambda one: one[0]), 2)
-        if first != second
-        for name in code_differences(earlier, now)
-    ]
-
-
-def _in_words(found: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Says what code differs, a line for two runs."""
-    lines: dict[tuple[str, str], list[str]] = {}
-    for first, second, name in dict.fromkeys(found):
-        lines.setdefault((first, second), []).append(name)
-    return [
-        f"{second} differs from {first} in {', '.join(names)}" for (first, second), names in lines.items()
+        f"{second} differs from {first} in {', '.join(names)}"
+        for first, second in combinations(sorted(codes), 2)
+        if (names := code_differences(codes[first], codes[second]))
     ]
 
 
@@ -215,7 +203,7 @@ def _joined(one: Compared, other: Compared) -> Compared:
     if len(cells):
         unlike = cells.index.droplevel(-1).unique()
         both = len(first.merge(second, on=DRAW))
-        why = "; ".join(_in_words(_unlike_code((one, other))))
+        why = "; ".join(_unlike_code((one, other)))
         raise ConfigError(
             f"Expected one set of rows of a condition that several runs hold, but {len(unlike)} of {both} episodes of "
             f"{words} came out differently in {runs}{f' ({why})' if why else ''}. Leave one of them out, or "
@@ -272,11 +260,12 @@ def _left_out(pairs: Sequence[Pair]) -> list[str]:
 
 def _maps(maps: Sequence[int]) -> str:
     """Numbers of maps in words; runs of them by their ends."""
-    whole = len(maps) > 1 and maps[-1] - maps[0] == len(maps) - 1
-    if whole:
+    if len(maps) == 1:
+        return f"map {maps[0]}"
+    if maps[-1] - maps[0] == len(maps) - 1:
         return f"maps {maps[0]} to {maps[-1]}"
-    listed = ", ".join(map(str, maps[:_NAMED])) + (", …" if len(maps) > _NAMED else "")
-    return f"map {listed}" if len(maps) == 1 else f"{len(maps)} maps ({listed})"
+    more = ", …" if len(maps) > _NAMED else ""
+    return f"{len(maps)} maps ({', '.join(map(str, maps[:_NAMED]))}{more})"
 
 
 def _no_partner(conditions: Sequence[Compared], pairs: Sequence[Pair]) -> list[str]:

@@ -50,8 +50,9 @@ def faulty(fault: str) -> dict[str, Any]:
 def unit_of(data: Path | str, **changes: Any) -> Unit:
     given: dict[str, Any] = {
         "data": str(data), "model": "oracle", "planners": ("straight",), "risks": ("cvar:0.9",),
-        "scenarios": ("std",), "time_budget_s": 1.2,
+        "scenarios": ("std",),
     } | changes  # fmt: skip
+    given["world"] = {"time_budget_s": 1.2} | given.get("world", {})
     (condition,) = conditions_of(Suite(**given), lambda data: ["std"])
     return Unit(condition=condition, seed=0, realisation=0, maps=(0, 1), record="all", leads=True)
 
@@ -101,9 +102,9 @@ def test_a_unit_is_the_same_on_another_device(
     unit = unit_of(dataset_path, **changes)
     used: set[torch.device] = set()
 
-    def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any) -> Any:
+    def simulate(unit: Unit, problem: Problem, simulation: Simulation, *given: Any, **options: Any) -> Any:
         used.update(value.device for value in (problem.start, problem.risk_map, simulation.steps))
-        return simulate_here(unit, problem, simulation, *given)
+        return simulate_here(unit, problem, simulation, *given, **options)
 
     simulate_here = units_of_run.simulate
     monkeypatch.setattr(units_of_run, "simulate", simulate)
@@ -136,7 +137,7 @@ def test_nothing_waits_for_a_device_at_every_step(
 ) -> None:
     counted = []
     for budget_s in (0.8, 2.4):  # neither is enough to arrive
-        unit = unit_of(dataset_path, planners=(planner,), robots=(robot,), time_budget_s=budget_s)
+        unit = unit_of(dataset_path, planners=(planner,), robots=(robot,), world={"time_budget_s": budget_s})
         unit = replace(unit, record="steps")
         with elsewhere() as device:
             run_here(unit, tmp_path / f"{budget_s:g}", device=device)
@@ -200,7 +201,7 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=("straight",), risks=("mean",), scenarios=("std",),
-        maps=1, time_budget_s=2.0, record="steps",
+        maps=1, world={"time_budget_s": 2.0}, record="steps",
     )  # fmt: skip
     for _ in run_suite(suite, tmp_path / "run"):
         pass

@@ -41,7 +41,7 @@ def forge_run(
     digest = code_digest(code)
     notes: dict[str, Any] = {"follows": "", "remarks": [], "changed": []}
     about: dict[str, Any] = {
-        "format": "benchnav-run", "format_version": FORMAT_VERSION, "suite": {}, "commands": [],
+        "format": "benchnav-run", "format_version": FORMAT_VERSION, "suite": {},
         "conditions": {name: notes | dict(entry) for name, entry in conditions.items()}, "datasets": {},
         "codes": {digest: code}, "reused": "",
         "planner_limit_s": 0.0, "device": "cpu", "gpu": None, "warnings": [], "dropped": [],

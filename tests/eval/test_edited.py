@@ -22,7 +22,7 @@ def run(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("edited") / "run"
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty", "straight"),
-        risks=("mean", "cvar:0.5"), scenarios=("std",), maps=2, seeds=(0, 3), time_budget_s=4.0,
+        risks=("mean", "cvar:0.5"), scenarios=("std",), maps=2, seeds=(0, 3), world={"time_budget_s": 4.0},
         record="none",
     )  # fmt: skip
     list(run_suite(suite, folder))

@@ -15,8 +15,8 @@ from benchnav.eval.folder.folder import open_run
 from benchnav.eval.run.runner import run_suite
 
 SMALL = (
-    "--planners", "[straight,mppi]", "--risks", "[mean]", "--scenarios", "[std]", "--maps", "1",
-    "--model", "oracle", "--time_budget_s", "10", "--planner_options", '{"mppi": {"samples": 64}}',
+    "--planners", "[straight,{part: mppi, options: {samples: 64}}]", "--risks", "[mean]",
+    "--scenarios", "[std]", "--maps", "1", "--model", "oracle", "--world.time_budget_s", "10",
 )  # fmt: skip
 
 
@@ -182,7 +182,7 @@ def test_a_config_file_and_print_config(dataset_path: Path, tmp_path: Path, monk
         ("run", "--planers", "[mppi]"),
         ("run", "--planners", "[mppi,nowhere.py:Mine]", "--model", "oracle"),
         ("run", "--world", "mars", "--model", "oracle"),
-        ("run", "--noise", "frozen", "--model", "oracle"),
+        ("run", "--noise", "stored", "--model", "oracle"),
         ("run", "--planner_limit_s", "-1", "--model", "oracle"),
         ("run", "--device", "gpu", "--model", "oracle"),
         ("run", "--config", "no-such.yaml"),

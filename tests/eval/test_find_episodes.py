@@ -26,7 +26,7 @@ def made(path: Path, **draws: tuple[tuple[int, int, int], ...]) -> Path:
     maps = {f"test/{scenario}": ["m"] * 60 for scenario in ("std", "hs")}
     about = {
         "format": FORMAT, "format_version": FORMAT_VERSION, "suite": {}, "conditions": entries,
-        "datasets": {suite.data: {"id": "d", "maps": maps}}, "commands": [], "machine": {}, "device": "cpu",
+        "datasets": {suite.data: {"id": "d", "maps": maps}}, "machine": {}, "device": "cpu",
         "planner_limit_s": 0.0,
     }  # fmt: skip
     path.mkdir()

@@ -36,7 +36,7 @@ def call(*words: str) -> int:
 def words_on(dataset: Path, *more: str) -> tuple[str, ...]:
     return (
         "run", "--data", str(dataset), "--model", "oracle", "--planners", "[tests.eval.parts:Faulty]", "--risks",
-        "[mean]", "--scenarios", "[std]", "--maps", "1", "--time_budget_s", "4", "--record", "steps", *more,
+        "[mean]", "--scenarios", "[std]", "--maps", "1", "--world.time_budget_s", "4", "--record", "steps", *more,
     )  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def run(made: Path, tmp_path: Path) -> Path:
 def quick(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": ("tests.eval.parts:Faulty",), "risks": ("mean",),
-        "scenarios": ("std",), "maps": 1, "record": "none", "time_budget_s": 2.0,
+        "scenarios": ("std",), "maps": 1, "record": "none", "world": {"time_budget_s": 2.0},
     }  # fmt: skip
     return Suite(**(given | changes))
 

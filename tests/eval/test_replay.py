@@ -15,7 +15,7 @@ from benchnav.eval.report.playback.video import frame_times
 
 SMALL = (
     "--planners", "[straight,'tests.eval.parts:Faulty']", "--risks", "[mean,cvar:0.5]", "--scenarios", "[std]",
-    "--maps", "2", "--model", "oracle", "--time_budget_s", "5", "--noise", "stored",
+    "--maps", "2", "--model", "oracle", "--world.time_budget_s", "5", "--world.noise", "stored",
 )  # fmt: skip
 
 
@@ -137,6 +137,9 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
         (("run", "--recorded", "4"), "It is now '--record'."),
         (("run", "--instances", "4"), "It is now '--maps'."),
         (("replay", "RUN", "--instance", "4"), "It is now '--map'."),
+        (("run", "--noise", "stored"), "It is now '--world.noise'."),
+        (("run", "--time_budget_s", "50"), "It is now '--world.time_budget_s'."),
+        (("run", "--planner_options", "{}"), "It is now '--planners'."),
         (("run", "--task.slowest", "0.2"), "It is now 'min_traversability'."),
         (("run", "--config", "old.yaml"), "It is now 'record'."),
         (("run", "--record", "some"), "'none' or 'steps' or 'first' or 'failures' or 'all'"),

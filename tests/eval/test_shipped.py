@@ -28,10 +28,9 @@ def test_knowing_the_truth_each_planner_succeeds_on_nearly_every_std_map(
 ) -> None:
     suite = Suite(
         model="oracle",
-        planners=(planner,),
+        planners=({"part": planner, "options": FEW_SAMPLES.get(planner, {})},),
         risks=("mean",),
         scenarios=("std",),
-        planner_options={planner: FEW_SAMPLES[planner]} if planner in FEW_SAMPLES else {},
         record="steps",
     )
     for _ in run_suite(suite, tmp_path / "run"):

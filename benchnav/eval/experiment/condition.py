@@ -140,16 +140,10 @@ def conditions_of(suite: Suite, scenarios_of: Any) -> list[Condition]:
     Raises:
         ConfigError: a part cannot be had as asked for, two parts share a label, or one is there twice.
     """
-    products = [_listed(suite, product) for product in suite.conditions or ({},)]
-    planners = dict.fromkeys(
-        registry.read_part("planner", given).part for product in products for given in product["planners"]
-    )
-    for name in suite.planner_options:  # such as a mistyped one
-        check_known("`planner_options` of planners of the suite", name, planners)
     every: list[Condition] = []
-    for product in products:
+    for product in suite.conditions or ({},):
         here: set[str] = set()
-        for condition in _product(suite, product, scenarios_of):
+        for condition in _product(_listed(suite, product), scenarios_of):
             if condition.id in here and condition.risk.label != NOT_USED:
                 words = " ".join(label_words(condition.labels))
                 raise ConfigError(f"Expected settings that differ, got twice what {words} is.")
@@ -168,20 +162,22 @@ def check_labels(conditions: Iterable[Condition]) -> None:
     Raises:
         ConfigError: there are such.
     """
-    known: dict[tuple[str, str], Any] = {}
+    known: dict[tuple[str, str], str] = {}
     labels: dict[tuple[str, str], str] = {}
     for condition in conditions:
-        for name, label in condition.labels.items():
+        value = condition.value
+        described = {name: value[name] for name in PART_KINDS} | {"world": [value["world"], value["rules"]]}
+        for name, about in described.items():
+            label, digest = condition.labels[name], text_digest(about)
             if label == NOT_USED:
                 continue
-            value = _labelled(condition, name)
-            if known.setdefault((name, label), value) != value:
+            if known.setdefault((name, label), digest) != digest:
                 raise ConfigError(
                     f"Expected a label for each {name}, got two settings that are both called {label!r}. "
                     f"Write them as {{part: NAME, label: LABEL, options: {{…}}}}."
                 )
-            first = labels.setdefault((name, repr(value)), label)
-            if value is not None and first != label:
+            first = labels.setdefault((name, digest), label)
+            if first != label:
                 raise ConfigError(
                     f"Expected one label for one {name}, got {label!r} for what is called {first!r}. Write "
                     f"label: {first}."
@@ -201,20 +197,12 @@ def _listed(suite: Suite, product: Mapping[str, Any]) -> dict[str, list[Any]]:
     }
 
 
-def _product(suite: Suite, listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Condition]:
+def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Condition]:
     parts = {
-        kind: [part for given in listed[f"{kind}s"] for part in _parts(kind, given, suite)]
-        for kind in PART_KINDS
+        kind: [part for given in listed[f"{kind}s"] for part in _parts(kind, given)] for kind in PART_KINDS
     }
-    if suite.noise == "frozen":
-        raise ConfigError(
-            "Expected `noise` 'resampled' or 'stored', got 'frozen', which is now 'stored': the map's own λ. "
-            "For λ drawn once an episode say `world.noise` frozen, or take the world stakes."
-        )
-    short = {"noise": suite.noise, "time_budget_s": suite.time_budget_s}
-    # Short forms hold where a world itself names nothing.
     worlds = [
-        read_world(world, task, {name: value for name, value in short.items() if value})
+        read_world(world, task)
         for listed_world in listed["world"]
         for world in each_mapping(listed_world)
         for listed_task in listed["task"]
@@ -236,7 +224,7 @@ def is_checkpoint(kind: str, source: str) -> bool:
     return kind == "model" and ":" not in source and source not in registry.names("model")
 
 
-def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
+def _parts(kind: str, given: Any) -> list[Part]:
     """What is given as one part: several where options are given lists of values."""
     from benchnav.models.base import is_family
     from benchnav.models.predictor import find_checkpoint, load_model
@@ -251,8 +239,6 @@ def _parts(kind: str, given: Any, suite: Suite) -> list[Part]:
         return [replace(part, label=Path(part.part).name) if part.label == part.part else part]
     if kind == "model" and is_family(registry.find("model", part.part).target):
         load_model(part)  # says what to name in place of a family
-    if kind == "planner" and part.part in suite.planner_options:
-        part = replace(part, options={**suite.planner_options[part.part], **part.options})
     made = [registry.complete(kind, one) for one in each_part(kind, part)]
     if kind == "risk" and registry.find("risk", part.part).shipped:
         # Lets it refuse its options on one cell, also where no condition uses it.
@@ -278,12 +264,6 @@ def _as_run_once(condition: Condition) -> Condition:
             "it is resampled at each step. Take the world stakes, or `world.noise` frozen or stored."
         )
     return replace(condition, risk=any_risk)
-
-
-def _labelled(condition: Condition, name: str) -> Any:
-    if name == "world":
-        return condition.world, condition.rules
-    return condition.value[name] if name in PART_KINDS else None
 
 
 def label_words(labels: Mapping[str, str], names: Iterable[str] = LABELS[1:]) -> list[str]:

@@ -6,7 +6,7 @@ margin, or that they are equal to within it. `benchnav.eval.stats.hypotheses` te
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -182,7 +182,12 @@ def _pairs(
         (one, other)
         for one in ones
         for other in others
-        if one.id != other.id and _agree(one.labels, other.labels, unnamed)
+        # A label that is not used goes with any.
+        if one.id != other.id
+        and all(
+            one.labels[name] == other.labels[name] or NOT_USED in (one.labels[name], other.labels[name])
+            for name in unnamed
+        )
     ]
     for place, side in enumerate(("other", "one")):
         partners = defaultdict(list)
@@ -207,8 +212,3 @@ def _pairs(
                 f"{name}. Name one {name} in both."
             )
     return pairs
-
-
-def _agree(one: Mapping[str, str], other: Mapping[str, str], names: Iterable[str]) -> bool:
-    """Whether labels are the same; one that is not used goes with any."""
-    return all(one[name] == other[name] or NOT_USED in (one[name], other[name]) for name in names)

@@ -38,9 +38,6 @@ class Suite:
             time_budget_ratio: T over the map's reference time}; or a list of several.
         task: Changes to the preset's rules: {free_space: {by: risk | mean, above: 0.3}, min_traversability: 0.3,
             goal_radius_m: 1.0}.
-        noise: Short for `world.noise`.
-        time_budget_s: Short for `world.time_budget_s`; 0 takes the world's.
-        planner_options: Options of planners by name, as {planner: {option: value}}.
         maps: Maps a scenario, the first ones of the split; 0 takes all.
         seed: Root seed of all draws.
         seeds: Several root seeds in place of `seed`.
@@ -63,9 +60,6 @@ class Suite:
     objectives: tuple[PartSpec, ...] = ("goal_distance",)
     world: tuple[PartSpec, ...] | PartSpec = "paper"
     task: dict[str, Any] = field(default_factory=dict)
-    noise: str = ""
-    time_budget_s: float = 0.0
-    planner_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     maps: int = 20
     seed: int = 0
     seeds: tuple[int, ...] = ()

@@ -297,7 +297,8 @@ def differences(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFrame
     both = one.index.intersection(other.index, sort=False)
     cells = one.loc[both].compare(other.loc[both], result_names=("first", "second"))
     lacking = one.index.symmetric_difference(other.index, sort=False)
-    return cells.stack(level=0, future_stack=True).dropna(how="all"), lacking
+    cells = cells.stack(level=0, future_stack=True).dropna(how="all")
+    return cells.reindex(columns=["first", "second"]), lacking
 
 
 def differing_columns(first: pd.DataFrame, second: pd.DataFrame) -> list[str]:

@@ -12,7 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -88,21 +88,19 @@ class Origins:
             "planner_limit_s": planner_limit_s,
         }
         self._codes: dict[str, Code] = {}
-        self._maps: dict[tuple[str, str], list[str]] = {}  # a digest of what they mean, and one of each
+        self._maps: dict[tuple[Any, ...], tuple[str, ...]] = {}  # a digest of what they mean, and one of each
 
     def of(self, unit: Unit) -> Origin:
         """The origin of a unit that is made now."""
         condition = unit.condition
         if condition.id not in self._codes:
             self._codes[condition.id] = {"environment": self._environment, **describe_parts(condition)}
-        place = condition.data, condition.split
-        if len(self._maps.get(place, ())) <= unit.maps[-1] + 1:
+        place = condition.data, condition.split, unit.maps
+        if place not in self._maps:
             dataset = TerrainDataset(find_dataset(condition.data))
-            digests = map_digests(dataset, condition.split, unit.maps[-1] + 1)
-            self._maps[place] = [dataset.about_digest(condition.split), *digests]
-        meaning, *digests = self._maps[place]
-        maps = (meaning, *(digests[i] for i in unit.maps))
-        return Origin(code=self._codes[condition.id], maps=maps)
+            digests = map_digests(dataset, condition.split, unit.maps)
+            self._maps[place] = (dataset.about_digest(condition.split), *digests)
+        return Origin(code=self._codes[condition.id], maps=self._maps[place])
 
 
 def describe_parts(condition: Condition) -> Code:
@@ -128,23 +126,19 @@ def describe_parts(condition: Condition) -> Code:
 
 def describe_datasets(conditions: Conditions) -> dict[str, Any]:
     """The maps used: by dataset its id and, by split, a digest of each map and one of what they mean."""
-    used: dict[tuple[str, str], int] = {}
-    for condition, extent in conditions.values():
-        place = condition.data, condition.split
-        used[place] = max(extent.maps, used.get(place, 0))
     described: dict[str, Any] = {}
-    for (data, split), count in used.items():
-        dataset = TerrainDataset(find_dataset(data))
-        about = described.setdefault(data, {"id": dataset.id, "maps": {}, "about": {}})
-        about["maps"][split] = map_digests(dataset, split, count)
-        about["about"][split] = dataset.about_digest(split)
+    for condition, extent in conditions.values():
+        dataset, split = TerrainDataset(find_dataset(condition.data)), condition.split
+        about = described.setdefault(condition.data, {"id": dataset.id, "maps": {}, "about": {}})
+        if extent.maps > len(about["maps"].get(split, ())):
+            about["maps"][split] = map_digests(dataset, split, range(extent.maps))
+            about["about"][split] = dataset.about_digest(split)
     return described
 
 
-def map_digests(dataset: TerrainDataset, split: str, count: int) -> list[str]:
-    """Digests of the first maps of a split, 16 hexadecimal digits each."""
-    digests = dataset.entry_digests(split, range(count))
-    return [digest_of([entry.tobytes()])[:16] for entry in digests]
+def map_digests(dataset: TerrainDataset, split: str, maps: Sequence[int]) -> list[str]:
+    """Digests of some maps of a split, 16 hexadecimal digits each."""
+    return [digest_of([entry.tobytes()])[:16] for entry in dataset.entry_digests(split, maps)]
 
 
 def code_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -202,7 +196,7 @@ def extend_history(earlier: Iterable[Mapping[str, Any]], suite: Mapping[str, Any
         suite: of this process's command, as it was written.
     """
     asked = {
-        "command": describe_command(),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "suite": dict(suite),
         **describe_machine(),
         "benchnav": benchnav.__version__,
@@ -218,14 +212,9 @@ def join(*lists: Iterable[Any]) -> list[Any]:
     return list({json.dumps(item, sort_keys=True): item for entries in lists for item in entries}.values())
 
 
-def describe_command() -> str:
-    """The command of this process."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-
-
-def command_lines(earlier: Iterable[str]) -> list[str]:
-    """The commands that made a run, this process's last."""
-    return [*(line for line in earlier if line != describe_command()), describe_command()]
+def command_lines(about: Mapping[str, Any]) -> list[str]:
+    """The commands that made a run, of its `run.json`, each once."""
+    return list(dict.fromkeys(entry["command"] for entry in about["history"]))
 
 
 @cache

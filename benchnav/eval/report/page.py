@@ -10,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 import benchnav
 from benchnav.core.tables import Table
+from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.report.findings import Finding
 
 # Of a figure's own pixels; fine enough for screens of twice the density.
@@ -51,7 +52,7 @@ def write_page(
         table=table,
         figures=[(path.stem, caption, _inline(path), _width(path)) for path, caption in figures.items()],
         provenance=provenance_lines(about),
-        commands=about["commands"],
+        commands=command_lines(about),
         version=benchnav.__version__,
     )
 

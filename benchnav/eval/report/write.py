@@ -14,6 +14,7 @@ from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
 from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
+from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.recording import MAP, read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
@@ -312,7 +313,7 @@ def _as_markdown(report: Report, figures: Mapping[Path, str]) -> str:
     for path, caption in figures.items():
         lines += [f"![{path.stem}](figures/{path.name})", "", markdown(caption), ""]
     return "\n".join(
-        [*lines, "Commands:", "", *(f"    {command}" for command in report.about["commands"]), ""]
+        [*lines, "Commands:", "", *(f"    {command}" for command in command_lines(report.about)), ""]
     )
 
 

@@ -45,7 +45,9 @@ def find_recording(folder: Path, unit: Unit, member: int, out: Path | None = Non
         settings = Settings(device=device_of_run(open_run(folder).about).type)
         recorder = _recorder(unit, settings, [member])
         problem, simulation = recorder.problem, recorder.simulation
-        episodes, _ = simulate(unit, problem, simulation, settings, recorder.watch, recorder.every)
+        episodes, _ = simulate(
+            unit, problem, simulation, settings, watch=recorder.watch, watch_every=recorder.every
+        )
     recording = recorder.recording(episodes, member)
     if not _repeats(row, recording):
         raise BenchnavError(

@@ -137,7 +137,6 @@ def _about(earlier: Mapping[str, Any], work: Work, conditions: Conditions) -> di
         "gpu": gpu_name(work.settings.device),
         "datasets": provenance.describe_datasets(conditions),
         "machine": provenance.describe_machine(),
-        "commands": provenance.command_lines(earlier.get("commands", ())),
         "history": provenance.extend_history(earlier.get("history", ()), work.suite),
         **{name: earlier[name] for name in ("codes", "reused", "tables") if name in earlier},
     }

@@ -61,104 +61,93 @@ def check_suite(suite: Suite, elsewhere: bool) -> Checked:
         ConfigError: a part, scenario, map or combination cannot be had, or no planner can steer any robot.
         DatasetError: there is no such dataset.
     """
-    builder = Builder(suite.all_seeds[0], suite.maps)
-    conditions = conditions_of(suite, builder.scenarios)
+    conditions = conditions_of(suite, scenarios_of)
     if not conditions:
         raise ConfigError(
-            f"Expected a suite with at least one condition, got none; data has {builder.scenarios(suite.data)}."
+            f"Expected a suite with at least one condition, got none; data has {scenarios_of(suite.data)}."
         )
     for condition in conditions:
-        builder.check_split(condition, suite.maps)
+        check_split(condition, suite.maps)
     conditions, dropped = _steered(conditions)
     if elsewhere:
         check_everywhere(conditions)
+    warnings, wanted = build_each(conditions, suite.all_seeds[0], suite.maps), {}
     for condition in conditions:
-        builder.build(condition)
-    wanted, doubts = {}, []
-    for condition in conditions:
-        dataset = builder.dataset(condition.data)
-        doubts += _doubts(condition, dataset)
+        dataset = _open(condition)
+        warnings += _doubts(condition, dataset)
         maps = suite.maps or dataset.map_count(condition.split)
         wanted[condition.id] = (condition, Extent.product(suite.all_seeds, suite.realisations, maps))
     return Checked(
         conditions=wanted,
         dropped=tuple(dropped),
-        warnings=tuple(dict.fromkeys([*builder.warnings, *doubts])),
+        warnings=tuple(dict.fromkeys(warnings)),
         hypotheses=fix_hypotheses(suite.hypotheses, wanted),
     )
 
 
-class Builder:
+def _open(condition: Condition) -> TerrainDataset:
+    return TerrainDataset(find_dataset(condition.data))
+
+
+def scenarios_of(data: str) -> list[str]:
+    """The scenarios of a dataset's test splits."""
+    splits = TerrainDataset(find_dataset(data)).splits
+    return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
+
+
+def check_split(condition: Condition, maps: int) -> None:
+    """Refuses a scenario that a dataset lacks, and more maps than it has."""
+    dataset, known = _open(condition), scenarios_of(condition.data)
+    if condition.scenario not in known:
+        raise ConfigError(
+            f"Expected `scenarios` among {known} of {dataset.path}, got {condition.scenario!r}."
+            f"{hint(condition.scenario, known)}{_make_all(dataset, condition.split, 1)}"
+        )
+    count = dataset.map_count(condition.split)
+    if maps > count:
+        raise ConfigError(
+            f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {maps}. "
+            f"0 takes all.{_make_all(dataset, condition.split, maps)}"
+        )
+
+
+def build_each(conditions: Iterable[Condition], seed: int, maps: int) -> list[str]:
     """Builds conditions on the first map of their splits; what is the same in several is built once.
 
     Args:
+        conditions: what is built.
         seed: root seed of the draw of λ.
         maps: of each split; 0 for all.
 
-    Attributes:
-        warnings: what readers of the results should know.
+    Returns:
+        What readers of the results should know.
+
+    Raises:
+        BenchnavError: one cannot be run.
     """
+    warnings: list[str] = []
+    seen: set[str] = set()
 
-    def __init__(self, seed: int, maps: int) -> None:
-        """Has built nothing yet."""
-        self.seed, self.maps = seed, maps
-        self.warnings: list[str] = []
-        self._datasets: dict[str, TerrainDataset] = {}
-        self._seen: set[str] = set()
-
-    def dataset(self, data: str) -> TerrainDataset:
-        """A dataset by path or id, which is opened once."""
-        if data not in self._datasets:
-            self._datasets[data] = TerrainDataset(find_dataset(data))
-        return self._datasets[data]
-
-    def scenarios(self, data: str) -> list[str]:
-        """The scenarios of a dataset's test splits."""
-        splits = self.dataset(data).splits
-        return [name.removeprefix("test/") for name in splits if name.startswith("test/")]
-
-    def check_split(self, condition: Condition, maps: int) -> None:
-        """Refuses a scenario that a dataset lacks, and more maps than it has."""
-        dataset, known = self.dataset(condition.data), self.scenarios(condition.data)
-        if condition.scenario not in known:
-            raise ConfigError(
-                f"Expected `scenarios` among {known} of {dataset.path}, got {condition.scenario!r}."
-                f"{hint(condition.scenario, known)}{_make_all(dataset, condition.split, 1)}"
-            )
-        count = dataset.map_count(condition.split)
-        if maps > count:
-            raise ConfigError(
-                f"Expected `maps` at most {count}, the maps of {condition.split} in {dataset.path}, got {maps}. "
-                f"0 takes all.{_make_all(dataset, condition.split, maps)}"
-            )
-
-    def build(self, condition: Condition) -> None:
-        """Builds a condition.
-
-        Raises:
-            BenchnavError: it cannot be run.
-        """
-        dataset, task = self.dataset(condition.data), condition.make_task()
-        if self._is_new("planner", condition.planner, condition.robot, condition.objective):
-            _check_planner(condition, task)
-        place = condition.data, condition.split
-        if self._is_new("ground", *place, condition.world.noise):
-            _check_known_ground(condition, dataset, self.maps)
-        if self._is_new("world", *place, condition.world, condition.rules, condition.robot):
-            first = read_maps(dataset, condition.split, [0])
-            noise = noise_key(self.seed, condition.split, 0)
-            Simulation(first.terrain, task, condition.world, first.places, noise, [0])
-            self.warnings += _late(condition, task, dataset, self.maps)
-        if not condition.blind and self._is_new(
-            "model", condition.model, condition.data, condition.risk.part
-        ):
-            self.warnings += _check_model(condition, dataset)
-
-    def _is_new(self, *parts: Any) -> bool:
-        key = repr(parts)
-        new = key not in self._seen
-        self._seen.add(key)
+    def is_new(*parts: Any) -> bool:
+        new = repr(parts) not in seen
+        seen.add(repr(parts))
         return new
+
+    for condition in conditions:
+        dataset, task, world = _open(condition), condition.make_task(), condition.world
+        place = condition.data, condition.split
+        if is_new("planner", condition.planner, condition.robot, condition.objective):
+            _check_planner(condition, task)
+        if is_new("ground", *place, world.noise):
+            _check_known_ground(condition, dataset, maps)
+        if is_new("world", *place, world, condition.rules, condition.robot):
+            first = read_maps(dataset, condition.split, [0])
+            noise = noise_key(seed, condition.split, 0)
+            Simulation(first.terrain, task, world, first.places, noise, [0])
+            warnings += _late(condition, task, dataset, maps)
+        if not condition.blind and is_new("model", condition.model, condition.data, condition.risk.part):
+            warnings += _check_model(condition, dataset)
+    return warnings
 
 
 def _make_all(dataset: TerrainDataset, split: str, maps: int) -> str:

@@ -171,9 +171,8 @@ def _about(runs: Sequence[Run]) -> Mapping[str, Any]:
     entries = {i: [run.about["conditions"][i] for run in reversed(runs)] for i in runs[0].conditions}
     # They are alike but for latencies, which only those shards have that measured them.
     about["conditions"] = {i: {k: v for entry in own for k, v in entry.items()} for i, own in entries.items()}
-    for name in ("warnings", "dropped", "history", "commands"):
+    for name in ("warnings", "dropped", "history"):
         about[name] = provenance.join(*(run.about[name] for run in runs))
-    about["commands"] = provenance.command_lines(about["commands"])
     about["history"] = provenance.extend_history(about["history"], about["suite"])
     return about
 

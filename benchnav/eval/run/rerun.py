@@ -3,13 +3,11 @@
 What is repeated are the conditions of `run.json`, each as often as it was run, whatever commands they came by.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from benchnav.core.device import device_of_run
@@ -30,7 +28,7 @@ from benchnav.eval.folder.folder import (
     read_table,
 )
 from benchnav.eval.run.begin import Work
-from benchnav.eval.run.check import Builder, Say, check_everywhere
+from benchnav.eval.run.check import Say, build_each, check_everywhere, check_split
 from benchnav.eval.run.runner import run_work
 from benchnav.eval.run.unit import Settings
 
@@ -136,47 +134,39 @@ def _makings(folder: Path, every: Sequence[Unit]) -> set[str]:
 def _check_there(run: Run) -> None:
     """Refuses a run of which something is no longer there, with all that is not."""
     lacking: dict[str, None] = {}
-    builder = Builder(seed=0, maps=1)
     for condition, extent in run.conditions.values():
-        for check in (partial(builder.check_split, maps=extent.maps), provenance.describe_parts):
+        for check in (partial(check_split, maps=extent.maps), provenance.describe_parts):
             try:
                 check(condition)
             except BenchnavError as error:
                 lacking[str(error)] = None
-        if not lacking:
-            builder.build(condition)
     if lacking:
         raise ConfigError(
             f"{run.folder} cannot be repeated here, since something is no longer there. {' '.join(lacking)}"
         )
+    build_each((condition for condition, _ in run.conditions.values()), seed=0, maps=1)
 
 
 def _verdict(
     conditions: Mapping[str, Condition], rows: int, cells: pd.DataFrame, lacking: pd.Index
 ) -> list[str]:
     """Which rows came out differently, the first of them with all that differs, and the greatest differences."""
-    differing: dict[tuple[Any, ...], list[str]] = {}
-    greatest: dict[str, float] = {}
-    for (*episode, name), (a, b) in zip(cells.index, cells.to_numpy(), strict=True):
-        differing.setdefault(tuple(episode), []).append(f"{name} {_text(a)} → {_text(b)}")
-        if isinstance(a, float) and isinstance(b, float) and not np.isnan(a - b):
-            greatest[name] = max(abs(a - b), greatest.get(name, 0.0))
-    differing |= {episode: ["in one of the tables alone"] for episode in lacking}
-    counts = Counter(condition_id for condition_id, *_ in differing)
+    changes = [f"{name} {_text(a)} → {_text(b)}" for (*_, name), a, b in cells.itertuples()]
+    told = pd.Series(changes, index=cells.index, dtype=str).groupby(level=KEYS, sort=False).agg(", ".join)
+    differing = pd.concat([told, pd.Series("in one of the tables alone", index=lacking)])
+    counts = differing.groupby(level="condition", sort=False).size()
     lines = [
-        f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:",
-        *(
-            f"  {conditions[condition_id].description}: {count} rows"
-            for condition_id, count in counts.items()
-        ),
-        "first of them:",
+        f"{len(differing)} of {rows} rows came out differently, in {len(counts)} of {len(conditions)} conditions:"
     ]
-    for (condition_id, *place), values in list(differing.items())[:_SHOWN]:
+    lines += [f"  {conditions[condition].description}: {count} rows" for condition, count in counts.items()]
+    lines.append("first of them:")
+    for (condition, *place), line in differing.head(_SHOWN).items():
         where = ", ".join(f"{name} {value}" for name, value in zip(KEYS[1:], place, strict=True))
-        lines.append(f"  {conditions[condition_id].description}, {where}: {', '.join(values)}")
-    if greatest:
-        gaps = ", ".join(f"{name} {value:.3g}" for name, value in greatest.items())
-        lines.append(f"greatest differences: {gaps}")
+        lines.append(f"  {conditions[condition].description}, {where}: {line}")
+    numbers = cells[cells.map(lambda value: isinstance(value, float)).all(axis=1)]
+    gaps = (numbers["first"] - numbers["second"]).abs().groupby(level=-1, sort=False).max().dropna()
+    if len(gaps):
+        lines.append(f"greatest differences: {', '.join(f'{name} {gap:.3g}' for name, gap in gaps.items())}")
     return lines
 
 

@@ -74,29 +74,28 @@ class Clock:
     def __init__(self, device: torch.device) -> None:
         """Begins with nothing."""
         self._on_gpu = device.type == "cuda"
-        self._seconds: list[float] = []
-        self._events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
+        self._marks: list[tuple[Any, Any]] = []
 
     @contextmanager
     def timed(self) -> Iterator[None]:
         """Times what is done within; what raises is not counted."""
-        if self._on_gpu:
-            begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-            begin.record()
-            yield
-            end.record()
-            self._events.append((begin, end))
-        else:
-            began = time.perf_counter()
-            yield
-            self._seconds.append(time.perf_counter() - began)
+        began = self._mark()
+        yield
+        self._marks.append((began, self._mark()))
+
+    def _mark(self) -> Any:
+        if not self._on_gpu:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
 
     def seconds(self) -> list[float]:
         """The time of each call so far."""
-        if self._on_gpu:
-            torch.cuda.synchronize()
-            return [begin.elapsed_time(end) / 1e3 for begin, end in self._events]
-        return self._seconds
+        if not self._on_gpu:
+            return [end - begin for begin, end in self._marks]
+        torch.cuda.synchronize()
+        return [begin.elapsed_time(end) / 1e3 for begin, end in self._marks]
 
 
 class _Log:

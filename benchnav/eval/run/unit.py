@@ -30,7 +30,7 @@ from benchnav.eval.folder.provenance import Origin, Origins, code_differences
 from benchnav.eval.folder.steps import write_steps
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.recorder import Recorder
-from benchnav.eval.run.rollout import Episodes, Watcher, fault, run_episodes
+from benchnav.eval.run.rollout import Episodes, fault, run_episodes
 from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, load_model
@@ -87,8 +87,8 @@ def run_unit(unit: Unit, folder: Path, origin: Origin, settings: Settings) -> No
             return
         watched = unit.watched()
         recorder = Recorder(unit, problem, simulation, block.terrain, watched)
-        watch = recorder.watch if watched else None
-        episodes, compiled = simulate(unit, problem, simulation, settings, watch, recorder.every)
+        watching = {"watch": recorder.watch, "watch_every": recorder.every} if watched else {}
+        episodes, compiled = simulate(unit, problem, simulation, settings, **watching)
     succeeded = (episodes.outcome == Outcome.SUCCESS).tolist()
     for member in unit.recorded(succeeded):
         recorder.recording(episodes, member).save(folder / unit.recording_path(member))
@@ -114,9 +114,9 @@ def _check_origin(unit: Unit, origin: Origin, settings: Settings) -> None:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
-    """What is stored of a block of maps.
+    """What is stored of a block of maps; what is kept for it is kept for this very one.
 
     Args:
         terrain: the true maps.
@@ -193,15 +193,13 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
 
 def _predict(unit: Unit, origin: Origin, device: torch.device, field: Tensor | None) -> TraversabilityMixture:
     """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
-    part = unit.condition.model
-    options = json.dumps(dict(part.options), sort_keys=True)
-    model = (part.part, options, origin.code["parts"].get(f"model {part.part}", ""))
-    block = (unit.condition.data, unit.condition.split, unit.maps, origin.maps, device)
-    if not isinstance(_model(*model), Clairvoyant):
+    part, block = unit.condition.model, read_block(unit, origin, device)
+    digest = origin.code["parts"].get(f"model {part.part}", "")
+    model = json.dumps([part.part, dict(part.options), digest], sort_keys=True)
+    if not isinstance(_model(model), Clairvoyant):
         return _prediction(model, block)
-    if field is None:
-        raise ConfigError("Expected λ that stays what it is for the clairvoyant, got resampled λ.")
-    return predict(_model(*model), replace(_block(*block).terrain, traversability=field))
+    assert field is not None  # suites are refused in which λ cannot be known
+    return predict(_model(model), replace(block.terrain, traversability=field))
 
 
 def noise_key(seed: int, split: str, realisation: int) -> int:
@@ -214,13 +212,7 @@ def _draw(split: str, realisation: int) -> tuple[str | int, ...]:
 
 
 def simulate(
-    unit: Unit,
-    problem: Problem,
-    simulation: Simulation,
-    settings: Settings,
-    watch: Watcher | None = None,
-    watch_every: int = 1,
-    **options: Any,
+    unit: Unit, problem: Problem, simulation: Simulation, settings: Settings, **options: Any
 ) -> tuple[Episodes, bool]:
     """Runs a unit's episodes; gives what happened, and whether the planner ran compiled.
 
@@ -229,8 +221,6 @@ def simulate(
         problem: the unit's.
         simulation: the unit's.
         settings: of them the time limit of planners.
-        watch: see `run_episodes`, as of `watch_every` and `options`.
-        watch_every: as there.
         **options: further arguments of `run_episodes`.
     """
     condition = unit.condition
@@ -246,7 +236,7 @@ def simulate(
         # Keyed by seed and split, never by the batch.
         key = rng.stream_key(unit.seed, "planner", *_draw(condition.split, unit.realisation))
         generator = rng.generator(key)
-        episodes = run_episodes(planner, problem, simulation, generator, watch, watch_every, **options)
+        episodes = run_episodes(planner, problem, simulation, generator, **options)
     return episodes, bool(planner.compiled)
 
 
@@ -285,10 +275,11 @@ def _block(
 
 
 @lru_cache(maxsize=2)
-def _prediction(model: tuple[str, str, str], block: tuple[Any, ...]) -> TraversabilityMixture:
-    return predict(_model(*model), _block(*block).terrain)
+def _prediction(model: str, block: Block) -> TraversabilityMixture:
+    return predict(_model(model), block.terrain)
 
 
 @lru_cache(maxsize=2)
-def _model(part: str, options: str, digest: str) -> Any:
-    return load_model(Part(part=part, label="", options=json.loads(options)))
+def _model(model: str) -> Any:
+    part, options, _ = json.loads(model)
+    return load_model(Part(part=part, label="", options=options))

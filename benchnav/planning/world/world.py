@@ -147,16 +147,13 @@ PRESETS: Mapping[str, Preset] = {
 }
 
 
-def read_world(
-    world: Any, task: Any = None, short: Mapping[str, Any] | None = None
-) -> tuple[World, Rules, str]:
+def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     """Reads a world and the rules that go with it.
 
     Args:
         world: name of a preset, or a mapping of changes with the preset's name under `preset`; without it
             they change the paper's.
         task: a mapping of changes to the preset's rules, if there are any.
-        short: further changes to the world, for what `world` itself does not name.
 
     Returns:
         World, rules, and what tables call them: the preset's name and all that is changed.
@@ -173,8 +170,6 @@ def read_world(
             f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{hint(str(name), PRESETS)}"
         )
     preset = PRESETS[name]
-    has_budget = bool(set(_BUDGETS) & set(given))
-    given = {key: v for key, v in (short or {}).items() if not (has_budget and key in _BUDGETS)} | given
     budgets = [key for key in _BUDGETS if given.get(key) is not None]
     if len(budgets) == 1:  # of the two ways to give a time budget one takes the other's place
         given |= dict.fromkeys(set(_BUDGETS) - set(budgets))

@@ -45,8 +45,8 @@ def test_the_id_is_that_of_the_value_and_not_of_the_label() -> None:
         {"robots": ("differential_drive",)},
         {"robots": ({"part": "unicycle", "options": {"dt_s": 0.2}},)},
         {"objectives": ("travel_time",)},
-        {"noise": "stored"},
-        {"time_budget_s": 50.0},
+        {"world": {"noise": "stored"}},
+        {"world": {"time_budget_s": 50.0}},
         {"world": {"noise": "stored", "time_budget_s": 50.0}},
         {"world": "stakes"},
         {"world": {"preset": "stakes", "correlation_m": 2.0}},
@@ -79,10 +79,9 @@ def test_a_condition_is_read_back_from_what_a_run_holds() -> None:
 def test_every_setting_reaches_its_place() -> None:
     condition = one(
         task={"free_space": {"by": "mean", "above": 0.1}, "min_traversability": 0.05, "goal_radius_m": 2},
-        world={"preset": "paper", "noise": "stored"},
-        time_budget_s=30.0,
+        world={"preset": "paper", "noise": "stored", "time_budget_s": 30.0},
         robots=({"part": "unicycle", "options": {"dt_s": 0.2}},),
-        planner_options={FAN: {"after_s": 3.0}},
+        planners=({"part": FAN, "options": {"after_s": 3.0}},),
     )
     assert (condition.rules.free_space.by, condition.rules.free_space.above) == ("mean", 0.1)
     assert (condition.rules.min_traversability, condition.rules.goal_radius_m) == (0.05, 2.0)
@@ -108,10 +107,6 @@ def test_several_worlds_stand_at_the_top_of_a_suite() -> None:
     assert [(world.noise, world.correlation_m) for world in worlds] == [
         ("resampled", 1.5), ("frozen", 1.0), ("frozen", 2.0),
     ]  # fmt: skip
-
-
-def test_what_a_world_says_itself_goes_before_the_short_forms() -> None:
-    assert one(world={"noise": "resampled"}, noise="stored").world.noise == "resampled"
 
 
 def test_a_product_has_every_combination_once_in_the_order_of_tables() -> None:
@@ -174,12 +169,12 @@ def test_two_settings_of_one_part_stand_side_by_side_with_labels() -> None:
         ({"planners": ("mppi", {"part": "mppi", "options": {"samples": 8}})}, "label"),
         ({"planners": ({"part": "mppi", "options": {"sample": 8}},)}, "Did you mean 'samples'"),
         ({"planners": ({"part": "mppi", "option": {}},)}, "options"),
-        ({"planner_options": {"mppi": {"samples": 8}}}, "planner_options"),
         ({"model": "no-such-model"}, "no-such-model"),
         ({"model": "fused"}, "family"),
         ({"model": {"part": "paper-v1", "options": {"a": 1}}}, "no options"),
-        ({"noise": "frozen"}, "stored"),
-        ({"noise": "loud"}, "loud"),
+        ({"world": {"noise": "loud"}}, "loud"),
+        ({"conditions": ({"noise": "stored"},)}, "It is now 'world.noise'"),
+        ({"conditions": ({"planner_options": {}},)}, "It is now 'planners'"),
         ({"world": "papr"}, "Did you mean 'paper'"),
         ({"world": {"nois": "stored"}}, "Did you mean 'noise'"),
         ({"task": {"min_traversabilty": 0.1}}, "Did you mean 'min_traversability'"),
@@ -224,15 +219,14 @@ def test_a_world_with_stakes_is_distinguished_by_what_is_changed() -> None:
     assert one(world={"preset": "stakes", "immobile": None}).world_label == "stakes immobile=none"
     held = one(world={"immobile": {"for_s": 4}})
     assert held.world.immobile == Immobile(below=0.1, for_s=4.0)
-    assert one(world="stakes", time_budget_s=50.0).world.time_budget_s == 50.0
-    own = one(world={"preset": "stakes", "time_budget_ratio": 2}, time_budget_s=50.0).world
+    assert one(world={"preset": "stakes", "time_budget_s": 50.0}).world.time_budget_s == 50.0
+    own = one(world={"time_budget_ratio": 2}).world
     assert (own.time_budget_s, own.time_budget_ratio) == (None, 2.0)
 
 
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"noise": "frozen"}, "is now 'stored'.*world stakes"),
         ({"world": {"correlation_m": 2.0}}, "with `world.noise` frozen, got it with 'resampled'"),
         ({"world": {"time_budget_s": 5.0, "time_budget_ratio": 2.0}}, "either"),
         ({"world": {"time_budget_s": None}}, "either"),

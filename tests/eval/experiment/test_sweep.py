@@ -87,11 +87,6 @@ def test_a_sweep_in_one_of_several_products_is_its_own() -> None:
     assert [t.world.time_budget_ratio for t in found[1:]] == [2, 2, 3, 3]
 
 
-def test_options_of_a_planner_given_apart_are_swept_too() -> None:
-    found = conditions(planners=["mppi"], risks=["mean"], planner_options={"mppi": {"samples": [8, 16]}})
-    assert [t.planner.options["samples"] for t in found] == [8, 16]
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -18,7 +18,7 @@ def made(dataset_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("schema") / "run"
     suite = Suite(
         data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty",), risks=("mean", "cvar:0.5"),
-        scenarios=("std",), maps=2, seeds=(0, 3), time_budget_s=2.0, record="none",
+        scenarios=("std",), maps=2, seeds=(0, 3), world={"time_budget_s": 2.0}, record="none",
     )  # fmt: skip
     list(run_suite(suite, folder))
     return folder

@@ -30,7 +30,8 @@ def run(dataset: Path, folder: Path, **changes: Any) -> Path:
     given = {"planners": PLANNERS, "risks": ("mean", "cvar"), "maps": 2, "seeds": (0, 5)}
     given |= {"record": "steps"} | changes
     suite = Suite(
-        data=str(dataset), scenarios=("std",), model="oracle", noise="stored", time_budget_s=4.0, **given,
+        data=str(dataset), scenarios=("std",), model="oracle", world={"noise": "stored", "time_budget_s": 4.0},
+        **given,
     )  # fmt: skip
     for _ in run_suite(suite, folder):
         pass
@@ -122,8 +123,8 @@ def test_a_run_that_keeps_rows_alone_has_no_steps(dataset_path: Path, tmp_path: 
 def test_files_that_agree_are_left_alone(folder: Path, dataset_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in folder.glob("steps/*/*")}
     assert len(before) == 6
-    suite = Suite(data=str(dataset_path), model="oracle", planners=PLANNERS, risks=("mean", "cvar"), noise="stored",
-                  time_budget_s=4.0)  # fmt: skip
+    suite = Suite(data=str(dataset_path), model="oracle", planners=PLANNERS, risks=("mean", "cvar"),
+                  world={"noise": "stored", "time_budget_s": 4.0})  # fmt: skip
     conditions = {
         t.id: (t, Extent.product((0, 5), 1, 2)) for t in conditions_of(suite, lambda data: ("std",))
     }

@@ -45,8 +45,8 @@ def page(tmp_path: Path) -> Page:
         bold_note="the best", explained=(("planner", EVIL),),
     )  # fmt: skip
     about = {
-        "commands": [EVIL], "datasets": {}, "conditions": {}, "codes": {"a": code_with(parts={EVIL: EVIL})},
-        "machine": {"processor": "", "cores": 2}, "history": [{"commit": "", "benchnav": "1"}],
+        "datasets": {}, "conditions": {}, "codes": {"a": code_with(parts={EVIL: EVIL})},
+        "machine": {"processor": "", "cores": 2}, "history": [{"command": EVIL, "commit": "", "benchnav": "1"}],
     }  # fmt: skip
     text = write_page(
         EVIL, [EVIL], [EVIL], [Finding(title=EVIL, sentences=(EVIL,))], table, {picture: EVIL},

@@ -46,9 +46,9 @@ def run_folder(folder: Path, rows: pd.DataFrame, **changes: object) -> Path:
         }
         for name, about in known.items()
     }
-    commands = ["benchnav-eval run --seeds '[0,7]'"]
-    history = [{"commit": "abc", "benchnav": "0.8"}]
-    return forge_run(folder, rows, known, **({"commands": commands, "history": history} | changes))
+    command = "benchnav-eval run --seeds '[0,7]'"
+    history = [{"command": command, "commit": "abc", "benchnav": "0.8"}]
+    return forge_run(folder, rows, known, **({"history": history} | changes))
 
 
 @pytest.mark.usefixtures("whole_fonts")

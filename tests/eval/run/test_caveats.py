@@ -26,7 +26,7 @@ def suite_on(dataset: Path, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": (FREE, STEERING), "risks": ("mean", "cvar:0.5"),
         "robots": ("unicycle", "bicycle"), "scenarios": ("std",), "maps": 2, "record": "none",
-        "time_budget_s": 3.0,
+        "world": {"time_budget_s": 3.0},
     }  # fmt: skip
     return Suite(**(given | changes))
 

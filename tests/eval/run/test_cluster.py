@@ -84,7 +84,7 @@ def suite_on(dataset: Path, log: Path, **changes: object) -> Suite:
     held = {"part": "tests.eval.parts:Held", "label": "held", "options": {"log": str(log)}}
     given = {
         "data": str(dataset), "model": "oracle", "planners": (held,), "risks": ("mean", "cvar"),
-        "scenarios": ("std", "hs"), "maps": 2, "seeds": (0, 1), "noise": "stored", "time_budget_s": 30.0,
+        "scenarios": ("std", "hs"), "maps": 2, "seeds": (0, 1), "world": {"noise": "stored", "time_budget_s": 30.0},
     } | changes  # fmt: skip
     return Suite(**given)  # type: ignore[arg-type]
 

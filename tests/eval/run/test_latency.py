@@ -28,7 +28,7 @@ def whole(monkeypatch: pytest.MonkeyPatch) -> None:
 def suite_on(dataset: Path, *planners: Any, **changes: Any) -> Suite:
     given: dict[str, Any] = {
         "data": str(dataset), "model": "oracle", "planners": planners, "risks": ("mean",),
-        "scenarios": ("std",), "maps": MAPS - 1, "record": "none", "time_budget_s": 4.0,
+        "scenarios": ("std",), "maps": MAPS - 1, "record": "none", "world": {"time_budget_s": 4.0},
     }  # fmt: skip
     return Suite(**(given | changes))
 
@@ -70,11 +70,13 @@ def test_long_episodes_are_left_and_what_was_measured_stays(dataset_path: Path, 
     plain = {"part": "tests.eval.parts:Faulty", "label": "plain", "options": {"fault": "none"}}
     slow = {"part": "unicycle", "label": "slow", "options": {"speed_mps": [0.0, 0.1]}}
     still = {"part": "tests.eval.parts:Still", "label": "still"}
-    suite = suite_on(dataset_path, still, time_budget_s=30.0, maps=1)
+    suite = suite_on(dataset_path, still, world={"time_budget_s": 30.0}, maps=1)
     list(run_suite(suite, tmp_path / "run"))
     (first,) = latencies(tmp_path / "run")
     assert first["steps"] == 100
-    more = suite_on(dataset_path, still, plain, time_budget_s=30.0, maps=1, robots=("unicycle", slow))
+    more = suite_on(
+        dataset_path, still, plain, world={"time_budget_s": 30.0}, maps=1, robots=("unicycle", slow)
+    )
     list(run_suite(more, tmp_path / "run"))
     found = latencies(tmp_path / "run")
     assert found[0] == first

@@ -51,9 +51,9 @@ def ran(dataset: TerrainDataset, tmp_path_factory: pytest.TempPathFactory) -> tu
     )
     suite = Suite(
         data=str(dataset.path), scenarios=SCENARIOS, planners=spies, risks=tuple(RISKS), maps=0,
-        seeds=SEEDS, realisations=REALISATIONS, time_budget_s=0.6,
+        seeds=SEEDS, realisations=REALISATIONS,
         model={"part": "oracle", "label": "truth"}, record="steps",
-        conditions=({"world": [{"noise": "resampled"}, {"noise": "stored"}]},),
+        conditions=({"world": {"noise": ["resampled", "stored"], "time_budget_s": 0.6}},),
     )  # fmt: skip
     for _ in run_suite(suite, folder / "run", jobs=2):
         pass

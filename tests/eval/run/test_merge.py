@@ -35,7 +35,7 @@ def suite(dataset_path: Path) -> Suite:
     """12 units of planners that need no time, of which one fails."""
     return Suite(
         data=str(dataset_path), model="oracle", planners=("tests.eval.parts:Faulty", BAD), risks=("mean",),
-        scenarios=("std", "hs"), maps=2, seeds=(0, 1, 2), noise="stored", time_budget_s=30.0,
+        scenarios=("std", "hs"), maps=2, seeds=(0, 1, 2), world={"noise": "stored", "time_budget_s": 30.0},
     )  # fmt: skip
 
 
@@ -282,7 +282,7 @@ def test_the_commands(  # type: ignore[no-untyped-def]
 
     run = (
         "run", "--data", str(dataset_path), "--model", "oracle", "--planners", "[tests.eval.parts:Faulty]",
-        "--risks", "[mean]", "--scenarios", "[std,hs]", "--maps", "2", "--time_budget_s", "30",
+        "--risks", "[mean]", "--scenarios", "[std,hs]", "--maps", "2", "--world.time_budget_s", "30",
         "--realisations", "2",
     )  # fmt: skip
     out = [str(tmp_path / name) for name in ("one", "two", "all")]
@@ -297,8 +297,8 @@ def test_the_commands(  # type: ignore[no-untyped-def]
     assert status == 0
     assert "Faulty" in printed
     assert (Path(out[2]) / "summary.md").exists()
-    commands = open_run(Path(out[2])).about["commands"]
-    assert [line.split()[1] for line in commands] == ["run", "run", "merge"]
+    commands = open_run(Path(out[2])).about["history"]
+    assert [entry["command"].split()[1] for entry in commands] == ["run", "run", "merge"]
     assert call("report", out[2])[0] == 0
     assert call(*run, "--shard", "3/2", "--out", out[0])[0] == 2
     assert call("merge", out[2])[0] == 2

@@ -34,7 +34,8 @@ def suite(dataset_path: Path, tmp_path: Path) -> Suite:
     shutil.copy(dataset_path, tmp_path / "tiny.h5")
     return Suite(
         data=str(tmp_path / "tiny.h5"), model="oracle", risks=("mean",), scenarios=("std",), maps=2,
-        planners=("tests.eval.parts:Faulty", f"{tmp_path / 'mine.py'}:Mine"), time_budget_s=30.0, noise="stored",
+        planners=("tests.eval.parts:Faulty", f"{tmp_path / 'mine.py'}:Mine"),
+        world={"noise": "stored", "time_budget_s": 30.0},
         record="steps",
     )  # fmt: skip
 

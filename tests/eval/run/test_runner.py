@@ -42,7 +42,8 @@ BUDGETS = {
     "cl_rrt": {"expansions": 50},
     "mppi": {"samples": 64, "horizon_s": 1.5},
 }
-PLANNERS = ("straight", "astar_dwa", "cl_rrt", "mppi")
+PLANNERS = ("straight", *BUDGETS)
+WORLD = {"time_budget_s": 12.0}
 KEYS = ["scenario", "planner", "risk", "seed", "realisation", "map"]
 # What a wall clock says is no result.
 TIMING = ["planning_ms", "planning_ms_p95", "planning_start_ms"]
@@ -60,7 +61,8 @@ MINE = "from tests.eval.parts import Faulty\n\nclass Mine(Faulty):\n    pass\n"
 
 def suite_on(dataset: Path, **changes: object) -> Suite:
     made = Suite(
-        data=str(dataset), model="oracle", maps=2, time_budget_s=12.0, planner_options=BUDGETS,
+        data=str(dataset), model="oracle", maps=2, world=WORLD,
+        planners=("straight", *({"part": n, "options": o} for n, o in BUDGETS.items())),
         risks=("cvar", "mean"), scenarios=("std", "hs"),
     )  # fmt: skip
     return replace(made, **changes)  # type: ignore[arg-type]
@@ -68,7 +70,7 @@ def suite_on(dataset: Path, **changes: object) -> Suite:
 
 def quick(dataset: Path, **changes: object) -> Suite:
     """A suite of a planner that needs no time."""
-    given = {"planners": ("tests.eval.parts:Faulty",), "planner_options": {}, "record": "none"} | changes
+    given = {"planners": ("tests.eval.parts:Faulty",), "record": "none"} | changes
     return suite_on(dataset, **given)
 
 
@@ -231,7 +233,7 @@ def test_the_same_suite_again_runs_nothing_and_says_so(dataset_path: Path, tmp_p
         ({"seed": 5, "maps": 1}, 4, 12, 4),
         ({"realisations": 3}, 4, 24, 4),
         ({"scenarios": ("hg",)}, 6, 12, 4),
-        ({"noise": "stored"}, 8, 16, 4),
+        ({"world": WORLD | {"noise": "stored"}}, 8, 16, 4),
     ],
 )
 def test_a_run_is_extended_by_what_is_missing(
@@ -246,7 +248,7 @@ def test_a_run_is_extended_by_what_is_missing(
     # What was there and what came make the rows of a run that had all at once.
     fresh = {"risks": ("cvar", "mean", "var")} if change == {"risks": ("var",)} else change
     fresh = {"seeds": (0, 5)} if change == {"seed": 5} else fresh
-    if not {"scenarios", "noise", "maps"} & set(change):
+    if not {"scenarios", "world", "maps"} & set(change):
         same(extended, finish(quick(dataset_path, **fresh), tmp_path / "fresh"))
 
 
@@ -518,14 +520,13 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
     for change, expected in (
         ({"scenarios": ("fog",)}, "fog"),
         ({"risks": ("cvr",)}, "cvr"),
-        ({"planners": ("mpi",), "planner_options": {}}, "mpi"),
-        ({"planner_options": {"mppi": {"sample": 1}}, "planners": ("mppi",)}, "samples"),
+        ({"planners": ("mpi",)}, "mpi"),
+        ({"planners": ({"part": "mppi", "options": {"sample": 1}},)}, "samples"),
         ({"model": "no-such-model"}, "no-such-model"),
         ({"data": "no-such-data"}, "no-such-data"),
-        ({"noise": "loud"}, "loud"),
-        ({"noise": "frozen"}, "stored"),
+        ({"world": {"noise": "loud"}}, "loud"),
         ({"maps": 9}, "0 takes all"),
-        ({"time_budget_s": 0.01}, "time budget of at least one time step"),
+        ({"world": {"time_budget_s": 0.01}}, "time budget of at least one time step"),
         ({"planners": ("astar_dwa",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ("cl_rrt",), "robots": ("bicycle",)}, "steering_rad"),
         ({"planners": ({"part": "mppi", "options": {"noise": [0.5]}},)}, "noise"),
@@ -540,10 +541,7 @@ def test_suites_are_checked_before_anything_is_run_or_dropped(dataset_path: Path
         ),
         ({"conditions": ({"task": 3},)}, "mapping"),
         ({"conditions": ({"planners": []},)}, "at least one condition"),
-        (
-            {"conditions": ({"planners": "mppi"},), "planner_options": {"mpi": {"samples": 8}}},
-            "planner_options",
-        ),
+        ({"conditions": ({"noise": "stored"},)}, "It is now 'world.noise'"),
         ({"model": {"part": "paper-v1", "lable": "mine"}}, "lable"),
     ):
         for place in (tmp_path / "run", tmp_path / "new"):
@@ -615,7 +613,7 @@ def test_goals_out_of_reach_are_told_before_the_run(dataset_path: Path, tmp_path
         lines: list[str] = []
         suite = Suite(
             data=str(dataset_path), model="oracle", planners=("straight",), scenarios=("std",), maps=2,
-            time_budget_s=budget, robots=(robot,), record="steps",
+            world={"time_budget_s": budget}, robots=(robot,), record="steps",
         )  # fmt: skip
         for _ in run_suite(suite, tmp_path / f"{budget}-{len(str(robot))}", say=lines.append):
             pass
@@ -656,7 +654,7 @@ def test_single_class_of_a_model_without_classes_is_refused_before_the_run(
 ) -> None:
     suite = Suite(
         data=str(dataset_path), model="tests.eval.parts:TwoModes", planners=("straight", "astar_dwa"),
-        scenarios=("std",), maps=1, record="steps", time_budget_s=1.0,
+        scenarios=("std",), maps=1, record="steps", world={"time_budget_s": 1.0},
     )  # fmt: skip
     with pytest.raises(ConfigError, match="which has no `class_names`"):
         finish(replace(suite, risks=("mean", "single-class")), tmp_path / "run")
