@@ -65,8 +65,9 @@ def on_maps(options: dict[str, object], objective: str, scenario: str, seed: int
     times = []
     for condition in conditions_of(suite, lambda data: [scenario]):
         unit = Unit(condition=condition, seed=seed, realisation=0, maps=tuple(range(maps)))
-        problem, simulation = build(unit, Settings().origins().of(unit))
-        episodes, _ = simulate(unit, problem, simulation)
+        settings = Settings()
+        problem, simulation = build(unit, settings.origins().of(unit))
+        episodes, _ = simulate(unit, problem, simulation, settings)
         arrived = episodes.outcome == int(Outcome.SUCCESS)
         times.append(torch.where(arrived, episodes.steps * problem.dt_s, BUDGET_S).mean())
     return float(torch.stack(times).mean())
