@@ -18,7 +18,7 @@ import numpy as np
 from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
-from benchnav.datagen.dem.raster import Lattice, Layer, opened
+from benchnav.datagen.dem.raster import Layer, load_rasterio, opened
 from benchnav.datagen.dem.tiling import Run, Tiling, cut
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
@@ -74,7 +74,7 @@ class Survey:
     Args:
         tiling: how the ground is cut into maps.
         layers: by field; under `FIELD min` and `FIELD max` what is averaged there.
-        known: which rows and columns of the lattice, framed by a cell, lie wholly on the elevation model.
+        known: which rows and columns of all cells, framed by one, lie wholly on the elevation model.
         indices: of classes, by value of their raster; NaN for no label.
         cliff_m: height over 0 that only cells without a value leave bare; infinite where these are declared.
         source: what the manifest says of the rasters.
@@ -215,7 +215,10 @@ def survey(
     # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
     offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
     south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
-    lattice = Lattice(crs=crs, west_m=west_m, south_m=south_m, cells=tiling.cells, resolution_m=step)
+    height, width = tiling.cells
+    corner = west_m - step, south_m + (height + 1) * step
+    transform = load_rasterio().transform.from_origin(*corner, step, step)
+    frame = {"crs": crs, "transform": transform, "height": height + 2, "width": width + 2}
     sources = [("elevation_m", dem, how)]
     for field, argument, kinds, how in (
         ("class_id", "classes", (), "mode"),
@@ -229,7 +232,8 @@ def survey(
         bands = [1, 2, 3] if field == "rgb" else [1]
         ends = ("min", "max") if how in ("average", "cubic") and field != "rgb" else ()
         for layer, way in ((field, how), *((f"{field} {end}", end) for end in ends)):
-            layers[layer] = stack.enter_context(raster.laid(lattice, bands, way))
+            layers[layer] = raster.laid(frame, bands, way)
+            stack.enter_context(layers[layer].warped)
     origins = {field: provenance(raster.name) for field, raster, _ in sources}
     ids = {str(value): name for value, name in sorted(named.items())}
     source = {

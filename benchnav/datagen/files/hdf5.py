@@ -238,7 +238,9 @@ def named_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def held(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> Iterator[None]:
+def held(
+    out: Path, overwrite: bool, foreign: Callable[[Path], str] = foreign_in
+) -> Iterator[None]:
     """Holds the place of what is made whole, for one process; see `refuse_taken` and `named_errors`."""
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)

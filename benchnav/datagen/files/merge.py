@@ -17,7 +17,7 @@ from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.core.settings import plain
 from benchnav.core.store import building, real_place
 from benchnav.datagen import schema
-from benchnav.datagen.files.hdf5 import Contents, assemble, foreign_in, held, is_one_file, whole
+from benchnav.datagen.files.hdf5 import Contents, assemble, held, is_one_file, whole
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 from benchnav.datagen.schema import Maps
@@ -51,7 +51,7 @@ def merge(
     name = dataset_id or (out.stem if is_one_file(out) else out.name)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
-    with held(out, overwrite, foreign_in):
+    with held(out, overwrite):
         for split, files in contents.files.items():
             for dataset in map(TerrainDataset, files):
                 for indices, maps in dataset.chunks(split):

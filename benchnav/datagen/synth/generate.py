@@ -133,12 +133,11 @@ def complete(
     light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
     noise_key, shape = key("traversability"), recipe.grid.shape
     if recipe.synthesis == 1:
-        noise = rng.normal(noise_key, indices, shape) * latent.latent_std(class_id, recipe.classes)
-        realised = np.clip(latent.latent_mean(class_id, slope, recipe.classes) + noise, 0, 1)
+        noise = rng.normal(noise_key, indices, shape)
     else:
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
-        realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
+    realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
     brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     if recipe.places is None:
