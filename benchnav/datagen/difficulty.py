@@ -56,11 +56,10 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
             reference_times_s: grid reference time, not finite where there is none.
     """
     slope = maps["slope_deg"].astype(np.float64)
-    expected = latent.expected_of(latent.truth(maps["class_id"], slope, recipe.classes))
-    stuck = expected <= recipe.stuck_threshold  # not where it is NaN
+    truth = latent.truth(maps["class_id"], slope, recipe.classes)
+    stuck = latent.expected_of(truth) <= recipe.stuck_threshold  # not where it is NaN
+    spots = truth[0][:, 1:].sum(axis=1)  # weight of the soft spots
     labelled = maps["class_id"] != UNLABELLED
-    weight = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])
-    spots = weight[np.where(labelled, maps["class_id"], 0)]
     on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
     counts = np.maximum(1, labelled.sum(axis=(1, 2)))
     shares = {"stuck": stuck, "soft_ground": spots > 0, "soft_spots": spots}

@@ -128,10 +128,14 @@ def test_the_table_fits_a_terminal_and_names_every_split(tmp_path: Path) -> None
     found = difficulty.of_split(dataset, "test/hg")
     times = found["reference_times_s"]
     times = times[np.isfinite(times)]
+    shares = (f"{100 * found[name].mean():.1f}" for name in ("stuck", "soft_ground", "soft_spots"))
     assert hg == [
-        "test/hg", f"{100 * found['stuck'].mean():.1f}", f"{100 * found['soft_ground'].mean():.1f}", f"{100 * found['soft_spots'].mean():.1f}",
-        f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}", f"{found['straight'].sum()}/3",
-    ]  # fmt: skip
+        "test/hg",
+        *shares,
+        f"{np.median(times):.1f}",
+        f"{times.min():.1f}–{times.max():.1f}",
+        f"{found['straight'].sum()}/3",
+    ]
     assert train[4:6] == ["–", "–"]
     assert not any("…" in line for line in lines)
 

@@ -24,7 +24,7 @@ import numpy as np
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.raster import load_rasterio
-from benchnav.datagen.dem.survey import Rasters, Survey, survey
+from benchnav.datagen.dem.survey import Rasters, Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
 from benchnav.datagen.files.hdf5 import Contents, assemble, held, pack
@@ -84,7 +84,7 @@ def import_dem(
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = survey(stack, rasters, recipe, shares, stride_m)
+        ground = Survey(stack, rasters, recipe, shares, stride_m)
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
         done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
@@ -107,13 +107,15 @@ def import_dem(
 
 @dataclass(kw_only=True)
 class _Part:
-    """What has become of the maps of one split: files of those kept, what the manifest says of each, counts of others."""
+    """What has become of the maps of one split: files of those kept, what is said of each, counts of the others."""
 
     name: str
     recipe: Recipe
     folder: Path
     ground: Survey
-    about: dict[str, list[Any]] = field(default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []})
+    about: dict[str, list[Any]] = field(
+        default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []}
+    )
     left_out: Counter[str] = field(default_factory=Counter)
     files: list[Path] = field(default_factory=list)
     pending: list[Maps] = field(default_factory=list)
@@ -208,9 +210,9 @@ class _Part:
         source = self.ground.source
         about = [source[key] for key in ("file", "sha256", "crs", "origin_m", "stride_m")]
         about += self.ground.tiling.shape
-        firsts, group = np.unique(self.ground.tiling.groups(self.about["kept"]), return_inverse=True)
-        texts = [json.dumps([*about, first]).encode() for first in firsts.tolist()]
-        numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])[group]
+        firsts = self.ground.tiling.groups(self.about["kept"]).tolist()
+        texts = (json.dumps([*about, first]).encode() for first in firsts)
+        numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])
         begin = 0
         for file in self.files:
             maps = TerrainDataset(file).read(self.name)

@@ -193,14 +193,16 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
     longitude, latitude = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
-    origin = (
-        ("Latitude of natural origin", latitude, "degree"),
-        ("Longitude of natural origin", longitude, "degree"),
-        ("Scale factor at natural origin", 1, "unity"),
-        ("False easting", 0, "metre"),
-        ("False northing", 0, "metre"),
-    )
-    parameters = [{"name": name, "value": value, "unit": unit} for name, value, unit in origin]
+    parameters = [
+        {"name": name, "value": value, "unit": unit}
+        for name, value, unit in (
+            ("Latitude of natural origin", latitude, "degree"),
+            ("Longitude of natural origin", longitude, "degree"),
+            ("Scale factor at natural origin", 1, "unity"),
+            ("False easting", 0, "metre"),
+            ("False northing", 0, "metre"),
+        )
+    ]
     axes = [
         {"name": name, "abbreviation": name[0], "direction": direction, "unit": "metre"}
         for name, direction in (("Easting", "east"), ("Northing", "north"))
