@@ -75,10 +75,7 @@ MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 def quantise(values: ndarray, bits: int) -> ndarray:
     """Rounds to multiples of 2^−bits, so that the last bits of a machine's arithmetic do not show."""
-    steps = values * 2.0**bits
-    np.rint(steps, out=steps)
-    steps *= 2.0**-bits
-    return steps
+    return np.rint(values * 2.0**bits) * 2.0**-bits
 
 
 def stored_arrays(fields: Fields, height: int, width: int) -> dict[str, tuple[str, tuple[int, ...]]]:
