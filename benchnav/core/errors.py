@@ -4,7 +4,7 @@ A message names the argument, what was expected, what came, and what to do.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -28,6 +28,19 @@ def expect(holds: object, what: str) -> None:
     """
     if not holds:
         raise ConfigError(f"Expected {what}")
+
+
+def choose(what: str, asked: Collection[str] | None, known: Iterable[str]) -> list[str]:
+    """Gives what is asked for of what there is, in the order of that; None asks for all.
+
+    Raises:
+        ConfigError: nothing is asked for, or something that is not there, of the argument `what`.
+    """
+    known = list(known)
+    asked = known if asked is None else asked
+    unknown = [name for name in asked if name not in known]
+    expect(asked and not unknown, f"`{what}` among {known}, got {unknown or 'none'}.")
+    return [name for name in known if name in asked]
 
 
 class DatasetError(BenchnavError):

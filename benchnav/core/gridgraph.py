@@ -37,7 +37,7 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
     Args:
         edge_costs: cost > 0 of each edge of `neighbour_pairs`, infinite where it may not be taken,
             shape [B, E].
-        goals: goal cells, bool, shape [B, H, W].
+        goals: goal cells, bool, at least one in all, shape [B, H, W].
         shape: (H, W).
 
     Returns:
@@ -47,8 +47,6 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
     """
     batch, cells = len(edge_costs), shape[0] * shape[1]
     starts = np.flatnonzero(goals)
-    if starts.size == 0:
-        return np.full((batch, *shape), np.inf), np.full((batch, cells), NO_CELL)
     # Searching backward from the goals, so the edges are turned round: rows are their targets.
     source, target, _ = neighbour_pairs(*shape)
     offset = cells * np.arange(batch)[:, None]

@@ -58,20 +58,16 @@ def random_bits(key: int, indices: ndarray, count: int) -> ndarray:
 def uniform(key: int, indices: ndarray, shape: tuple[int, ...] = ()) -> ndarray:
     """Draws uniforms in the open interval (0, 1), float64, shape [B, *shape]."""
     bits = random_bits(key, indices, int(np.prod(shape, dtype=int)))
-    drawn = (bits >> np.uint64(11)).astype(np.float64)
-    drawn += 0.5
-    drawn *= 2.0**-53
+    drawn = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
     # The largest of the words rounds up to 1, of which the inverse normal is infinite.
-    np.minimum(drawn, 1 - 2.0**-53, out=drawn)
-    return drawn.reshape(len(bits), *shape)
+    return np.minimum(drawn, 1 - 2.0**-53).reshape(len(bits), *shape)
 
 
 def normal(key: int, indices: ndarray, shape: tuple[int, ...] = ()) -> ndarray:
     """Draws standard normals by inversion, float64, shape [B, *shape]."""
     from scipy.special import ndtri
 
-    drawn = uniform(key, indices, shape)
-    return ndtri(drawn, out=drawn)
+    return ndtri(uniform(key, indices, shape))
 
 
 def permutation(key: int, indices: ndarray, n: int) -> ndarray:

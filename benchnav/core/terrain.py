@@ -4,15 +4,14 @@ Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.mixture import TraversabilityMixture, map_tensors
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,13 @@ class Observation:
     def __post_init__(self) -> None:
         """Checks that the layers fit the grid and one another."""
         batch = self.rgb.shape[0]
-        _check_shapes(self.grid, batch, elevation_m=self.elevation_m, slope_deg=self.slope_deg)
+        for name in ("elevation_m", "slope_deg"):
+            shape = getattr(self, name).shape
+            expect(
+                shape == (batch, *self.grid.shape),
+                f"`{name}` of shape [{batch}, {self.grid.height}, {self.grid.width}], got {list(shape)}. "
+                "Pass a batch of maps on one grid.",
+            )
         expect(
             self.rgb.dtype == torch.uint8 and self.rgb.shape == (batch, 3, *self.grid.shape),
             f"`rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
@@ -70,45 +75,18 @@ class Terrain:
     grid: Grid
     look_alikes: Callable[[Tensor, Tensor], TraversabilityMixture] | None = None
 
-    def __post_init__(self) -> None:
-        """Checks that the layers fit the grid and one another."""
-        _check_shapes(
-            self.grid,
-            self.rgb.shape[0],
-            class_id=self.class_id,
-            elevation_m=self.elevation_m,
-            slope_deg=self.slope_deg,
-            truth=self.truth.weights.select(-3, 0),
-            traversability=self.traversability,
-        )
-
     def __len__(self) -> int:
         """Number of maps B."""
         return self.rgb.shape[0]
 
     def select(self, members: Tensor) -> "Terrain":
         """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
-        layers: dict[str, Any] = {
-            name: layer[members] for name, layer in vars(self).items() if isinstance(layer, Tensor)
-        }
-        return replace(self, truth=self.truth.select(members), **layers)
+        return map_tensors(self, lambda layer: layer[members])
 
     def to(self, device: torch.device | str) -> "Terrain":
         """The maps on a device."""
-        layers: dict[str, Any] = {
-            name: layer.to(device) for name, layer in vars(self).items() if isinstance(layer, Tensor)
-        }
-        return replace(self, truth=self.truth.to(device), **layers)
+        return map_tensors(self, lambda layer: layer.to(device))
 
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""
         return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid)
-
-
-def _check_shapes(grid: Grid, batch: int, **layers: Tensor) -> None:
-    for name, layer in layers.items():
-        expect(
-            layer.shape == (batch, *grid.shape),
-            f"`{name}` of shape [{batch}, {grid.height}, {grid.width}], got {list(layer.shape)}. "
-            "Pass a batch of maps on one grid.",
-        )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from benchnav import datagen
 from benchnav.core.command import INTERRUPTED, Command, run, show_progress
-from benchnav.core.errors import DatasetError, expect
+from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
 
@@ -52,8 +52,6 @@ def create(
         overwrite: Replace what is there.
     """
     from benchnav.datagen.difficulty import table
-    from benchnav.datagen.files.create import create as create_dataset
-    from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.reader import is_dataset
 
     expect(jobs >= 1, f"`jobs` ≥ 1, got {jobs}.")
@@ -66,33 +64,27 @@ def create(
     chosen = datagen.load_recipe(recipe, overrides)
     if seed is not None and seed != chosen.seed:
         chosen = replace(chosen, seed=seed, id=f"{chosen.id}-seed{seed}")
-    names = list(chosen.splits) if splits is None else splits
-    unknown = [name for name in names if name not in chosen.splits]
-    expect(names and not unknown, f"`splits` among {sorted(chosen.splits)}, got {unknown or 'none'}.")
-    sizes = {
-        name: replace(spec, maps=min(first or spec.maps, spec.maps))
-        for name, spec in chosen.splits.items()
-        if name in names
-    }
+    sizes = {}
+    for name in choose("splits", splits, chosen.splits):
+        spec = chosen.splits[name]
+        sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
     chosen = replace(chosen, splits=sizes)
     cells = sum(spec.maps for spec in sizes.values()) * chosen.height * chosen.width
     is_folder = own is not None or cells > _MOST_CELLS_OF_A_FILE
     path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
-    steps = create_dataset(chosen, path, jobs, scheduler, own, overwrite)
+    steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     done, total = next(steps)
     if done:
         print(f"{done} of {total} maps were there already", file=sys.stderr)
     show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
-        print(f"{path}: shard {own} is made")
         print(
-            f"when the others are: benchnav-datagen merge {path} OTHER … --out OUT, or, where they are made in the"
+            f"{path}: shard {own} is made\n"
+            f"when the others are: benchnav-datagen merge {path} OTHER … --out OUT, or, where they are made in the\n"
+            "same folder, nothing more: the last of them finishes it"
         )
-        print("same folder, nothing more: the last of them finishes it")
         return
-    dataset = datagen.TerrainDataset(path)
-    say_written(dataset)
-    print_table(table(dataset))
+    print_table(table(_written(path)))
 
 
 def list_datasets(folder: str = "") -> None:
@@ -188,13 +180,12 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
         id: Id of the new dataset; the name of the file when not given. Shards keep that of their recipe.
         overwrite: Replace what is there.
     """
-    from benchnav.datagen.files.describe import say_written
     from benchnav.datagen.files.merge import merge as merge_datasets
 
     path = output_path(out)
     sources = [Path(file) if Path(file).is_dir() else datagen.find_dataset(file) for file in files]
     show_progress(merge_datasets(sources, path, id, overwrite), "maps")
-    say_written(datagen.TerrainDataset(path))
+    _written(path)
 
 
 def import_dem(
@@ -238,8 +229,7 @@ def import_dem(
     from benchnav.datagen.dem.importer import import_dem as import_maps
     from benchnav.datagen.dem.survey import Rasters
     from benchnav.datagen.dem.tiling import read_shares
-    from benchnav.datagen.files.describe import say_written
-    from benchnav.datagen.files.hdf5 import is_one_file
+    from benchnav.datagen.files.hdf5 import name_of
 
     path = output_path(out)
     rasters = Rasters(
@@ -250,7 +240,7 @@ def import_dem(
         photo=photo,
         traversability=traversability,
     )
-    name = id or (path.stem if is_one_file(path) else path.name)
+    name = id or name_of(path)
     chosen = datagen.load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
     steps = import_maps(
         rasters,
@@ -264,8 +254,7 @@ def import_dem(
         overwrite=overwrite,
     )
     show_progress(steps, "maps")
-    made = datagen.TerrainDataset(path)
-    say_written(made)
+    made = _written(path)
     for split, entry in made.splits.items():
         left_out = entry["parts"][0]["source"]["left_out"]
         between = left_out.pop("between_splits")
@@ -367,6 +356,18 @@ def preview(
 def _opened(file: str) -> "TerrainDataset":
     """The dataset of a path or an id."""
     return datagen.TerrainDataset(datagen.find_dataset(file))
+
+
+def _written(path: Path) -> "TerrainDataset":
+    """A new dataset, of which is printed where it is, its size, its splits and their digests."""
+    from rich.filesize import decimal
+
+    dataset = datagen.TerrainDataset(path)
+    size, files = decimal(sum(file.stat().st_size for file in dataset.files)), len(dataset.files)
+    print(f"wrote {path} ({size}{f' in {files} files' if files > 1 else ''})")
+    for name, split in dataset.splits.items():
+        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")
+    return dataset
 
 
 def main() -> None:

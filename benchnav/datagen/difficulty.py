@@ -4,9 +4,6 @@ Hard ground is told before anything is trained or driven on it: where a straight
 on nearly every map, no planner has anything to plan. Letters in shapes: B maps, H×W cells.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-
 import numpy as np
 from numpy import ndarray
 
@@ -33,53 +30,36 @@ _EXPLAINED = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
-class Difficulty:
-    """What stands in a robot's way on the maps of a split; shares are of the cells whose class is known.
-
-    Args:
-        maps: number of maps.
-        stuck: share of the cells whose true E[λ] is at most λ_stuck.
-        soft_ground: share of the cells whose class has soft spots.
-        soft_spots: share of the ground that is a soft spot, in the mean over all draws of λ.
-        straight: number of maps on which all cells of the straight line from start to goal have a true
-            E[λ] above λ_stuck.
-        reference_times_s: grid reference times of the maps that have one.
-    """
-
-    maps: int
-    stuck: float
-    soft_ground: float
-    soft_spots: float
-    straight: int
-    reference_times_s: ndarray
-
-
-def of_split(dataset: TerrainDataset, split: str) -> Difficulty:
-    """Measures all maps of a split, some at a time.
+def of_split(dataset: TerrainDataset, split: str) -> Maps:
+    """Measures all maps of a split, some at a time; see `measure`.
 
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    return summarise(measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS))
+    parts = [measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:
-    """Measures some maps.
+    """Measures what stands in a robot's way on some maps.
 
     Args:
         maps: `class_id`, `slope_deg`, `start_m`, `goal_m` and `reference_time_s`, as stored.
         recipe: class table, resolution and λ_stuck.
 
     Returns:
-        The figures of each map, as `Difficulty` has them of all, each of shape [B].
+        Of each map, arrays of shape [B]; shares are of the cells whose class is known:
+            stuck: share of the cells whose true E[λ] is at most λ_stuck.
+            soft_ground: share of the cells whose class has soft spots.
+            soft_spots: share of the ground that is a soft spot, in the mean over all draws of λ.
+            straight: whether all cells of the straight line from start to goal have a true E[λ] above λ_stuck.
+            reference_times_s: grid reference time, not finite where there is none.
     """
     slope = maps["slope_deg"].astype(np.float64)
-    expected = latent.expected_of(latent.truth(maps["class_id"], slope, recipe.classes))
-    stuck = expected <= recipe.stuck_threshold  # not where it is NaN
+    truth = latent.truth(maps["class_id"], slope, recipe.classes)
+    stuck = latent.expected_of(truth) <= recipe.stuck_threshold  # not where it is NaN
+    spots = truth[0][:, 1:].sum(axis=1)  # weight of the soft spots
     labelled = maps["class_id"] != UNLABELLED
-    weight = np.array([item.soft.weight if item.soft else 0.0 for item in recipe.classes])
-    spots = weight[np.where(labelled, maps["class_id"], 0)]
     on_line = crossed_cells(recipe.grid, maps["start_m"], maps["goal_m"])
     counts = np.maximum(1, labelled.sum(axis=(1, 2)))
     shares = {"stuck": stuck, "soft_ground": spots > 0, "soft_spots": spots}
@@ -88,19 +68,6 @@ def measure(maps: Maps, recipe: Recipe) -> Maps:
         "straight": ~(stuck & on_line).any(axis=(1, 2)),
         "reference_times_s": maps["reference_time_s"].astype(np.float64),
     }
-
-
-def summarise(pieces: Iterable[Maps]) -> Difficulty:
-    """Puts what `measure` gave of some maps after others together."""
-    parts = list(pieces)
-    maps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    times = maps["reference_times_s"]
-    return Difficulty(
-        maps=len(times),
-        straight=int(maps["straight"].sum()),
-        reference_times_s=times[np.isfinite(times)],
-        **{name: float(maps[name].mean()) for name in ("stuck", "soft_ground", "soft_spots")},
-    )
 
 
 def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
@@ -119,18 +86,17 @@ def crossed_cells(grid: Grid, start_m: ndarray, goal_m: ndarray) -> ndarray:
     """
     start = start_m.astype(np.float64) / grid.resolution_m
     along = goal_m.astype(np.float64) / grid.resolution_m - start
-    # Where the line is cut by the grid's lines: as shares of its length, sorted, its ends among them.
+    # Where the line comes into each row and column of cells and leaves it, as shares of its length; one along a
+    # border lies beyond it.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        cuts = (np.arange(1, max(grid.shape)) - start[..., None]) / along[..., None]
-    inside = np.where((cuts > 0) & (cuts < 1), cuts, 0).reshape(len(start), -1)
-    shares = np.sort(np.concatenate([inside, np.tile([0.0, 1.0], (len(start), 1))], axis=1), axis=1)
-    middle = start[:, None] + (0.5 * (shares[:, 1:] + shares[:, :-1]))[..., None] * along[:, None]
+        cuts = (np.arange(max(grid.shape) + 1) - start[..., None]) / along[..., None]
+    cuts = np.nan_to_num(cuts, nan=-np.inf)
+    ends = np.minimum(cuts[..., 1:], cuts[..., :-1]), np.maximum(cuts[..., 1:], cuts[..., :-1])
+    (x_in, y_in), (x_out, y_out) = (np.moveaxis(values.clip(0, 1), 1, 0) for values in ends)
+    enter = np.maximum(x_in[:, None, : grid.width], y_in[:, : grid.height, None])
+    leave = np.minimum(x_out[:, None, : grid.width], y_out[:, : grid.height, None])
     # Cuts of both kinds at a corner may differ in their last bits.
-    member, piece = np.nonzero(np.diff(shares, axis=1) > 1e-12)
-    column, row = np.floor(middle[member, piece]).astype(np.int64).T
-    crossed = np.zeros((len(start), *grid.shape), dtype=bool)
-    crossed[member, row.clip(0, grid.height - 1), column.clip(0, grid.width - 1)] = True
-    return crossed
+    return leave - enter > 1e-12
 
 
 def table(dataset: TerrainDataset) -> Table:
@@ -139,12 +105,13 @@ def table(dataset: TerrainDataset) -> Table:
     rows = []
     for split in dataset.splits:
         measured = of_split(dataset, split)
-        shares = (measured.stuck, measured.soft_ground, measured.soft_spots)
-        times, typical, spread = measured.reference_times_s, NOTHING, NOTHING
+        percent = (f"{100 * measured[name].mean():.1f}" for name in ("stuck", "soft_ground", "soft_spots"))
+        times, typical, spread = measured["reference_times_s"], NOTHING, NOTHING
+        times = times[np.isfinite(times)]
         if len(times):
             typical, spread = f"{np.median(times):.1f}", f"{times.min():.1f}–{times.max():.1f}"
-        percent = (f"{100 * share:.1f}" for share in shares)
-        rows.append((split, *percent, typical, spread, f"{measured.straight}/{measured.maps}"))
+        straight = measured["straight"]
+        rows.append((split, *percent, typical, spread, f"{straight.sum()}/{len(straight)}"))
     return Table(
         title=f"how hard the maps are: what stands in a robot's way (λ_stuck {stuck:g})",
         headings=_HEADINGS,

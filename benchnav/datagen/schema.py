@@ -33,16 +33,12 @@ class Field:
         dtype: NumPy dtype in little-endian order.
         shape: shape of one map's entry; "H" and "W" stand for the grid.
         unit: SI unit, or "1".
-        least: smallest value allowed.
-        most: largest value allowed.
         meaning: one line for readers.
     """
 
     dtype: str
     shape: tuple[str | int, ...]
     unit: str
-    least: float
-    most: float
     meaning: str
 
     def entry_shape(self, height: int, width: int) -> tuple[int, ...]:
@@ -55,25 +51,23 @@ Fields = Mapping[str, Field]  # by name, in the order of being stored
 
 # What every dataset has.
 FIELDS: dict[str, Field] = {
-    "rgb": Field("|u1", (3, "H", "W"), "1", 0, 255, "top-down colour image, shaded"),
-    "class_id": Field("|u1", ("H", "W"), "1", 0, 255, "index into the class table"),
-    "elevation_m": Field("<f4", ("H", "W"), "m", -1e4, 1e4, "elevation, in steps of 2^-13 m"),
-    "slope_deg": Field("<f4", ("H", "W"), "deg", 0, 90, "slope by Horn's method, in steps of 2^-10 deg"),
-    "traversability": Field("<f4", ("H", "W"), "1", 0, 1, "realised traversability, in steps of 2^-16"),
-    "environment": Field("<i2", (), "1", 0, 32767, "environment of the map"),
-    "start_m": Field("<f4", (2,), "m", 0, 1e6, "start position (x, y)"),
-    "goal_m": Field("<f4", (2,), "m", 0, 1e6, "goal position (x, y)"),
+    "rgb": Field("|u1", (3, "H", "W"), "1", "top-down colour image, shaded"),
+    "class_id": Field("|u1", ("H", "W"), "1", "index into the class table"),
+    "elevation_m": Field("<f4", ("H", "W"), "m", "elevation, in steps of 2^-13 m"),
+    "slope_deg": Field("<f4", ("H", "W"), "deg", "slope by Horn's method, in steps of 2^-10 deg"),
+    "traversability": Field("<f4", ("H", "W"), "1", "realised traversability, in steps of 2^-16"),
+    "environment": Field("<i2", (), "1", "environment of the map"),
+    "start_m": Field("<f4", (2,), "m", "start position (x, y)"),
+    "goal_m": Field("<f4", (2,), "m", "goal position (x, y)"),
     "reference_time_s": Field(
-        "<f4", (), "s", 0, np.inf, "grid reference time at a commanded 1 m/s; NaN where not asked for"
+        "<f4", (), "s", "grid reference time at a commanded 1 m/s; NaN where not asked for"
     ),
 }
 
 
 # What a dataset may have beside.
 OPTIONAL: dict[str, Field] = {
-    "group": Field(
-        "<i8", (), "1", 0, 2**53, "maps of one number overlap, directly or by others between them"
-    ),
+    "group": Field("<i8", (), "1", "maps of one number overlap, directly or by others between them"),
 }
 
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
@@ -81,10 +75,7 @@ MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 def quantise(values: ndarray, bits: int) -> ndarray:
     """Rounds to multiples of 2^−bits, so that the last bits of a machine's arithmetic do not show."""
-    steps = values * 2.0**bits
-    np.rint(steps, out=steps)
-    steps *= 2.0**-bits
-    return steps
+    return np.rint(values * 2.0**bits) * 2.0**-bits
 
 
 def stored_arrays(fields: Fields, height: int, width: int) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -135,14 +126,10 @@ def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fi
     """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
     if set(fields) - set(FIELDS):
         return "1.3"
-    if any(has_unlabelled(entry) for entry in splits):
+    sources = [part.get("source", {}) for entry in splits for part in entry["parts"]]
+    if any(sum(source.get("unlabelled", ())) > 0 for source in sources):
         return "1.2"
     return "1.1" if max(synthesis) > 1 else "1.0"
-
-
-def has_unlabelled(entry: Mapping[str, Any]) -> bool:
-    """Tells by a split's entry in the manifest whether some of its cells have no class."""
-    return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
 def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
@@ -159,7 +146,7 @@ def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
 
 
 def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
-    """Gives the fields that a manifest describes, in its order; of those that are not ours any value is allowed.
+    """Gives the fields that a manifest describes, in its order.
 
     Raises:
         KeyError, TypeError, ValueError: one of `FIELDS` is not among them, or one is not as it should be.
@@ -172,41 +159,44 @@ def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
     for name, about in table.items():
         dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
         symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
-        foreign = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
-        fields[name] = field = (FIELDS | OPTIONAL).get(name, foreign)
-        if (about["dtype"], shape) != (field.dtype, field.entry_shape(height, width)):
-            raise ValueError(f"field {name!r} is {about['dtype']} {list(shape)}, not {field.dtype}")
+        foreign = Field(dtype, symbols, about["unit"], about["meaning"])
+        fields[name] = (FIELDS | OPTIONAL).get(name, foreign)
     return fields
 
 
 # What readers need: keys and the types of their values.
-_MANIFEST = {"id": str, "generator": dict, "fields": dict, "splits": dict, "recipes": list}
+_MANIFEST = {
+    "id": str,
+    "generator": {"package": str, "version": str},
+    "fields": dict,
+    "splits": dict,
+    "recipes": list,
+}
 _ENTRY = {"scenario": str, "maps": int, "digest": str, "parts": list}
 _GENERATED = {"maps": int, "recipe": int, "split": str, "first": int}
-_IMPORTED = {"maps": int, "source": dict}
+_IMPORTED = {"maps": int, "source": {"file": str, "left_out": dict}}
+_RECIPE = {"id": str, "seed": int, "scenarios": dict, "splits": dict}
 
 
 def check(manifest: Mapping[str, Any]) -> None:
     """Refuses a manifest that does not say what a reader needs.
 
     Raises:
-        KeyError, TypeError, ValueError: it does not.
+        AttributeError, KeyError, TypeError, ValueError: it does not.
     """
-    _check_kinds("the manifest", manifest, _MANIFEST)
-    _check_kinds("`generator`", manifest["generator"], {"package": str, "version": str})
+    _check_kinds(manifest, _MANIFEST)
     read_field_table(manifest["fields"])
     if not manifest["splits"] or not manifest["recipes"]:
         raise ValueError("it has no split or no recipe")
+    for recipe in manifest["recipes"]:
+        _check_kinds(recipe, _RECIPE)
     for name, entry in manifest["splits"].items():
-        _check_kinds(f"split {name!r}", entry, _ENTRY)
+        _check_kinds(entry, _ENTRY)
         for part in entry["parts"]:
-            _check_kinds(f"a part of split {name!r}", part, _IMPORTED if "source" in part else _GENERATED)
-            if "source" in part:
-                _check_kinds(f"the source of split {name!r}", part["source"], {"file": str, "left_out": dict})
-                continue
-            recipe = manifest["recipes"][part["recipe"]]
-            _check_kinds("a recipe", recipe, {"id": str, "seed": int, "scenarios": dict})
-            recipe["scenarios"][recipe["splits"][part["split"]]["scenario"]]
+            _check_kinds(part, _IMPORTED if "source" in part else _GENERATED)
+            if "recipe" in part:
+                recipe = manifest["recipes"][part["recipe"]]
+                recipe["scenarios"][recipe["splits"][part["split"]]["scenario"]]
         shards = manifest["shards"][name] if "shards" in manifest else entry["parts"]
         for parts in (entry["parts"], shards):
             if not 0 < sum(part["maps"] for part in parts) == entry["maps"]:
@@ -215,7 +205,10 @@ def check(manifest: Mapping[str, Any]) -> None:
             raise ValueError(f"a file of split {name!r} is not in the folder")
 
 
-def _check_kinds(what: str, given: Any, kinds: Mapping[str, type]) -> None:
+def _check_kinds(given: Any, kinds: Mapping[str, Any]) -> None:
     for name, kind in kinds.items():
-        if type(given) is not dict or type(given.get(name)) is not kind:
-            raise ValueError(f"{what} has no {name!r} of type {kind.__name__}")
+        value = given.get(name)
+        if isinstance(kind, dict):
+            _check_kinds(value, kind)
+        elif type(value) is not kind:
+            raise ValueError(f"it has no {name!r} of type {kind.__name__}")

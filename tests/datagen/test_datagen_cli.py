@@ -135,7 +135,7 @@ def test_options_of_create_reach_it(datagen: Call, monkeypatch: pytest.MonkeyPat
         seen.append(how)
         raise ConfigError("seen")
 
-    monkeypatch.setattr(create, "create", watched)
+    monkeypatch.setattr("benchnav.datagen.create_dataset", watched)
     plain = ("create", "tiny-v1", "--out", "d")
     for options in (
         (), ("--jobs", "3"), ("--backend", "dask", "--scheduler", "tcp://a:1"), ("--shard", "2/3"), ("--overwrite",),

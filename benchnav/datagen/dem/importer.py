@@ -24,10 +24,10 @@ import numpy as np
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.raster import load_rasterio
-from benchnav.datagen.dem.survey import Rasters, Survey, survey
+from benchnav.datagen.dem.survey import Rasters, Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
-from benchnav.datagen.files.hdf5 import Contents, assemble, check_place, foreign_in, held, pack
+from benchnav.datagen.files.hdf5 import Contents, assemble, held, pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
@@ -78,14 +78,13 @@ def import_dem(
         DatasetError: a raster does not fit, a split is left without maps, or `out` cannot be written.
     """
     out = real_place(out)
-    check_place(out, overwrite)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
     recipe = replace(recipe, id=dataset_id, splits=splits)
     with ExitStack() as stack:
+        stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = survey(stack, rasters, recipe, shares, stride_m)
-        stack.enter_context(held(out, overwrite, foreign_in))
+        ground = Survey(stack, rasters, recipe, shares, stride_m)
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
         done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
@@ -95,7 +94,7 @@ def import_dem(
             yield done, ground.tiling.maps
         for part in parts.values():
             part.finish()
-        sizes = {name: replace(splits[name], maps=len(part.kept)) for name, part in parts.items()}
+        sizes = {name: replace(splits[name], maps=len(part.about["kept"])) for name, part in parts.items()}
         contents = Contents(
             id=dataset_id,
             recipes=[replace(recipe, splits=sizes)],
@@ -103,21 +102,20 @@ def import_dem(
             files={name: part.files for name, part in parts.items()},
             fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
         )
-        check_place(out, overwrite)
         assemble(contents, folder, out)
 
 
 @dataclass(kw_only=True)
 class _Part:
-    """What has become of the maps of one split: files of those kept, with their numbers, and counts of the others."""
+    """What has become of the maps of one split: files of those kept, what is said of each, counts of the others."""
 
     name: str
     recipe: Recipe
     folder: Path
     ground: Survey
-    kept: list[int] = field(default_factory=list)
-    lowest_m: list[float] = field(default_factory=list)
-    unlabelled: list[int] = field(default_factory=list)
+    about: dict[str, list[Any]] = field(
+        default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []}
+    )
     left_out: Counter[str] = field(default_factory=Counter)
     files: list[Path] = field(default_factory=list)
     pending: list[Maps] = field(default_factory=list)
@@ -166,11 +164,11 @@ class _Part:
         maps["reference_time_s"] = times_s
         solved = np.isfinite(times_s) | (not solvable)
         self.left_out["not_solvable"] += int((~solved).sum())
-        self.kept += numbers[solved].tolist()
-        self.lowest_m += lowest_m[solved].tolist()
-        self.unlabelled += (~labelled).sum(axis=(1, 2))[solved].tolist()
+        found = (numbers, lowest_m, (~labelled).sum(axis=(1, 2)))
+        for values, more in zip(self.about.values(), found, strict=True):
+            values += more[solved].tolist()
         self.pending.append({name: maps[name][solved].astype(kind.dtype) for name, kind in FIELDS.items()})
-        if (len(self.kept) - self.written) * recipe.height * recipe.width >= SHARD_CELLS:
+        if (len(self.about["kept"]) - self.written) * recipe.height * recipe.width >= SHARD_CELLS:
             self._flush()
 
     def finish(self) -> None:
@@ -179,7 +177,7 @@ class _Part:
         Raises:
             DatasetError: no map was kept.
         """
-        if not self.kept:
+        if not self.about["kept"]:
             reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
             dem = self.ground.layers["elevation_m"].raster.name
             raise DatasetError(
@@ -187,13 +185,13 @@ class _Part:
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "
                 "or a recipe of easier ground."
             )
-        if self.written < len(self.kept):
+        if self.written < len(self.about["kept"]):
             self._flush()
         if self.ground.tiling.overlaps:
             self._add_groups()
 
     def _flush(self) -> None:
-        shard = ShardFile(split=self.name, first=self.written, stop=len(self.kept))
+        shard = ShardFile(split=self.name, first=self.written, stop=len(self.about["kept"]))
         maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}
         self.files.append(self.folder / shard.name)
         self._write(self.files[-1], maps, shard.first)
@@ -212,9 +210,9 @@ class _Part:
         source = self.ground.source
         about = [source[key] for key in ("file", "sha256", "crs", "origin_m", "stride_m")]
         about += self.ground.tiling.shape
-        firsts, group = np.unique(self.ground.tiling.groups(self.kept), return_inverse=True)
-        texts = [json.dumps([*about, first]).encode() for first in firsts.tolist()]
-        numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])[group]
+        firsts = self.ground.tiling.groups(self.about["kept"]).tolist()
+        texts = (json.dumps([*about, first]).encode() for first in firsts)
+        numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])
         begin = 0
         for file in self.files:
             maps = TerrainDataset(file).read(self.name)
@@ -224,12 +222,7 @@ class _Part:
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """The manifest's entry of the maps from one on, to the last or before another."""
-        about: Mapping[str, list[Any]] = {
-            "kept": self.kept,
-            "lowest_m": self.lowest_m,
-            "unlabelled": self.unlabelled,
-        }
-        kept = {name: values[first:stop] for name, values in about.items()}
+        kept = {name: values[first:stop] for name, values in self.about.items()}
         left_out = {**self.left_out, "between_splits": self.ground.tiling.between}
         source = {**self.ground.source, "truth": "unknown", **kept, "left_out": left_out}
         count, scenario = len(kept["kept"]), self.recipe.splits[self.name].scenario

@@ -6,7 +6,7 @@ is read here runs northward, with y. Letters in shapes: K bands, H×W cells.
 
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -18,25 +18,6 @@ from benchnav.core.errors import ConfigError, DatasetError
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
 _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lattice:
-    """The cells of all maps together.
-
-    Args:
-        crs: projected, in metres.
-        west_m: their western edge.
-        south_m: their southern edge.
-        cells: how many, northward and eastward.
-        resolution_m: width of a cell.
-    """
-
-    crs: Any
-    west_m: float
-    south_m: float
-    cells: Sequence[int]
-    resolution_m: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,33 +76,32 @@ class Raster:
                 self.file, src_crs=_horizontal(self.file.crs), crs=crs, tolerance=_TOLERANCE, **settings
             )
 
-    @contextmanager
-    def laid(self, lattice: Lattice, bands: list[int], how: str) -> Iterator["Layer"]:
-        """Lays bands of it on a lattice, resampled in one of GDAL's ways."""
-        rasterio, (height, width), step = load_rasterio(), lattice.cells, lattice.resolution_m
-        north_west = lattice.west_m - step, lattice.south_m + (height + 1) * step
-        with self.warped(
-            lattice.crs,
-            transform=rasterio.transform.from_origin(*north_west, step, step),
-            height=height + 2,
-            width=width + 2,
-            resampling=rasterio.enums.Resampling[how],
-            # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
-            dtype="float64" if len(bands) == 1 else self.file.dtypes[0],
-        ) as warped:
-            yield Layer(raster=self, bands=bands, warped=warped)
+    def laid(self, frame: Mapping[str, Any], bands: list[int], how: str) -> "Layer":
+        """Lays bands of it on cells, resampled in one of GDAL's ways.
+
+        Args:
+            frame: the cells of all maps and one around them: `crs`, `transform`, `height` and `width`.
+            bands: which bands.
+            how: name of one of `rasterio.enums.Resampling`.
+        """
+        resampling = load_rasterio().enums.Resampling[how]
+        # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
+        dtype = "float64" if len(bands) == 1 else self.file.dtypes[0]
+        return Layer(
+            raster=self, bands=bands, warped=self.warped(**frame, resampling=resampling, dtype=dtype)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """The first bands of a raster as resampled to a lattice that is framed by one cell."""
+    """The first bands of a raster as resampled to the cells of all maps and one around them."""
 
     raster: Raster
     bands: list[int]
     warped: Any
 
     def read(self, rows: range, columns: range) -> np.ndarray:
-        """Reads cells of the lattice and one cell around them.
+        """Reads cells of the maps and one cell around them.
 
         Args:
             rows: counted northward.
@@ -213,14 +193,16 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
     longitude, latitude = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
-    origin = (
-        ("Latitude of natural origin", latitude, "degree"),
-        ("Longitude of natural origin", longitude, "degree"),
-        ("Scale factor at natural origin", 1, "unity"),
-        ("False easting", 0, "metre"),
-        ("False northing", 0, "metre"),
-    )
-    parameters = [{"name": name, "value": value, "unit": unit} for name, value, unit in origin]
+    parameters = [
+        {"name": name, "value": value, "unit": unit}
+        for name, value, unit in (
+            ("Latitude of natural origin", latitude, "degree"),
+            ("Longitude of natural origin", longitude, "degree"),
+            ("Scale factor at natural origin", 1, "unity"),
+            ("False easting", 0, "metre"),
+            ("False northing", 0, "metre"),
+        )
+    ]
     axes = [
         {"name": name, "abbreviation": name[0], "direction": direction, "unit": "metre"}
         for name, direction in (("Easting", "east"), ("Northing", "north"))

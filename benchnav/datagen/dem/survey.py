@@ -8,7 +8,7 @@ covers most of it. Letters in shapes: B maps, K bands, H×W cells of a map.
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +18,8 @@ import numpy as np
 from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
-from benchnav.datagen.dem.raster import Lattice, Layer, opened
-from benchnav.datagen.dem.tiling import Run, Tiling, cut
+from benchnav.datagen.dem.raster import Layer, load_rasterio, opened
+from benchnav.datagen.dem.tiling import Run, cut
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
 
@@ -67,25 +67,115 @@ class Rasters:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
 class Survey:
     """Rasters laid on the cells of all maps.
 
-    Args:
+    Attributes:
         tiling: how the ground is cut into maps.
         layers: by field; under `FIELD min` and `FIELD max` what is averaged there.
-        known: which rows and columns of the lattice, framed by a cell, lie wholly on the elevation model.
+        known: which rows and columns of all cells, framed by one, lie wholly on the elevation model.
         indices: of classes, by value of their raster; NaN for no label.
         cliff_m: height over 0 that only cells without a value leave bare; infinite where these are declared.
         source: what the manifest says of the rasters.
     """
 
-    tiling: Tiling
-    layers: Mapping[str, Layer]
-    known: Sequence[ndarray]
-    indices: Mapping[int, float]
-    cliff_m: float
-    source: Mapping[str, Any]
+    def __init__(
+        self,
+        stack: ExitStack,
+        rasters: Rasters,
+        recipe: Recipe,
+        shares: Mapping[str, float],
+        stride_m: float | None,
+    ) -> None:
+        """Opens rasters and lays them on the cells of all maps.
+
+        Args:
+            stack: closes them.
+            rasters: which.
+            recipe: size and resolution of the maps, class table.
+            shares: of the maps, by split.
+            stride_m: from one map to the next; None for maps side by side.
+
+        Raises:
+            ConfigError: a setting does not fit the recipe.
+            DatasetError: a raster does not fit, or the ground is too small.
+        """
+        names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
+        named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
+        unknown = sorted({name for name in named.values() if name is not None} - set(names))
+        expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
+        dem = stack.enter_context(opened("dem", rasters.dem))
+        unit = dem.file.units[0] or "m"
+        if unit.lower() not in _METRES:
+            raise DatasetError(
+                f"Expected elevations of `dem` in metres, got {unit!r} in {dem.name}. Convert them (gdal_calc.py, "
+                f"× 0.3048 for feet), then declare the unit: rio edit-info --bidx 1 --units metre {dem.name}"
+            )
+        crs, bounds, cell_m = dem.place()
+        how, reach_m = "cubic", _KERNEL_CELLS * max(*cell_m, step)
+        if np.allclose(cell_m, step, rtol=1e-9) and bounds == dem.file.bounds:
+            how, reach_m = "nearest", 0.0
+        elif max(cell_m) <= step / 2 * (1 + 1e-9):
+            how, reach_m = "average", 0.0
+        size_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
+        rows, columns = np.floor(size_m / step + _SLACK).astype(int).tolist()
+        if rows < recipe.height or columns < recipe.width:
+            wide, high = recipe.grid.extent_m
+            raise DatasetError(
+                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem.name} of "
+                f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
+            )
+        stride = recipe.grid.shape
+        if stride_m is not None:
+            cells = stride_m / step
+            expect(
+                cells > 0.5 and abs(cells - round(cells)) < 1e-6,
+                f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
+            )
+            stride = round(cells), round(cells)
+        self.tiling = tiling = cut((rows, columns), recipe.grid.shape, stride, shares)
+        # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
+        offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
+        south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
+        height, width = tiling.cells
+        corner = west_m - step, south_m + (height + 1) * step
+        transform = load_rasterio().transform.from_origin(*corner, step, step)
+        frame = {"crs": crs, "transform": transform, "height": height + 2, "width": width + 2}
+        sources = [("elevation_m", dem, how)]
+        for field, argument, kinds, how in (
+            ("class_id", "classes", (), "mode"),
+            ("rgb", "photo", ("uint8",) * 3, "average"),
+            ("traversability", "traversability", (), "average"),
+        ):
+            if name := getattr(rasters, argument):
+                sources.append((field, stack.enter_context(opened(argument, name, kinds)), how))
+        self.layers: dict[str, Layer] = {}
+        for field, raster, how in sources:
+            bands = [1, 2, 3] if field == "rgb" else [1]
+            ends = ("min", "max") if how in ("average", "cubic") and field != "rgb" else ()
+            for layer, way in ((field, how), *((f"{field} {end}", end) for end in ends)):
+                self.layers[layer] = raster.laid(frame, bands, way)
+                stack.enter_context(self.layers[layer].warped)
+        origins = {field: provenance(raster.name) for field, raster, _ in sources}
+        ids = {str(value): name for value, name in sorted(named.items())}
+        self.source: dict[str, Any] = {
+            "kind": "dem",
+            **origins["elevation_m"],
+            "crs": crs.to_string(),
+            "resolution_m": [cell_m[1], cell_m[0]],
+            "origin_m": [west_m, south_m],
+            "tiles": list(tiling.tiles),
+            "stride_m": [tiling.stride[1] * step, tiling.stride[0] * step],
+            "classes": {**origins["class_id"], "ids": ids} if rasters.classes else None,
+            "photo": origins.get("rgb"),
+            "traversability": origins.get("traversability"),
+        }
+        self.known = []
+        for offset, count, size in zip(offset_m, tiling.cells, size_m, strict=True):
+            edges = offset + step * np.arange(-1, count + 2)
+            self.known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
+        self.indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
+        self.cliff_m = _CLIFF * max(*cell_m, step) if dem.mask_kinds == {"all_valid"} else np.inf
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Reads some maps.
@@ -160,97 +250,6 @@ class Survey:
                 f"rio edit-info --nodata VALUE {name}"
             )
         return indices
-
-
-def survey(
-    stack: ExitStack, rasters: Rasters, recipe: Recipe, shares: Mapping[str, float], stride_m: float | None
-) -> Survey:
-    """Opens rasters and lays them on the cells of all maps.
-
-    Args:
-        stack: closes them.
-        rasters: which.
-        recipe: size and resolution of the maps, class table.
-        shares: of the maps, by split.
-        stride_m: from one map to the next; None for maps side by side.
-
-    Raises:
-        ConfigError: a setting does not fit the recipe.
-        DatasetError: a raster does not fit, or the ground is too small.
-    """
-    names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
-    named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
-    unknown = sorted({name for name in named.values() if name is not None} - set(names))
-    expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
-    dem = stack.enter_context(opened("dem", rasters.dem))
-    unit = dem.file.units[0] or "m"
-    if unit.lower() not in _METRES:
-        raise DatasetError(
-            f"Expected elevations of `dem` in metres, got {unit!r} in {dem.name}. Convert them (gdal_calc.py, "
-            f"× 0.3048 for feet), then declare the unit: rio edit-info --bidx 1 --units metre {dem.name}"
-        )
-    crs, bounds, cell_m = dem.place()
-    how, reach_m = "cubic", _KERNEL_CELLS * max(*cell_m, step)
-    if np.allclose(cell_m, step, rtol=1e-9) and bounds == dem.file.bounds:
-        how, reach_m = "nearest", 0.0
-    elif max(cell_m) <= step / 2 * (1 + 1e-9):
-        how, reach_m = "average", 0.0
-    size_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
-    rows, columns = np.floor(size_m / step + _SLACK).astype(int).tolist()
-    if rows < recipe.height or columns < recipe.width:
-        wide, high = recipe.grid.extent_m
-        raise DatasetError(
-            f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem.name} of "
-            f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
-        )
-    stride = recipe.grid.shape
-    if stride_m is not None:
-        cells = stride_m / step
-        expect(
-            cells > 0.5 and abs(cells - round(cells)) < 1e-6,
-            f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
-        )
-        stride = round(cells), round(cells)
-    tiling = cut((rows, columns), recipe.grid.shape, stride, shares)
-    # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
-    offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
-    south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
-    lattice = Lattice(crs=crs, west_m=west_m, south_m=south_m, cells=tiling.cells, resolution_m=step)
-    sources = [("elevation_m", dem, how)]
-    for field, argument, kinds, how in (
-        ("class_id", "classes", (), "mode"),
-        ("rgb", "photo", ("uint8",) * 3, "average"),
-        ("traversability", "traversability", (), "average"),
-    ):
-        if name := getattr(rasters, argument):
-            sources.append((field, stack.enter_context(opened(argument, name, kinds)), how))
-    layers: dict[str, Layer] = {}
-    for field, raster, how in sources:
-        bands = [1, 2, 3] if field == "rgb" else [1]
-        ends = ("min", "max") if how in ("average", "cubic") and field != "rgb" else ()
-        for layer, way in ((field, how), *((f"{field} {end}", end) for end in ends)):
-            layers[layer] = stack.enter_context(raster.laid(lattice, bands, way))
-    origins = {field: provenance(raster.name) for field, raster, _ in sources}
-    ids = {str(value): name for value, name in sorted(named.items())}
-    source = {
-        "kind": "dem",
-        **origins["elevation_m"],
-        "crs": crs.to_string(),
-        "resolution_m": [cell_m[1], cell_m[0]],
-        "origin_m": [west_m, south_m],
-        "tiles": list(tiling.tiles),
-        "stride_m": [tiling.stride[1] * step, tiling.stride[0] * step],
-        "classes": {**origins["class_id"], "ids": ids} if rasters.classes else None,
-        "photo": origins.get("rgb"),
-        "traversability": origins.get("traversability"),
-    }
-    known = []
-    for offset, count, size in zip(offset_m, tiling.cells, size_m, strict=True):
-        edges = offset + step * np.arange(-1, count + 2)
-        known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
-    indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
-    cliff_m = _CLIFF * max(*cell_m, step) if dem.mask_kinds == {"all_valid"} else np.inf
-    return Survey(tiling=tiling, layers=layers, known=known, indices=indices, cliff_m=cliff_m, source=source)
 
 
 def provenance(name: str) -> dict[str, str | None]:

@@ -7,7 +7,7 @@ import datetime
 import hashlib
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,9 @@ PAPER = """@misc{endo2024benchnav,
 
 # The context that readers of version 1.0 look for, whether or not a term is used.
 _OWN_TERMS = (
-    *("citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format", "includes"),
-    *("isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
-    *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
-    "equivalentProperty",
+    "citeAs column extract field fileProperty fileObject fileSet format includes isLiveDataset jsonPath key md5 "
+    "parentField path recordSet references regex repeated replace samplingRate separator source subField transform "
+    "equivalentProperty"
 )
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
@@ -50,7 +49,7 @@ _CONTEXT: dict[str, Any] = {
     "data": {"@id": "cr:data", "@type": "@json"},
     "examples": {"@id": "cr:examples", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    **{term: f"cr:{term}" for term in _OWN_TERMS},
+    **{term: f"cr:{term}" for term in _OWN_TERMS.split()},
 }
 
 
@@ -72,7 +71,7 @@ class Publication:
 
     def __post_init__(self) -> None:
         """Checks what programs read."""
-        if not _URL.fullmatch(self.license):
+        if not self.is_url:
             _check_licence(self.license)
         expect(self.creator.strip(), "`creator` to be a name, got an empty one.")
         expect(_URL.fullmatch(self.url) or not self.url, f"`url` to begin with https://, got {self.url!r}.")
@@ -82,10 +81,14 @@ class Publication:
             raise ConfigError(f"Expected `date` as YYYY-MM-DD, got {self.date!r}.") from error
 
     @property
+    def is_url(self) -> bool:
+        """Whether the licence is a URL, and no name."""
+        return _URL.fullmatch(self.license) is not None
+
+    @property
     def license_url(self) -> str:
         """Where the licence is to be read."""
-        is_url = self.license.startswith("http")
-        return self.license if is_url else f"https://spdx.org/licenses/{self.license}.html"
+        return self.license if self.is_url else f"https://spdx.org/licenses/{self.license}.html"
 
 
 def _check_licence(name: str) -> None:
@@ -220,10 +223,9 @@ def _classes(dataset: TerrainDataset) -> dict[str, Any]:
     """The class table, whose numbers give the latent traversability of a cell."""
     rows: list[dict[str, Any]] = []
     for number, item in enumerate(dataset.recipe.classes):
-        row: dict[str, Any] = {"id": number, "name": item.name, "colour": item.hex_colour}
-        row |= {key: getattr(item, key) for key in ("scale", "exponent", "offset", "noise")}
-        for key in ("weight", "mean", "std"):
-            row[f"soft_{key}"] = getattr(item.soft, key, 0.0)
+        row = {"id": number, **asdict(item), "colour": f"#{bytes(item.colour).hex()}"}
+        soft = row.pop("soft") or {}
+        row |= {f"soft_{key}": soft.get(key, 0.0) for key in ("weight", "mean", "std")}
         rows.append({f"classes/{key}": value for key, value in row.items()})
     kinds = {"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"}
     fields = [_node("Field", key, dataType=kinds.get(key.rpartition("/")[2], "sc:Float")) for key in rows[0]]
@@ -244,14 +246,13 @@ def card(dataset: TerrainDataset, names: Mapping[str, str], publication: Publica
         names: of its splits, as files are called, by their names in the dataset.
         publication: licence, creator, place and date.
     """
-    is_url = publication.license.startswith("http")
     ours = is_ours(dataset, names)
     title = f"BenchNav {dataset.id}" if ours else dataset.id
     files = [{"split": name, "path": f"{FOLDER}/{name}-*-of-*.parquet"} for name in names.values()]
     head = {
         "pretty_name": title,
-        "license": "other" if is_url else publication.license.lower(),
-        **({"license_link": publication.license} if is_url else {}),
+        "license": "other" if publication.is_url else publication.license.lower(),
+        **({"license_link": publication.license} if publication.is_url else {}),
         "tags": ["robotics", "off-road-navigation", "traversability", "terrain"],
         "configs": [{"config_name": "default", "data_files": files}],
     }

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from benchnav.core.errors import expect
+from benchnav.core.errors import choose, expect
 from benchnav.core.store import building, take_place
 from benchnav.datagen.export.croissant import CARD, METADATA, Publication, card, metadata
 from benchnav.datagen.export.parquet import FOLDER, split_names, write_split
@@ -36,8 +36,8 @@ def export(
         DatasetError: the dataset is damaged, or `out` cannot be written.
         ConfigError: no such split or field, or `out` is taken.
     """
-    names = split_names(_chosen("splits", splits, list(dataset.splits)))
-    columns = _chosen("fields", fields, list(dataset.fields))
+    names = split_names(choose("splits", splits, dataset.splits))
+    columns = choose("fields", fields, dataset.fields)
     expect(maps_a_file >= 0, f"`maps_per_file` ≥ 0, got {maps_a_file}.")
     out = out.resolve()
     done, total = 0, sum(dataset.map_count(split) for split in names)
@@ -56,10 +56,3 @@ def export(
 
 def _foreign(out: Path) -> str:
     return "" if (out / METADATA).is_file() else "is no exported dataset"
-
-
-def _chosen(what: str, asked: Sequence[str] | None, known: list[str]) -> list[str]:
-    asked = known if asked is None else asked
-    unknown = [name for name in asked if name not in known]
-    expect(asked and not unknown, f"`{what}` among {known}, got {unknown or 'none'}.")
-    return [name for name in known if name in asked]

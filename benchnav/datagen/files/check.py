@@ -1,4 +1,4 @@
-"""Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split digests."""
+"""Checks a whole dataset: schema, per-chunk checksums, entry digests, split digests."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -80,9 +80,9 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
     fields, count = list(dataset.fields), dataset.map_count(split)
     stored = np.zeros((count, len(fields), schema.DIGEST_BYTES), np.uint8)
     computed = np.zeros_like(stored)
-    is_read = {name: np.zeros(count, dtype=bool) for name in (*fields, schema.ENTRY_DIGESTS)}
+    is_stored = np.zeros(count, dtype=bool)
     files: list[str] = []  # of each map
-    for piece in dataset.pieces(split):
+    for piece in dataset.pieces[split]:
         own = piece.path.name if piece.path != dataset.path else ""
         files += [own] * piece.maps
         try:
@@ -91,7 +91,7 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
             yield -1, "", _MISSING, own
             continue
         with file:
-            for name in is_read:
+            for name in (*fields, schema.ENTRY_DIGESTS):
                 try:
                     array = dataset.stored_array(file, split, name, piece.maps)
                 except (*READ_ERRORS, TypeError, AttributeError) as error:
@@ -104,16 +104,13 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                         yield first, name, "is damaged", own
                         continue
                     maps = slice(first, first + len(values))
-                    is_read[name][maps] = True
                     if name == schema.ENTRY_DIGESTS:
-                        stored[maps] = values
+                        stored[maps], is_stored[maps] = values, True
                         continue
-                    for index in _out_of_range(dataset, split, name, values):
-                        yield first + index, name, "is out of range", own
                     digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
                     computed[maps, fields.index(name)] = digests[:, 0]
-    readable = np.stack([is_read[name] for name in fields], axis=1)
-    unlike = (computed != stored).any(axis=2) & readable & is_read[schema.ENTRY_DIGESTS][:, None]
+    readable = computed.any(axis=2)
+    unlike = (computed != stored).any(axis=2) & readable & is_stored[:, None]
     digest = schema.split_digest(computed, *dataset.grid.shape, dataset.fields)
     if readable.all() and digest == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
@@ -138,16 +135,3 @@ def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
                 with suppress(*READ_ERRORS):
                     values = array[index : index + 1]
                 yield index, values
-
-
-def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.ndarray) -> list[int]:
-    """Which maps have a value that may not be."""
-    field = dataset.fields[name]
-    most = len(dataset.recipe.classes) - 1 if name == "class_id" else field.most
-    allowed = (values >= field.least) & (values <= most)
-    if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
-        allowed |= values == schema.UNLABELLED
-    # Not asked for; not observed; what a field that is not ours means by it, it may mean.
-    if name in ("reference_time_s", "traversability") or name not in schema.FIELDS | schema.OPTIONAL:
-        allowed |= np.isnan(values)
-    return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

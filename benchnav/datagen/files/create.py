@@ -36,7 +36,7 @@ from benchnav.datagen.synth.generate import generate
 SHARD_CELLS = 2**20
 
 
-@dataclass(frozen=True, order=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class ShardFile:
     """Consecutive maps of a recipe's split, in a file that is a dataset by itself.
 

@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rich.filesize import decimal
-
 from benchnav.core.settings import plain
 from benchnav.core.tables import Table
 from benchnav.datagen import schema
@@ -46,7 +44,7 @@ def describe(dataset: TerrainDataset) -> dict[str, Any]:
 
 def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
     total, name = 0, ""
-    for piece in dataset.pieces(split):
+    for piece in dataset.pieces[split]:
         with open_file(piece.path) as file:
             try:
                 for name in dataset.field_names:
@@ -115,11 +113,3 @@ def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
         return f"{part['maps']} of {part['source']['file']}"
     recipe = described["recipes"][part["recipe"]]
     return f"{part['maps']} of {recipe['id']} {part['split']}, seed {recipe['seed']}"
-
-
-def say_written(dataset: TerrainDataset) -> None:
-    """Prints where a new dataset is, its size, its splits and their digests."""
-    size, files = decimal(sum(path.stat().st_size for path in dataset.files)), len(dataset.files)
-    print(f"wrote {dataset.path} ({size}{f' in {files} files' if files > 1 else ''})")
-    for name, split in dataset.splits.items():
-        print(f"  {name:12} {split['maps']:6} maps  {split['digest']}")

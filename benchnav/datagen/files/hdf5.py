@@ -21,7 +21,7 @@ import benchnav
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import refuse_taken, replacing, restore, seal, sole_writer, take_place, write_text
 from benchnav.datagen import schema
-from benchnav.datagen.files.reader import FOLDER_MANIFEST, open_file, read_manifest
+from benchnav.datagen.files.reader import FOLDER_MANIFEST, TerrainDataset, open_file, read_manifest
 from benchnav.datagen.recipe.recipe import Recipe
 
 FOLDER_FORMAT_VERSION = "1.2"  # at least
@@ -127,6 +127,11 @@ def is_one_file(path: Path) -> bool:
     return path.suffix in (".h5", ".hdf5")
 
 
+def name_of(path: Path) -> str:
+    """What a dataset at a place is called where nobody says."""
+    return path.stem if is_one_file(path) else path.name
+
+
 def check_place(path: Path, overwrite: bool, names: Collection[str] = ()) -> None:
     """Refuses a place for a dataset that is taken.
 
@@ -147,8 +152,7 @@ def foreign_in(path: Path, names: Collection[str] = ()) -> str:
         return "" if is_one_file(path) == path.is_file() else f"is a {'folder' if path.is_dir() else 'file'}"
     ours = set(names)
     with suppress(DatasetError):  # a damaged manifest is one where shards lie beside it
-        shards = read_manifest(path).get("shards", {})
-        ours |= {shard["file"] for several in shards.values() for shard in several}
+        ours |= {file.name for file in TerrainDataset(path).files}
     files = sorted(file.name for file in path.iterdir())
     ours |= {name for name in files if name not in ours and _is_shard(path / name)}
     for name in files:
@@ -238,7 +242,7 @@ def named_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def held(out: Path, overwrite: bool, foreign: Callable[[Path], str]) -> Iterator[None]:
+def held(out: Path, overwrite: bool, foreign: Callable[[Path], str] = foreign_in) -> Iterator[None]:
     """Holds the place of what is made whole, for one process; see `refuse_taken` and `named_errors`."""
     with named_errors(out), sole_writer(out, str(out)):
         restore(out)

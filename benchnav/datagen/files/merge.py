@@ -17,10 +17,10 @@ from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.core.settings import plain
 from benchnav.core.store import building, real_place
 from benchnav.datagen import schema
-from benchnav.datagen.files.hdf5 import Contents, assemble, foreign_in, held, is_one_file, whole
+from benchnav.datagen.files.check import find_faults
+from benchnav.datagen.files.hdf5 import Contents, assemble, held, is_one_file, name_of, whole
 from benchnav.datagen.files.reader import TerrainDataset, is_dataset
 from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
-from benchnav.datagen.schema import Maps
 
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
@@ -48,16 +48,18 @@ def merge(
     finished = [path for path in paths if is_dataset(path) or not path.is_dir()]
     if finished and len(finished) < len(paths):
         raise DatasetError("Expected either datasets or shards of one dataset, got both.")
-    name = dataset_id or (out.stem if is_one_file(out) else out.name)
+    name = dataset_id or name_of(out)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
-    with held(out, overwrite, foreign_in):
-        for split, files in contents.files.items():
-            for dataset in map(TerrainDataset, files):
-                for indices, maps in dataset.chunks(split):
-                    _check(dataset, split, indices, maps)
-                    done += len(indices)
-                    yield done, total
+    with held(out, overwrite):
+        for path in dict.fromkeys(chain(*contents.files.values())):
+            if faults := find_faults(path):
+                raise DatasetError(
+                    f"{path} is damaged: {faults[0]}. Run `benchnav-datagen validate` on it, which says how to make "
+                    "it anew."
+                )
+            done += sum(entry["maps"] for entry in TerrainDataset(path).splits.values())
+            yield done, total
         if is_one_file(out):
             assemble(contents, out.parent, out)
             return
@@ -94,7 +96,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
         own = [recipe_from_dict(data, f"in {dataset.path}") for data in dataset.manifest["recipes"]]
         recipes += [recipe for recipe in own if recipe not in recipes]
         for name, entry in dataset.splits.items():
-            files.setdefault(name, []).extend(piece.path for piece in dataset.pieces(name))
+            files.setdefault(name, []).extend(piece.path for piece in dataset.pieces[name])
             gathered = splits.setdefault(name, {"scenario": entry["scenario"], "maps": 0, "parts": []})
             gathered["maps"] += entry["maps"]
             for part in entry["parts"]:
@@ -180,16 +182,3 @@ def _fingerprints(dataset: TerrainDataset) -> np.ndarray:
     column = dataset.field_names.index("elevation_m")
     digests = np.concatenate([dataset.entry_digests(split) for split in dataset.splits])
     return np.ascontiguousarray(digests[:, column]).view(f"S{schema.DIGEST_BYTES}").ravel()
-
-
-def _check(dataset: TerrainDataset, split: str, indices: Sequence[int], maps: Maps) -> None:
-    """Holds maps against their digests.
-
-    Raises:
-        DatasetError: one does not match.
-    """
-    if not np.array_equal(dataset.entry_digests(split, indices), schema.entry_digests(maps, dataset.fields)):
-        raise DatasetError(
-            f"Maps of split {split!r} in {dataset.path} do not match their digests. "
-            "Run `benchnav-datagen validate` on it, which says how to make it anew."
-        )

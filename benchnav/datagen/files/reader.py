@@ -178,7 +178,18 @@ class TerrainDataset:
         chosen = range(size) if indices is None else np.asarray(indices).tolist()
         if not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
-        return self._read(split, names, chosen)
+
+        def run_of(item: tuple[int, int]) -> tuple[Path, int]:
+            place, index = item
+            return self._piece_of(split, index).path, index - place
+
+        runs = []  # of maps that follow one another in a file
+        for _, items in groupby(enumerate(chosen), run_of):
+            run = [index for _, index in items]
+            runs.append(self.read_run(split, run[0], len(run), names))
+        if not runs:
+            return self.read_run(split, 0, 0, names)
+        return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
@@ -186,8 +197,7 @@ class TerrainDataset:
         Raises:
             DatasetError: no such split, or a stored chunk is damaged.
         """
-        chosen = range(self.map_count(split)) if indices is None else indices
-        return self._read(split, (schema.ENTRY_DIGESTS,), chosen)[schema.ENTRY_DIGESTS]
+        return self.read(split, indices, (schema.ENTRY_DIGESTS,))[schema.ENTRY_DIGESTS]
 
     def chunks(
         self, split: str, fields: Collection[str] | None = None, cells: int = CHUNK_CELLS
@@ -210,10 +220,8 @@ class TerrainDataset:
 
     def terrain_chunks(self, split: str) -> "Iterator[Terrain]":
         """Reads a split as Terrain, some maps at a time, as `chunks` does."""
-        from benchnav.datagen.files.terrain import terrain_of
-
-        for _, maps in self.chunks(split, schema.MAP_FIELDS):
-            yield terrain_of(maps, self.recipe)
+        for indices, _ in self.chunks(split, fields=()):
+            yield self.terrain(split, indices)
 
     def check_fields(self, names: Collection[str]) -> Collection[str]:
         """Gives names of fields back.
@@ -221,18 +229,14 @@ class TerrainDataset:
         Raises:
             DatasetError: maps have no such field.
         """
-        unknown = [name for name in names if name not in self.fields]
+        unknown = [name for name in names if name not in (*self.fields, schema.ENTRY_DIGESTS)]
         if unknown:
             raise DatasetError(f"Expected `fields` among {list(self.fields)}, got {unknown}.")
         return names
 
-    def pieces(self, split: str) -> list[Piece]:
-        """The files that hold a split's maps, in their order."""
-        self.map_count(split)
-        return self._pieces[split]
-
     @cached_property
-    def _pieces(self) -> dict[str, list[Piece]]:
+    def pieces(self) -> dict[str, list[Piece]]:
+        """By split the files that hold its maps, in their order."""
         pieces: dict[str, list[Piece]] = {split: [] for split in self.splits}
         for split, own in pieces.items():
             one = [{"file": "", "maps": self.splits[split]["maps"]}]
@@ -245,25 +249,10 @@ class TerrainDataset:
     @cached_property
     def files(self) -> set[Path]:
         """The files that hold maps."""
-        return {piece.path for pieces in self._pieces.values() for piece in pieces}
-
-    def _read(self, split: str, names: Collection[str], indices: Sequence[int]) -> Maps:
-        """Reads maps run by run: those that follow one another in a file together."""
-
-        def run_of(item: tuple[int, int]) -> tuple[Path, int]:
-            place, index = item
-            return self._piece_of(split, index).path, index - place
-
-        runs = []
-        for _, items in groupby(enumerate(indices), run_of):
-            run = [index for _, index in items]
-            runs.append(self.read_run(split, run[0], len(run), names))
-        if not runs:
-            return self.read_run(split, 0, 0, names)
-        return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
+        return {piece.path for pieces in self.pieces.values() for piece in pieces}
 
     def _piece_of(self, split: str, index: int) -> Piece:
-        pieces = self._pieces[split]
+        pieces = self.pieces[split]
         return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1]
 
     def read_run(self, split: str, first: int, count: int, names: Collection[str]) -> Maps:
@@ -335,7 +324,10 @@ def open_file(path: Path) -> h5py.File:
     try:
         return h5py.File(path, "r")
     except FileNotFoundError as error:
-        raise DatasetError(f"Expected a dataset file, got {path}, which is not there any more.") from error
+        raise DatasetError(
+            f"Expected a dataset file, got {path}, which is not there. "
+            "Make one with `benchnav-datagen create`."
+        ) from error
     except OSError as error:
         raise DatasetError(f"{path} is no readable HDF5 file: {error}. Make it again.") from error
 
@@ -354,11 +346,6 @@ def read_manifest(path: Path) -> dict[str, Any]:
     Raises:
         DatasetError: there is none, or it is damaged, foreign, or of a newer format.
     """
-    if not path.exists():
-        raise DatasetError(
-            f"Expected a dataset file, got {path}, which is not there. "
-            "Make one with `benchnav-datagen create`."
-        )
     try:
         text = _manifest_text(path)
         manifest = json.loads(text)

@@ -67,11 +67,6 @@ class TerrainClass:
             f"got {self.scale}, {self.exponent} and {self.noise}.",
         )
 
-    @property
-    def hex_colour(self) -> str:
-        """Its colour as #rrggbb."""
-        return f"#{bytes(self.colour).hex()}"
-
 
 def look_alike_classes(classes: tuple[TerrainClass, ...]) -> list[tuple[int, ...]]:
     """Classes that share a colour, by class: of each class those that look like it, itself among them."""

@@ -44,17 +44,17 @@ def deal_units(units: tuple[AlikeClasses, ...], shown: int, environments: int) -
     Returns:
         Class indices, distinct in each row, shape [E, M].
     """
-    steps, times = list(dict.fromkeys(strides(len(units)))), np.zeros(len(units), dtype=np.int64)
-    place = np.empty((len(steps), len(units)), dtype=np.int64)
-    for row, stride in enumerate(steps):
-        place[row, stride * np.arange(len(units)) % len(units)] = np.arange(len(units))
-    table = np.empty((environments, shown), dtype=np.int64)
-    for environment in range(environments):
-        order = np.lexsort((place[times % len(steps), np.arange(len(units))], times))
-        dealt = _fill([int(unit) for unit in order], units, shown)
-        times[dealt] += 1
-        table[environment] = [member for unit in dealt for member in units[unit]]
-    return table
+    count, times = len(units), [0] * len(units)
+    # By stride, the place of each unit in the pack.
+    places = [np.argsort(stride * np.arange(count) % count) for stride in dict.fromkeys(strides(count))]
+    table = []
+    for _ in range(environments):
+        order = sorted(range(count), key=lambda unit: (times[unit], places[times[unit] % len(places)][unit]))
+        dealt = _fill(order, units, shown)
+        for unit in dealt:
+            times[unit] += 1
+        table.append([member for unit in dealt for member in units[unit]])
+    return np.array(table)
 
 
 def never_shown(units: tuple[AlikeClasses, ...], shown: int) -> list[AlikeClasses]:

@@ -23,10 +23,8 @@ def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainCla
     scale, exponent, offset = (
         np.array([getattr(c, name) for c in classes]) for name in ("scale", "exponent", "offset")
     )
-    loss = slope_deg ** np.take(exponent, class_id)
-    loss *= np.take(scale * 1e-3, class_id)
-    loss += np.take(offset, class_id)
-    return np.minimum(np.maximum(1 - loss, 0), 1)
+    loss = slope_deg ** np.take(exponent, class_id) * np.take(scale * 1e-3, class_id)
+    return np.clip(1 - (loss + np.take(offset, class_id)), 0, 1)
 
 
 def latent_std(class_id: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:

@@ -304,7 +304,7 @@ def _check_environments(recipe: Recipe) -> None:
         len(shares) <= len(classes),
         f"at most {len(classes)} shares in `occupancy`, one a class, got {len(shares)}.",
     )
-    most = FIELDS["environment"].most
+    most = np.iinfo(FIELDS["environment"].dtype).max
     expect(1 <= recipe.environments <= most, f"`environments` in 1–{most}, got {recipe.environments}.")
     expect(
         periods and all(recipe.resolution_m <= period < np.inf for period in periods),

@@ -23,10 +23,7 @@ def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
     flat = noise.reshape(len(noise), -1)
     edges = np.round(np.cumsum(occupancy)[:-1] * flat.shape[1]).astype(int)
     levels = np.sort(flat, axis=1)[:, edges[edges < flat.shape[1]]]
-    bands = np.zeros(flat.shape, dtype=np.int64)
-    for level in levels.T:
-        bands += flat >= level[:, None]
-    return bands.reshape(noise.shape)
+    return (flat[:, None] >= levels[:, :, None]).sum(axis=1).reshape(noise.shape)
 
 
 def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
@@ -61,12 +58,8 @@ def shade(elevation_m: ndarray, resolution_m: float, light: ndarray, ambient: fl
 def lambert(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) -> ndarray:
     """Brightness of ground of the given ∂z/∂x and ∂z/∂y; see `shade`, shape [B, H, W]."""
     x, y, z = (light[:, k, None, None] for k in range(3))
-    cosine = z - x * along_x - y * along_y
-    cosine /= np.sqrt(1 + along_x * along_x + along_y * along_y)
-    np.maximum(cosine, 0, out=cosine)
-    cosine *= 1 - ambient
-    cosine += ambient
-    return cosine
+    cosine = (z - x * along_x - y * along_y) / np.sqrt(1 + along_x * along_x + along_y * along_y)
+    return np.maximum(cosine, 0) * (1 - ambient) + ambient
 
 
 def paint(class_id: ndarray, colours: ndarray, brightness: ndarray) -> ndarray:
@@ -80,9 +73,5 @@ def paint(class_id: ndarray, colours: ndarray, brightness: ndarray) -> ndarray:
     Returns:
         Image, uint8, shape [B, 3, H, W].
     """
-    image = np.empty((len(class_id), 3, *class_id.shape[1:]), dtype=np.uint8)
-    for channel in range(3):
-        lit = np.take(colours[:, channel], class_id)
-        lit *= brightness
-        image[:, channel] = np.rint(lit, out=lit)
-    return image
+    lit = np.take(colours.T, class_id, axis=1) * brightness
+    return np.moveaxis(np.rint(lit).astype(np.uint8), 0, 1)

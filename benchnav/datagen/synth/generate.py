@@ -4,6 +4,8 @@ Elevation is quantised first; slope, shading and λ are derived from what is sto
 float64. Letters in shapes: B maps, H×W cells.
 """
 
+from functools import partial
+
 import numpy as np
 from numpy import ndarray
 
@@ -54,8 +56,9 @@ def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
         if not recipe.splits[split].solvable:
             return {**drawn, "reference_time_s": np.full(len(indices), np.nan)}
         drawn["reference_time_s"] = reference_time_s(recipe, drawn)
+        maps = maps or drawn
         for name, values in drawn.items():
-            maps.setdefault(name, np.empty((len(indices), *values.shape[1:]), values.dtype))[pending] = values
+            maps[name][pending] = values
         pending = pending[~np.isfinite(drawn["reference_time_s"])]
         if len(pending) == 0:
             return maps
@@ -121,31 +124,27 @@ def complete(
     Returns:
         The fields of `schema.FIELDS` but `reference_time_s`.
     """
-
-    def key(purpose: str) -> int:
-        return rng.stream_key(recipe.seed, split, purpose, attempt)
-
+    key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
     ground = quantise(framed_m, 13)
     gradient = framed_gradient(ground, recipe.resolution_m)
     slope = quantise(inclination_deg(*gradient), 10)
-    azimuth, lift = rng.uniform(key("light"), indices, (2,)).T
+    azimuth, lift = rng.uniform(key("light", attempt), indices, (2,)).T
     light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
-    noise_key, shape = key("traversability"), recipe.grid.shape
+    noise_key, shape = key("traversability", attempt), recipe.grid.shape
     if recipe.synthesis == 1:
-        noise = rng.normal(noise_key, indices, shape) * latent.latent_std(class_id, recipe.classes)
-        realised = np.clip(latent.latent_mean(class_id, slope, recipe.classes) + noise, 0, 1)
+        noise = rng.normal(noise_key, indices, shape)
     else:
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
-        realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
+    realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
     brightness = appearance.lambert(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
-        start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places"), indices)
+        start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places", attempt), indices)
     return {
         "rgb": appearance.paint(class_id, colours, brightness),
         "class_id": class_id,
@@ -160,23 +159,22 @@ def complete(
 
 def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
     """Draws maps that may or may not be solvable; see `complete`."""
-
-    def key(purpose: str) -> int:
-        return rng.stream_key(recipe.seed, split, purpose, attempt)
-
+    key = partial(rng.stream_key, recipe.seed, split)
     grid, scenario = recipe.grid, recipe.scenarios[recipe.splits[split].scenario]
     if recipe.synthesis == 1:
-        ground = elevation.fractal(key("elevation"), indices, grid.shape, scenario.roughness)
+        ground = elevation.fractal(key("elevation", attempt), indices, grid.shape, scenario.roughness)
     else:
         cells = max(3, round(REFERENCE_M / recipe.resolution_m))
-        ground = elevation.open_fractal(key("elevation"), indices, grid.shape, scenario.roughness, cells)
-    relief, crowding = rng.uniform(key("relief"), indices, (2,)).T
+        ground = elevation.open_fractal(
+            key("elevation", attempt), indices, grid.shape, scenario.roughness, cells
+        )
+    relief, crowding = rng.uniform(key("relief", attempt), indices, (2,)).T
     ground *= _within(scenario.relief_m, relief)[:, None, None]
     low, high = recipe.craters(scenario)
     if high > 0:
         count = low + np.floor((high - low + 1) * crowding)
         craters = elevation.place_craters(
-            key("craters"), indices, grid.extent_m, count, scenario.crater_radius_m, high
+            key("craters", attempt), indices, grid.extent_m, count, scenario.crater_radius_m, high
         )
         ground += elevation.crater_elevation(
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio

@@ -38,9 +38,7 @@ def framed_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, nd
     smooth_y, smooth_x = pairs_y[:, 1:] + pairs_y[:, :-1], pairs_x[:, :, 1:] + pairs_x[:, :, :-1]
     along_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
     along_y = smooth_x[:, 2:] - smooth_x[:, :-2]
-    along_x /= 8 * resolution_m
-    along_y /= 8 * resolution_m
-    return along_x, along_y
+    return along_x / (8 * resolution_m), along_y / (8 * resolution_m)
 
 
 def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
@@ -53,9 +51,7 @@ def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
     Returns:
         Degrees in [0, 90), shape of `along_x`.
     """
-    angle = np.arctan(np.sqrt(along_x * along_x + along_y * along_y))
-    angle *= 180 / np.pi
-    return angle
+    return np.arctan(np.sqrt(along_x * along_x + along_y * along_y)) * (180 / np.pi)
 
 
 def framed(elevation_m: ndarray) -> ndarray:

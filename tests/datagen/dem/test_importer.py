@@ -134,10 +134,10 @@ def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path, monkeypatch: 
     assert folder.path.is_dir()
     assert file.digest == folder.digest
     assert file.splits == folder.splits
-    assert [piece.maps for piece in folder.pieces("train")] == [4, 4, 4, 4]
+    assert [piece.maps for piece in folder.pieces["train"]] == [4, 4, 4, 4]
     for split in shares:
         source = folder.splits[split]["parts"][0]["source"]
-        for piece in folder.pieces(split):
+        for piece in folder.pieces[split]:
             shard = TerrainDataset(piece.path)
             assert find_faults(piece.path) == []
             (part,) = shard.splits[split]["parts"]

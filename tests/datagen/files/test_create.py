@@ -188,7 +188,7 @@ def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path) -> None:
     assert folder.digest == file.digest
     assert folder.manifest["format_version"] == "1.2"
     assert file.manifest["format_version"] == "1.0"
-    assert [piece.maps for piece in folder.pieces("train")] == [3, 3, 2]
+    assert [piece.maps for piece in folder.pieces["train"]] == [3, 3, 2]
     for indices in (None, [7, 0, 3, 3], [], [2], range(2, 7)):
         for name, values in folder.read("train", indices).items():
             np.testing.assert_array_equal(values, file.read("train", indices)[name])
