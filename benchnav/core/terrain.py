@@ -33,13 +33,7 @@ class Observation:
     def __post_init__(self) -> None:
         """Checks that the layers fit the grid and one another."""
         batch = self.rgb.shape[0]
-        for name in ("elevation_m", "slope_deg"):
-            shape = getattr(self, name).shape
-            expect(
-                shape == (batch, *self.grid.shape),
-                f"`{name}` of shape [{batch}, {self.grid.height}, {self.grid.width}], got {list(shape)}. "
-                "Pass a batch of maps on one grid.",
-            )
+        _check_shapes(self.grid, batch, elevation_m=self.elevation_m, slope_deg=self.slope_deg)
         expect(
             self.rgb.dtype == torch.uint8 and self.rgb.shape == (batch, 3, *self.grid.shape),
             f"`rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
@@ -75,6 +69,18 @@ class Terrain:
     grid: Grid
     look_alikes: Callable[[Tensor, Tensor], TraversabilityMixture] | None = None
 
+    def __post_init__(self) -> None:
+        """Checks that the layers fit the grid and one another."""
+        _check_shapes(
+            self.grid,
+            self.rgb.shape[0],
+            class_id=self.class_id,
+            elevation_m=self.elevation_m,
+            slope_deg=self.slope_deg,
+            truth=self.truth.weights.select(-3, 0),
+            traversability=self.traversability,
+        )
+
     def __len__(self) -> int:
         """Number of maps B."""
         return self.rgb.shape[0]
@@ -90,3 +96,12 @@ class Terrain:
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""
         return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid)
+
+
+def _check_shapes(grid: Grid, batch: int, **layers: Tensor) -> None:
+    for name, layer in layers.items():
+        expect(
+            layer.shape == (batch, *grid.shape),
+            f"`{name}` of shape [{batch}, {grid.height}, {grid.width}], got {list(layer.shape)}. "
+            "Pass a batch of maps on one grid.",
+        )

@@ -33,12 +33,16 @@ class Field:
         dtype: NumPy dtype in little-endian order.
         shape: shape of one map's entry; "H" and "W" stand for the grid.
         unit: SI unit, or "1".
+        least: smallest value allowed.
+        most: largest value allowed.
         meaning: one line for readers.
     """
 
     dtype: str
     shape: tuple[str | int, ...]
     unit: str
+    least: float
+    most: float
     meaning: str
 
     def entry_shape(self, height: int, width: int) -> tuple[int, ...]:
@@ -51,23 +55,25 @@ Fields = Mapping[str, Field]  # by name, in the order of being stored
 
 # What every dataset has.
 FIELDS: dict[str, Field] = {
-    "rgb": Field("|u1", (3, "H", "W"), "1", "top-down colour image, shaded"),
-    "class_id": Field("|u1", ("H", "W"), "1", "index into the class table"),
-    "elevation_m": Field("<f4", ("H", "W"), "m", "elevation, in steps of 2^-13 m"),
-    "slope_deg": Field("<f4", ("H", "W"), "deg", "slope by Horn's method, in steps of 2^-10 deg"),
-    "traversability": Field("<f4", ("H", "W"), "1", "realised traversability, in steps of 2^-16"),
-    "environment": Field("<i2", (), "1", "environment of the map"),
-    "start_m": Field("<f4", (2,), "m", "start position (x, y)"),
-    "goal_m": Field("<f4", (2,), "m", "goal position (x, y)"),
+    "rgb": Field("|u1", (3, "H", "W"), "1", 0, 255, "top-down colour image, shaded"),
+    "class_id": Field("|u1", ("H", "W"), "1", 0, 255, "index into the class table"),
+    "elevation_m": Field("<f4", ("H", "W"), "m", -1e4, 1e4, "elevation, in steps of 2^-13 m"),
+    "slope_deg": Field("<f4", ("H", "W"), "deg", 0, 90, "slope by Horn's method, in steps of 2^-10 deg"),
+    "traversability": Field("<f4", ("H", "W"), "1", 0, 1, "realised traversability, in steps of 2^-16"),
+    "environment": Field("<i2", (), "1", 0, 32767, "environment of the map"),
+    "start_m": Field("<f4", (2,), "m", 0, 1e6, "start position (x, y)"),
+    "goal_m": Field("<f4", (2,), "m", 0, 1e6, "goal position (x, y)"),
     "reference_time_s": Field(
-        "<f4", (), "s", "grid reference time at a commanded 1 m/s; NaN where not asked for"
+        "<f4", (), "s", 0, np.inf, "grid reference time at a commanded 1 m/s; NaN where not asked for"
     ),
 }
 
 
 # What a dataset may have beside.
 OPTIONAL: dict[str, Field] = {
-    "group": Field("<i8", (), "1", "maps of one number overlap, directly or by others between them"),
+    "group": Field(
+        "<i8", (), "1", 0, 2**53, "maps of one number overlap, directly or by others between them"
+    ),
 }
 
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
@@ -126,10 +132,14 @@ def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fi
     """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
     if set(fields) - set(FIELDS):
         return "1.3"
-    sources = [part.get("source", {}) for entry in splits for part in entry["parts"]]
-    if any(sum(source.get("unlabelled", ())) > 0 for source in sources):
+    if any(has_unlabelled(entry) for entry in splits):
         return "1.2"
     return "1.1" if max(synthesis) > 1 else "1.0"
+
+
+def has_unlabelled(entry: Mapping[str, Any]) -> bool:
+    """Tells by a split's entry in the manifest whether some of its cells have no class."""
+    return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
 def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
@@ -146,7 +156,7 @@ def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
 
 
 def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
-    """Gives the fields that a manifest describes, in its order.
+    """Gives the fields that a manifest describes, in its order; of those that are not ours any value is allowed.
 
     Raises:
         KeyError, TypeError, ValueError: one of `FIELDS` is not among them, or one is not as it should be.
@@ -159,7 +169,7 @@ def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
     for name, about in table.items():
         dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
         symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
-        foreign = Field(dtype, symbols, about["unit"], about["meaning"])
+        foreign = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
         fields[name] = (FIELDS | OPTIONAL).get(name, foreign)
     return fields
 

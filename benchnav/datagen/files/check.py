@@ -1,4 +1,4 @@
-"""Checks a whole dataset: schema, per-chunk checksums, entry digests, split digests."""
+"""Checks a whole dataset: schema, per-chunk checksums, entry digests, ranges, split digests."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -107,6 +107,8 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                     if name == schema.ENTRY_DIGESTS:
                         stored[maps], is_stored[maps] = values, True
                         continue
+                    for index in _out_of_range(dataset, split, name, values):
+                        yield first + index, name, "is out of range", own
                     digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
                     computed[maps, fields.index(name)] = digests[:, 0]
     readable = computed.any(axis=2)
@@ -135,3 +137,16 @@ def _read_some(array: h5py.Dataset) -> Iterator[tuple[int, np.ndarray | None]]:
                 with suppress(*READ_ERRORS):
                     values = array[index : index + 1]
                 yield index, values
+
+
+def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.ndarray) -> list[int]:
+    """Which maps have a value that may not be."""
+    field = dataset.fields[name]
+    most = len(dataset.recipe.classes) - 1 if name == "class_id" else field.most
+    allowed = (values >= field.least) & (values <= most)
+    if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
+        allowed |= values == schema.UNLABELLED
+    # Not asked for; not observed; what a field that is not ours means by it, it may mean.
+    if name in ("reference_time_s", "traversability") or name not in schema.FIELDS | schema.OPTIONAL:
+        allowed |= np.isnan(values)
+    return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

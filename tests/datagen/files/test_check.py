@@ -60,9 +60,10 @@ def test_changed_values_with_sound_checksums_are_named_by_map_and_field(tmp_path
         file["test/hs/traversability"][1, 2, 3] = 1.5
         file["train/elevation_m"][2, 0, 0] += 2.0**-13
         file["train/goal_m"][4] = [1, 1]
-        file["valid/traversability"][0, 5, 5] = np.nan
+        file["valid/traversability"][0, 5, 5] = np.nan  # as of a cell not observed: in range
     found = {str(fault) for fault in find_faults(path)}
     assert found == {
+        "test/hs: map 1: field 'traversability' is out of range",
         "test/hs: map 1: field 'traversability' does not match its digest",
         "train: map 2: field 'elevation_m' does not match its digest",
         "train: map 4: field 'goal_m' does not match its digest",
@@ -152,3 +153,10 @@ def test_damaged_shards_are_named_and_they_alone_made_anew(tmp_path: Path) -> No
     assert TerrainDataset(path).digest == digest
     assert same(content(path), before)
     assert all(file.stat().st_mtime_ns == when for file, when in kept.items())
+
+
+def test_a_cell_without_a_class_is_a_fault_where_none_was_said_to_be(tmp_path: Path) -> None:
+    path = tiny_dataset(tmp_path / "d.h5")
+    with h5py.File(path, "r+") as file:
+        file["train/class_id"][5, 2, 3] = schema.UNLABELLED
+    assert Fault("train", 5, "class_id", "is out of range") in find_faults(path)
