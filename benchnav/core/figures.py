@@ -48,6 +48,7 @@ LINE_COLOURS = COLOURS[:-1]
 BLIND = "0.45"
 
 TRAVERSABILITY_COLOURS = "viridis"
+_HATCH_CELLS = 4
 # Of cells of which nothing is known.
 LACKING = "0.7"
 
@@ -157,6 +158,41 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     width, height = map(float, extent_m)
     panel.set(xlim=(0, width), ylim=(0, height))
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
+
+
+def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Finds the edges between cells of a region and those that are not of it, the map's border among them.
+
+    Args:
+        region: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+
+    Returns:
+        Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
+    """
+    framed = np.pad(region, 1)
+    rows, columns = np.nonzero(framed[1:, 1:-1] != framed[:-1, 1:-1])
+    along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
+    rows, columns = np.nonzero(framed[1:-1, 1:] != framed[1:-1, :-1])
+    along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
+    edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
+    return (edges * resolution_m).astype(np.float32)
+
+
+def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Draws diagonals through a region, which tell it from what it surrounds.
+
+    Args:
+        region: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+
+    Returns:
+        Both ends (x, y) of each diagonal of a cell in metres, float32, shape [M, 2, 2].
+    """
+    rows, columns = np.nonzero(region)
+    drawn = (rows - columns) % _HATCH_CELLS == 0
+    corners = np.stack((columns[drawn], rows[drawn]), axis=1)
+    return (np.stack((corners, corners + 1), axis=1) * resolution_m).astype(np.float32)
 
 
 def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **shared: Any) -> list[Any]:
