@@ -28,7 +28,7 @@ _PIECE = 10
 # An X in one stroke, and its half width.
 _CROSS = np.array([(-1, -1), (1, 1), (0, 0), (-1, 1), (1, -1)], dtype=np.float32)
 _CROSS_M = 1.0
-_MARK, _EDGE = (255, 255, 255), (0, 0, 0)
+_MARK = (255, 255, 255)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,12 +147,9 @@ def log_outcome(stream: Any, driver: Driver) -> None:
         stream, recording, driver.entities("outcome"), POINTS, [recording.track[-1]],
         (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[bytes_of(driver.colour)],
     )  # fmt: skip
-    if recording.immobilised_at is None:
-        return
-    cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
-    lifted, flat = over_ground(recording, cross, LIFT_M + 0.3), on_map(recording.grid, cross)
-    world, overlay = driver.entities("immobilised")
-    stream.log(world, rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12))
-    for name, colour, radius, order in (("edge", _EDGE, 0.55, 40), ("cross", _MARK, 0.3, 41)):
-        crossed = rr.LineStrips2D([flat], colors=[colour], radii=radius, draw_order=order)
-        stream.log(f"{overlay}/{name}", crossed)
+    if recording.immobilised_at is not None:
+        cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
+        log_both(
+            stream, recording, driver.entities("immobilised"), STRIPS, [cross], (0.12, 0.3), LIFT_M + 0.3,
+            colors=[_MARK],
+        )  # fmt: skip

@@ -144,7 +144,7 @@ def test_an_immobilised_robot_is_crossed_out_from_that_moment_on(tmp_path: Path)
     flat = (x / 0.5, 40 - y / 0.5)
     for entity, place, size in (
         ("/world/immobilised", (x, y), 2),
-        ("/map/overlay/immobilised/cross", flat, 4),
+        ("/map/overlay/immobilised", flat, 4),
     ):
         times, ((cross,),) = column(path, entity, "strips")  # type: ignore[misc]
         np.testing.assert_allclose(times, [4.3], atol=1e-6)
