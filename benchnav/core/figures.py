@@ -8,7 +8,7 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -18,7 +18,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
-from matplotlib.transforms import Bbox
 
 from benchnav.core.store import replacing
 
@@ -222,9 +221,9 @@ def legend_outside(
     figure: Figure,
     handles: Sequence[Artist] = (),
     columns: int = 4,
-    side: Literal["lower", "upper"] = "lower",
+    side: str = "lower center",
 ) -> Legend:
-    """Lays a legend under or over the panels: what has a label in them, once each, then the handles.
+    """Lays a legend beside the panels, at a side of the figure: what has a label in them, once each, then the handles.
 
     A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
     """
@@ -232,8 +231,7 @@ def legend_outside(
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
-    loc: Any = f"outside {side} center"
-    return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
+    return figure.legend(handles=[*labelled.values(), *handles], loc=f"outside {side}", ncols=columns)
 
 
 def frame_map(panel: Axes) -> None:
@@ -242,9 +240,7 @@ def frame_map(panel: Axes) -> None:
     panel.spines[:].set_visible(True)
 
 
-def save(
-    figure: Figure, path: Path, kind: str, dpi: float | str = "figure", part: Bbox | None = None
-) -> None:
+def save(figure: Figure, path: Path, kind: str, dpi: float | str = "figure", trim: bool = False) -> None:
     """Writes a figure with its fonts embedded.
 
     Args:
@@ -252,10 +248,10 @@ def save(
         path: file to write.
         kind: png, pdf, svg or jpg.
         dpi: dots an inch; those of the figure where not given.
-        part: what of it is written, in inches; all where not given.
+        trim: cut white borders away.
     """
     with matplotlib.rc_context(_SAVED):
-        figure.savefig(path, format=kind, dpi=dpi, bbox_inches=part)
+        figure.savefig(path, format=kind, dpi=dpi, bbox_inches="tight" if trim else None, pad_inches=0.05)
 
 
 def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI) -> None:
@@ -273,7 +269,6 @@ def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI)
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
-    part = Bbox(figure.get_tightbbox()).padded(0.05) if trim else None
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
-            save(figure, partial, suffix[1:], dpi, part)
+            save(figure, partial, suffix[1:], dpi, trim)

@@ -48,7 +48,7 @@ _PAGE, _DPI = 9.4, 300.0
 _SIDES, _ENDS = 0.7, 1.5  # what is not maps of a sheet's width and height
 _LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.15
 _HATCH = "//////"
-_READ_MAPS, _MOST_THUMBNAILS = 20, 100
+_MOST_THUMBNAILS = 100
 _MARK_SIZE = 0.75
 _SHADES = matplotlib.colormaps[TRAVERSABILITY_COLOURS].with_extremes(bad=LACKING)
 LACKING_PATCH = Patch(facecolor=LACKING, label="not known")
@@ -261,15 +261,13 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     sheet.axis("off")
     halo: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
     for index in range(count):
-        place = index % _READ_MAPS
-        if not place:
-            block = dataset.read(split, range(index, min(index + _READ_MAPS, count)), fields)
+        stored = {name: values[0] for name, values in dataset.read(split, [index], fields).items()}
         x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
-        image = np.moveaxis(block["rgb"][place], 0, -1)
-        if "class_id" in block:
-            values = np.ma.masked_invalid(block["traversability"][place])
+        image = np.moveaxis(stored["rgb"], 0, -1)
+        if "class_id" in stored:
+            values = np.ma.masked_invalid(stored["traversability"])
             image = np.concatenate([image, _SHADES(values, bytes=True)[..., :3]], axis=1)
-            edges = outline(soft_ground(block["class_id"][place], classes), high / grid.height)
+            edges = outline(soft_ground(stored["class_id"], classes), high / grid.height)
             # The page counts inches downward.
             _draw_soft_ground(sheet, edges * (1, -1) + (x, y + high), line=0.2)
         box = (x, x + wide, y + high, y)

@@ -319,4 +319,4 @@ def _grid(
 def _explain(figure: Figure, most: int = 4) -> None:
     """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
     columns = most if figure.get_figwidth() == TWO_COLUMNS_IN else 2
-    legend_outside(figure, columns=columns, side="upper")
+    legend_outside(figure, columns=columns, side="upper center")

@@ -169,25 +169,17 @@ def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.D
 
     Of the part that is swept it is the name alone, since its label holds the number.
     """
-    table = []
-    for line in lines:
-        first = rows.loc[line.conditions[0]]
-        labels = {name: first[name] for name in ("model", "planner", "risk", "robot", "objective")}
-        for name, label in labels.items():
-            if number.startswith(f"{name}.") and label != NOT_USED:
-                labels[name] = str(line.rest[f"{name}.part"])
-        world = first["world"]
-        table.append(
-            {
-                "scenario": str(line.rest["split"]).removeprefix("test/"),
-                "data": str(line.rest.get("data", first["data"])),
-                "world": world.split(" ")[0] if number.startswith(("world.", "rules.")) else world,
-                **labels,
-                "planner": first["planner"],
-                "who": planner_name(labels["planner"]),
-            }
-        )
-    labelled = pd.DataFrame(table)
+    labelled = rows.loc[[line.conditions[0] for line in lines]].reset_index(drop=True)
+    labelled["scenario"] = [str(line.rest["split"]).removeprefix("test/") for line in lines]
+    labelled["who"] = labelled["planner"]
+    if number.startswith(("world.", "rules.")):
+        labelled["world"] = labelled["world"].str.partition(" ")[0]
+    part = number.partition(".")[0]
+    column = "who" if part == "planner" else part
+    if f"{part}.part" in lines[0].rest:
+        parts = np.array([line.rest.get(f"{part}.part") for line in lines])
+        labelled[column] = labelled[column].where(labelled[column] == NOT_USED, parts)
+    labelled["who"] = labelled["who"].map(planner_name)
     names = {}
     for _, alike in labelled.groupby(list(_LABELS), sort=False):
         rests = [lines[place].rest for place in alike.index]

@@ -119,23 +119,20 @@ def log_driven(stream: Any, driver: Driver) -> None:
 
 def log_plans(stream: Any, driver: Driver) -> None:
     """Logs what was planned, when it was planned; of a robot that is not alone, the path alone."""
-    known: dict[str, list[np.ndarray]] = {}
+    known: dict[str, list[bytes]] = {}
     for plan in map(thinned, driver.recording.own_plans):
         stream.set_time(TIMELINE, duration=plan.step * driver.recording.dt_s)
         for name, style in STYLES.items():
             lines = list(plan.lines.get(name, ()))
+            content = [line.tobytes() for line in lines]
             # A layer without lines is logged too: it wipes out the earlier plan's. One that stays is not.
-            if (driver.name and name != "path") or _same(known.get(name), lines):
+            if (driver.name and name != "path") or known.get(name) == content:
                 continue
-            known[name] = lines
+            known[name] = content
             colours = [bytes_of(driver.colour, 0.628) if driver.name else bytes_of(style.colour)]
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
             entities = driver.entities(f"plan/{name}")
             log_both(stream, driver.recording, entities, STRIPS, lines, radii, colors=colours)
-
-
-def _same(known: list[np.ndarray] | None, lines: list[np.ndarray]) -> bool:
-    return known is not None and len(known) == len(lines) and all(map(np.array_equal, known, lines))
 
 
 def log_outcome(stream: Any, driver: Driver) -> None:
