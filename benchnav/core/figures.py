@@ -221,7 +221,7 @@ def legend_outside(
     figure: Figure,
     handles: Sequence[Artist] = (),
     columns: int = 4,
-    side: str = "lower center",
+    side: Any = "lower center",
 ) -> Legend:
     """Lays a legend beside the panels, at a side of the figure: what has a label in them, once each, then the handles.
 
@@ -231,7 +231,7 @@ def legend_outside(
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
-    return figure.legend(handles=[*labelled.values(), *handles], loc=f"outside {side}", ncols=columns)
+    return figure.legend(handles=[*labelled.values(), *handles], loc="outside " + side, ncols=columns)
 
 
 def frame_map(panel: Axes) -> None:

@@ -205,9 +205,9 @@ def _charts(report: Report) -> Drawn:
         yield f"over-{name}", _SWEEP.format(name), curve_figure(number, lines, summary)
     yield "outcomes", _OUTCOMES, outcome_figure(summary)
     yield "distributions", _DISTRIBUTIONS, distribution_figure(summary, report.episodes)
-    for place, (title, lines) in enumerate(report.sheets.shown, start=1):
+    for place, (title, sheet) in enumerate(report.sheets.shown, start=1):
         name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place}"
-        yield name, _FAILURES.format(title), failure_figure(lines)
+        yield name, _FAILURES.format(title), failure_figure(sheet)
 
 
 def _trajectories(folder: Path, summary: pd.DataFrame) -> Drawn:
