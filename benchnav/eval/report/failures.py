@@ -40,13 +40,15 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
 
 def _ends(steps: pd.DataFrame) -> pd.DataFrame:
     """The last place of each episode, and λ at its end; the last state of an episode has no λ of its own."""
-    from_s = steps.groupby(_KEYS, sort=False)["time_s"].transform("max") - _LAST_S
-    late = steps.assign(late=steps["traversability"].where(steps["time_s"] >= from_s - 1e-9))
-    # Both `last` and `mean` pass over NaN.
-    ends = late.groupby(_KEYS, sort=False).agg(
-        x_m=("x_m", "last"),
-        y_m=("y_m", "last"),
-        end_traversability=("traversability", "last"),
-        last_traversability=("late", "mean"),
+    groups = steps.groupby(_KEYS, sort=False)
+    last = groups[["x_m", "y_m"]].last()
+    met = steps[steps["traversability"].notna()]
+    end = met.groupby(_KEYS, sort=False)["traversability"].last().rename("end_traversability")
+    from_s = groups["time_s"].transform("max") - _LAST_S
+    late = met[met["time_s"] >= from_s.loc[met.index] - 1e-9]
+    mean = late.groupby(_KEYS, sort=False)["traversability"].mean().rename("last_traversability")
+    return (
+        last.join([end, mean])
+        .reset_index()
+        .astype({"x_m": np.float64, "y_m": np.float64, "end_traversability": np.float64})
     )
-    return ends.astype(dict.fromkeys(_ENDS[:3], np.float64)).reset_index()
