@@ -8,7 +8,7 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -18,7 +18,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
-from matplotlib.transforms import Bbox
 
 from benchnav.core.store import replacing
 
@@ -48,6 +47,7 @@ LINE_COLOURS = COLOURS[:-1]
 BLIND = "0.45"
 
 TRAVERSABILITY_COLOURS = "viridis"
+_HATCH_CELLS = 4
 # Of cells of which nothing is known.
 LACKING = "0.7"
 
@@ -159,6 +159,41 @@ def show_map(panel: Axes, values: Any, extent_m: Iterable[float], **style: Any) 
     return panel.imshow(values, origin="lower", extent=(0, width, 0, height), interpolation="none", **style)
 
 
+def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Finds the edges between cells of a region and those that are not of it, the map's border among them.
+
+    Args:
+        region: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+
+    Returns:
+        Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
+    """
+    framed = np.pad(region, 1)
+    rows, columns = np.nonzero(framed[1:, 1:-1] != framed[:-1, 1:-1])
+    along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
+    rows, columns = np.nonzero(framed[1:-1, 1:] != framed[1:-1, :-1])
+    along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
+    edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
+    return (edges * resolution_m).astype(np.float32)
+
+
+def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
+    """Draws diagonals through a region, which tell it from what it surrounds.
+
+    Args:
+        region: bool, shape [H, W].
+        resolution_m: edge length of a cell.
+
+    Returns:
+        Both ends (x, y) of each diagonal of a cell in metres, float32, shape [M, 2, 2].
+    """
+    rows, columns = np.nonzero(region)
+    drawn = (rows - columns) % _HATCH_CELLS == 0
+    corners = np.stack((columns[drawn], rows[drawn]), axis=1)
+    return (np.stack((corners, corners + 1), axis=1) * resolution_m).astype(np.float32)
+
+
 def stack_panels(figure: Figure, count: int, across: int, layers: int = 1, **shared: Any) -> list[Any]:
     """Divides a figure into places, row by row, each with panels under each other; what is left over is removed.
 
@@ -186,9 +221,9 @@ def legend_outside(
     figure: Figure,
     handles: Sequence[Artist] = (),
     columns: int = 4,
-    side: Literal["lower", "upper"] = "lower",
+    side: Any = "lower center",
 ) -> Legend:
-    """Lays a legend under or over the panels: what has a label in them, once each, then the handles.
+    """Lays a legend beside the panels, at a side of the figure: what has a label in them, once each, then the handles.
 
     A figure that has a label of all its x-axes has its legend over the panels, as both would be in one place.
     """
@@ -196,8 +231,7 @@ def legend_outside(
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             labelled.setdefault(label, handle)
-    loc: Any = f"outside {side} center"
-    return figure.legend(handles=[*labelled.values(), *handles], loc=loc, ncols=columns)
+    return figure.legend(handles=[*labelled.values(), *handles], loc="outside " + side, ncols=columns)
 
 
 def frame_map(panel: Axes) -> None:
@@ -206,9 +240,7 @@ def frame_map(panel: Axes) -> None:
     panel.spines[:].set_visible(True)
 
 
-def save(
-    figure: Figure, path: Path, kind: str, dpi: float | str = "figure", part: Bbox | None = None
-) -> None:
+def save(figure: Figure, path: Path, kind: str, dpi: float | str = "figure", trim: bool = False) -> None:
     """Writes a figure with its fonts embedded.
 
     Args:
@@ -216,10 +248,10 @@ def save(
         path: file to write.
         kind: png, pdf, svg or jpg.
         dpi: dots an inch; those of the figure where not given.
-        part: what of it is written, in inches; all where not given.
+        trim: cut white borders away.
     """
     with matplotlib.rc_context(_SAVED):
-        figure.savefig(path, format=kind, dpi=dpi, bbox_inches=part)
+        figure.savefig(path, format=kind, dpi=dpi, bbox_inches="tight" if trim else None, pad_inches=0.05)
 
 
 def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI) -> None:
@@ -237,7 +269,6 @@ def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI)
     if engine is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
-    part = Bbox(figure.get_tightbbox()).padded(0.05) if trim else None
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
-            save(figure, partial, suffix[1:], dpi, part)
+            save(figure, partial, suffix[1:], dpi, trim)

@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -28,8 +29,10 @@ from benchnav.core.figures import (
     TRAVERSABILITY_COLOURS,
     TWO_COLUMNS_IN,
     frame_map,
+    hatching,
     mark,
     mark_handle,
+    outline,
     show_map,
     styled,
 )
@@ -45,7 +48,7 @@ _PAGE, _DPI = 9.4, 300.0
 _SIDES, _ENDS = 0.7, 1.5  # what is not maps of a sheet's width and height
 _LINE, _LETTER, _COLUMN = 0.135, 0.054, 1.15
 _HATCH = "//////"
-_READ_MAPS, _MOST_THUMBNAILS = 20, 100
+_MOST_THUMBNAILS = 100
 _MARK_SIZE = 0.75
 _SHADES = matplotlib.colormaps[TRAVERSABILITY_COLOURS].with_extremes(bad=LACKING)
 LACKING_PATCH = Patch(facecolor=LACKING, label="not known")
@@ -114,9 +117,9 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         marks,
     )
     panels = {str(panel.get_label()): panel for panel in figure.axes}
-    veils = _hillshade(maps["elevation_m"], maps["slope_deg"], grid.resolution_m)
-    extent = (0.0, grid.extent_m[0], 0.0, grid.extent_m[1])
-    y, x = ((np.arange(cells) + 0.5) * grid.resolution_m for cells in grid.shape)
+    resolution_m = grid.resolution_m
+    veils = _hillshade(maps["elevation_m"], maps["slope_deg"], resolution_m)
+    y, x = ((np.arange(cells) + 0.5) * resolution_m for cells in grid.shape)
     for row in range(len(indices)):
         show_map(panels[f"elevation_m {row}"], veils[row], grid.extent_m)
         heights = maps["elevation_m"][row]
@@ -124,8 +127,11 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         if len(crossed):
             looks_of = {"colors": "black", "linewidths": 0.35, "alpha": 0.7}
             panels[f"elevation_m {row}"].contour(x, y, heights, levels=crossed, **looks_of)
-        _draw_soft_ground(panels[f"class_id {row}"], soft[row], extent, hatched=True)
-        _draw_soft_ground(panels[f"traversability {row}"], soft[row], extent)
+        if soft[row].any():
+            hatched = LineCollection(list(hatching(soft[row], resolution_m)), colors="black", linewidths=0.4)
+            panels[f"class_id {row}"].add_collection(hatched)
+            for name in ("class_id", "traversability"):
+                _draw_soft_ground(panels[f"{name} {row}"], outline(soft[row], resolution_m))
         for column in columns:
             for name in ("start", "goal"):
                 mark(panels[f"{column.name} {row}"], name, maps[f"{name}_m"][row], _MARK_SIZE, clip_on=False)
@@ -234,10 +240,9 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    held, grid = dataset.map_count(split), dataset.grid
-    classes = dataset.recipe.classes
-    paired = any(item.soft for item in classes)
-    across = grid.width * (2 if paired else 1)
+    held, grid, classes = dataset.map_count(split), dataset.grid, dataset.recipe.classes
+    fields = ("rgb", "class_id", "traversability") if any(item.soft for item in classes) else ("rgb",)
+    across = grid.width * (2 if len(fields) > 1 else 1)
     count, ratio, gap = min(held, _MOST_THUMBNAILS), grid.height / across, 0.05
     columns = contact_columns(count, ratio)
     wide = min(max((TWO_COLUMNS_IN - gap) / columns, 0.5 / min(1, ratio)), 2.4) - gap
@@ -254,24 +259,21 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
-    outline: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
-    for first in range(0, count, _READ_MAPS):
-        fields = ("rgb", "class_id", "traversability") if paired else ("rgb",)
-        block = dataset.read(split, range(first, min(first + _READ_MAPS, count)), fields)
-        for place, rgb in enumerate(np.moveaxis(block["rgb"], 1, -1)):
-            index = first + place
-            x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
-            image = rgb
-            if paired:
-                values = np.ma.masked_invalid(block["traversability"][place])
-                image = np.concatenate([rgb, _SHADES(values, bytes=True)[..., :3]], axis=1)
-            box = (x, x + wide, y + high, y)
-            sheet.imshow(image, origin="lower", extent=box, aspect="auto", interpolation="none")
-            if paired:
-                soft = soft_ground(block["class_id"][place], classes)
-                _draw_soft_ground(sheet, soft, (x, x + wide / 2, y + high, y), line=0.2)
-            label = sheet.text(x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top")
-            label.set_path_effects(outline)
+    halo: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
+    for index in range(count):
+        stored = {name: values[0] for name, values in dataset.read(split, [index], fields).items()}
+        x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
+        image = np.moveaxis(stored["rgb"], 0, -1)
+        if "class_id" in stored:
+            values = np.ma.masked_invalid(stored["traversability"])
+            image = np.concatenate([image, _SHADES(values, bytes=True)[..., :3]], axis=1)
+            edges = outline(soft_ground(stored["class_id"], classes), high / grid.height)
+            # The page counts inches downward.
+            _draw_soft_ground(sheet, edges * (1, -1) + (x, y + high), line=0.2)
+        box = (x, x + wide, y + high, y)
+        sheet.imshow(image, origin="lower", extent=box, aspect="auto", interpolation="none")
+        label = sheet.text(x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top")
+        label.set_path_effects(halo)
     return figure
 
 
@@ -328,26 +330,7 @@ def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: flo
     return np.concatenate([colour, 0.7 * np.abs(lit)[..., None]], axis=-1)
 
 
-def _draw_soft_ground(
-    panel: Axes,
-    soft: np.ndarray,
-    extent: tuple[float, float, float, float],
-    hatched: bool = False,
-    line: float = 0.4,
-) -> None:
-    """Outlines the cells of bool [H, W] that may hide soft spots, by the cells' own edges, in black on white."""
-    if not soft.any() or (soft.all() and not hatched):
-        return
-    left, right, bottom, top = extent
-    # Two points a cell, next to its edges, so that contours keep to the edges.
-    along_y, along_x = (
-        np.repeat(np.arange(cells) / cells, 2) + np.tile([1e-4, 1 - 1e-4], cells) / cells
-        for cells in soft.shape
-    )
-    x, y = left + (right - left) * along_x, bottom + (top - bottom) * along_y
-    member = np.repeat(np.repeat(soft, 2, axis=0), 2, axis=1).astype(np.float64)
-    if hatched:
-        panel.contourf(x, y, member, levels=[0.5, 1.5], colors="none", hatches=[_HATCH])
-    if not soft.all():
-        panel.contour(x, y, member, levels=[0.5], colors="white", linewidths=2.5 * line)
-        panel.contour(x, y, member, levels=[0.5], colors="black", linewidths=line)
+def _draw_soft_ground(panel: Axes, edges: np.ndarray, line: float = 0.4) -> None:
+    """Draws edges around ground that may hide soft spots, both ends of each, shape [M, 2, 2], in black on white."""
+    for colour, width in (("white", 2.5 * line), ("black", line)):
+        panel.add_collection(LineCollection(list(edges), colors=colour, linewidths=width))

@@ -6,11 +6,9 @@ from pathlib import Path
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
-from benchnav.eval.experiment.condition import NOT_USED
+from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder.folder import Run, open_run
-
-_COLUMNS = ("planner", "risk", "scenario", "model", "robot", "objective", "world", "data")
 
 
 def find_episodes(
@@ -33,25 +31,22 @@ def find_episodes(
         ConfigError: the run has no such episode, or they are not on one map.
     """
     run = open_run(folder)
+    labelled = [condition.labels for condition, _ in run.conditions.values()]
     known = {
-        name: list(dict.fromkeys(condition.labels[name] for condition, _ in run.conditions.values()))
-        for name in _COLUMNS
+        name: [label for label in dict.fromkeys(own[name] for own in labelled) if label != NOT_USED]
+        for name in LABELS
     }
     found: dict[str, tuple[Unit, int]] = {}
     for values in itertools.product(*labels.values()):
         asked = dict(zip(labels, values, strict=True))
         unit = _find(run, asked, (seed, realisation, map_index))
         # A blind planner has no risk setting and fits any, but not one that no planner of the run has.
-        strange = [
-            name
-            for name, label in asked.items()
-            if known[name] != [NOT_USED] and label not in {*known[name]} - {NOT_USED}
-        ]
+        strange = [name for name, label in asked.items() if known[name] and label not in known[name]]
         if unit is None or strange:
             words = [f"{name} {label!r}" for name, label in asked.items()]
             words += [f"realisation {realisation}", f"map {map_index}"]
             words += [] if seed is None else [f"seed {seed}"]
-            near = "".join(hint(asked[name], {*known[name]} - {NOT_USED}) for name in strange[:1])
+            near = "".join(hint(asked[name], known[name]) for name in strange[:1])
             raise ConfigError(
                 f"Expected an episode of the run, got {', '.join(words)}. "
                 f"It has {', '.join(f'{name}s {values}' for name, values in known.items())}.{near}"

@@ -230,13 +230,12 @@ def drawn_plan(step: int, layers: Mapping[str, Tensor]) -> DrawnPlan:
 
 def thinned(plan: DrawnPlan) -> DrawnPlan:
     """Leaves out lines and points within lines where a layer has too many; what is thin stays as it is."""
-    return DrawnPlan(step=plan.step, lines={name: _thinned(lines) for name, lines in plan.lines.items()})
-
-
-def _thinned(lines: Sequence[np.ndarray]) -> list[np.ndarray]:
-    lines = [lines[place] for place in _spread(len(lines), MOST_POINTS // 2)]
-    most = MOST_POINTS // max(len(lines), 1)
-    return [line[_spread(len(line), most)] for line in lines]
+    layers = {}
+    for name, lines in plan.lines.items():
+        shown = [lines[place] for place in _spread(len(lines), MOST_POINTS // 2)]
+        most = MOST_POINTS // max(len(shown), 1)
+        layers[name] = [line[_spread(len(line), most)] for line in shown]
+    return DrawnPlan(step=plan.step, lines=layers)
 
 
 def _spread(count: int, most: int) -> np.ndarray:

@@ -1,7 +1,11 @@
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from matplotlib.figure import Figure
 
 from benchnav.core.figures import (
@@ -10,6 +14,8 @@ from benchnav.core.figures import (
     MARKS,
     TWO_COLUMNS_IN,
     condition_colours,
+    hatching,
+    outline,
     planner_colours,
     planner_name,
     save_twice,
@@ -68,3 +74,48 @@ def test_a_figure_is_written_whole_as_png_and_pdf_at_its_width(tmp_path: Path) -
     assert {one.name for one in path.parent.iterdir()} == {"one.png", "one.pdf"}
     assert b"/Type3" not in path.with_suffix(".pdf").read_bytes()
     assert dict(matplotlib.rcParams) == settings
+
+
+REGIONS = arrays(bool, st.tuples(st.integers(1, 7), st.integers(1, 9)))
+
+
+def cells_beside(region: np.ndarray, edge: np.ndarray, resolution_m: float) -> list[bool]:
+    """Whether the cells on the two sides of an edge are of a region; off the map none is."""
+    middle, along = edge.mean(axis=0) / resolution_m, (edge[1] - edge[0]) / resolution_m
+    across = 0.5 * along[::-1]
+    found = []
+    for column, row in (middle - across, middle + across):
+        inside = 0 <= row < region.shape[0] and 0 <= column < region.shape[1]
+        found.append(bool(inside and region[int(row), int(column)]))
+    return found
+
+
+@given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
+def test_an_outline_is_every_edge_between_what_is_in_a_region_and_what_is_not(
+    region: np.ndarray, resolution_m: float
+) -> None:
+    edges = outline(region, resolution_m)
+    np.testing.assert_allclose(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), resolution_m)
+    for edge in edges:
+        assert sorted(cells_beside(region, edge, resolution_m)) == [False, True]
+    # Each cell has four sides, and two cells of the region share what is between them.
+    shared = (region[1:] & region[:-1]).sum() + (region[:, 1:] & region[:, :-1]).sum()
+    assert len(np.unique(edges, axis=0)) == len(edges) == 4 * region.sum() - 2 * shared
+
+
+@given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
+def test_hatching_lies_in_its_region_alone(region: np.ndarray, resolution_m: float) -> None:
+    lines = hatching(region, resolution_m)
+    column, row = np.floor(lines.mean(axis=1) / resolution_m).astype(int).T
+    assert region[row, column].all()
+    np.testing.assert_allclose(lines[:, 1] - lines[:, 0], resolution_m)
+
+
+def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
+    lines = hatching(np.ones((9, 12), bool), 1.0)
+    column, row = lines[:, 0].astype(int).T
+    for line in range(9):
+        np.testing.assert_array_equal(np.diff(np.sort(column[row == line])), 4)
+        assert (row == line).sum() == 3
+    starts = {tuple(point) for point in lines[:, 0]}
+    assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)

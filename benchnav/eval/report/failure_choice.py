@@ -1,7 +1,8 @@
 """Which failures the sheets show: of each block those of the best setting and those of the worst."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -98,14 +99,12 @@ def collect_sheets(
     return Sheets(shown=tuple(shown), predicted=predicted, left_out=" ".join(dict.fromkeys(left_out)))
 
 
-def _looked_at(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
+def _looked_at(rows: pd.DataFrame) -> list[dict[Any, Any]]:
     """The best of a block and the worst, of those that look at a prediction."""
     seeing = rows[competing(rows) & (rows["model"] != NOT_USED)]
-    best = seeing.loc[seeing["condition"] == seeing["best"], "condition"]
-    worst = seeing.sort_values("success_rate", kind="stable")["condition"].head(1)
-    for condition in dict.fromkeys([*best, *worst]):
-        (row,) = rows[rows["condition"] == condition].to_dict("records")
-        yield {str(name): value for name, value in row.items()}
+    worst = seeing.sort_values("success_rate", kind="stable").head(1)
+    both = pd.concat([seeing[seeing["condition"] == seeing["best"]], worst])
+    return both.drop_duplicates("condition").to_dict("records")
 
 
 def choose_failures(failures: pd.DataFrame) -> pd.DataFrame:

@@ -46,8 +46,7 @@ def findings(
         predicted: by condition the λ̂ where its failed episodes ended, where that is known.
     """
     several = several_models(summary)
-    rows = ({str(name): value for name, value in row.items()} for row in summary.to_dict("records"))
-    names = {row["condition"]: condition_name(row, several) for row in rows}
+    names = {row["condition"]: condition_name(row, several) for row in summary.to_dict("records")}
     return [
         Finding(title=title, sentences=tuple(_sentences(block, names, failures, predicted or {})))
         for title, block in blocks(summary)

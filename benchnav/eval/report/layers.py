@@ -1,6 +1,6 @@
 """What is drawn over a map, once for figures and playback: plans, and ground that is soft or immobilises a robot.
 
-Letters in shapes: H×W cells, N positions, M lines.
+Letters in shapes: H×W cells, N positions.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,13 +10,12 @@ import matplotlib
 import numpy as np
 from matplotlib.collections import LineCollection
 
-from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of
+from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of, hatching, outline
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"
 SOFT = "white"
 
-_HATCH_CELLS = 4
 _LINE_WIDTH = 0.4  # of the thinnest line of a plan
 
 
@@ -94,38 +93,3 @@ def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:
     colours = shades(field)
     colours[immobilising] = bytes_of(IMMOBILISING)[:3]
     return colours
-
-
-def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Finds the edges between cells of a region and those that are not of it, the map's border among them.
-
-    Args:
-        region: bool, shape [H, W].
-        resolution_m: edge length of a cell.
-
-    Returns:
-        Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
-    """
-    framed = np.pad(region, 1)
-    rows, columns = np.nonzero(framed[1:, 1:-1] != framed[:-1, 1:-1])
-    along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
-    rows, columns = np.nonzero(framed[1:-1, 1:] != framed[1:-1, :-1])
-    along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
-    edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
-    return (edges * resolution_m).astype(np.float32)
-
-
-def hatching(region: np.ndarray, resolution_m: float) -> np.ndarray:
-    """Draws diagonals through a region, which tell it from what it surrounds.
-
-    Args:
-        region: bool, shape [H, W].
-        resolution_m: edge length of a cell.
-
-    Returns:
-        Both ends (x, y) of each diagonal of a cell in metres, float32, shape [M, 2, 2].
-    """
-    rows, columns = np.nonzero(region)
-    drawn = (rows - columns) % _HATCH_CELLS == 0
-    corners = np.stack((columns[drawn], rows[drawn]), axis=1)
-    return (np.stack((corners, corners + 1), axis=1) * resolution_m).astype(np.float32)

@@ -13,9 +13,6 @@ from benchnav.core.tables import Table
 from benchnav.eval.folder.provenance import command_lines
 from benchnav.eval.report.findings import Finding
 
-# Of a figure's own pixels; fine enough for screens of twice the density.
-_SCREEN = 0.6
-
 
 def write_page(
     name: str,
@@ -50,7 +47,7 @@ def write_page(
         warnings=warnings,
         findings=findings,
         table=table,
-        figures=[(path.stem, caption, _inline(path), _width(path)) for path, caption in figures.items()],
+        figures=[(path.stem, caption, _inline(path)) for path, caption in figures.items()],
         provenance=provenance_lines(about),
         commands=command_lines(about),
         version=benchnav.__version__,
@@ -63,20 +60,18 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
     Args:
         about: all of `run.json`.
     """
-    machine, codes = about["machine"], about["codes"]
+    machine, codes = about["machine"], about["codes"].values()
     lines = [
         ("commit of benchnav", about["history"][-1]["commit"]),
         ("version of benchnav", about["history"][-1]["benchnav"]),
     ]
-    environments = {json.dumps(code["environment"]): code["environment"] for code in codes.values()}
-    for environment in environments.values():
+    for environment in {json.dumps(code["environment"]): code["environment"] for code in codes}.values():
         lines += [(name, str(value)) for name, value in environment.items()]
     lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))
     for data, known in about["datasets"].items():
         maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
         lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
-    parts = {name: digest for code in codes.values() for name, digest in code["parts"].items()}
-    lines += list(parts.items())
+    lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
     seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
     lines.append(("seeds", ", ".join(map(str, seeds))))
     return [(name, value) for name, value in lines if value]
@@ -84,10 +79,3 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _inline(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
-
-
-def _width(path: Path) -> int:
-    """Width that a figure is shown at, in pixels of the page."""
-    with open(path, "rb") as file:
-        pixels = int.from_bytes(file.read(20)[16:], "big")  # of a PNG's header
-    return round(pixels * _SCREEN)

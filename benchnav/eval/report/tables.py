@@ -129,30 +129,22 @@ def paper_table(summary: pd.DataFrame, label: str) -> str:
 def _across(known: Sequence[tuple[str, pd.DataFrame]], several: Sequence[str]) -> Table:
     """The table of some blocks, side by side; a label that is the same as over it is left out."""
     labels = ["planner", *several, "risk"]
-    results = [
-        {tuple(row[name] for name in labels): row for row in rows.to_dict("records")} for _, rows in known
-    ]
-    settings = list(dict.fromkeys(setting for block in results for setting in block))
-    planners = list(dict.fromkeys(setting[0] for setting in settings))
-    rows, rules = [], set()
-    above: tuple[str, ...] = ()
-    for place, setting in enumerate(sorted(settings, key=lambda setting: planners.index(setting[0]))):
-        if above and setting[0] != above[0]:
-            rules.add(place)
-        cells = [planner_name(setting[0]), *setting[1:]]
-        for column in range(len(labels) - 1):
-            if setting[: column + 1] == above[: column + 1]:
-                cells[column] = ""
-        for block in results:
-            cells += _in_paper(block[setting]) if setting in block else [NOT_USED] * len(_PAPER)
-        rows.append(tuple(cells))
-        above = setting
+    side_by_side = []
+    for _, rows in known:
+        settings = pd.MultiIndex.from_frame(rows[labels])
+        side_by_side.append(pd.DataFrame(map(_in_paper, rows.to_dict("records")), settings, dtype=object))
+    table = pd.concat(side_by_side, axis=1).fillna(NOT_USED)
+    names = table.index.to_frame(index=False)
+    names = names.iloc[names["planner"].factorize()[0].argsort(kind="stable")]
+    cells = table.loc[pd.MultiIndex.from_frame(names)]
+    as_above = names.eq(names.shift()).cummin(axis=1)
+    names["planner"] = names["planner"].map(planner_name)
     return Table(
         headings=(*(name.capitalize() for name in labels), *_PAPER * len(known)),
         labels=len(labels),
-        rows=tuple(rows),
+        rows=tuple(map(tuple, np.hstack([names.mask(as_above, ""), cells]))),
         groups=tuple(title for title, _ in known),
-        rules=frozenset(rules),
+        rules=frozenset(np.flatnonzero(~as_above["planner"])[1:].tolist()),
     )
 
 

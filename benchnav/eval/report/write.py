@@ -199,16 +199,16 @@ def _charts(report: Report) -> Drawn:
         yield "forest", _FOREST, forest_figure(report.tests)
     yield "success", _SUCCESS, success_figure(summary, marked)
     sweeps = find_sweeps(report.about["conditions"])
-    names = Counter(sweep_name(sweep.number) for sweep in sweeps)
-    for sweep in sweeps:
-        short = sweep_name(sweep.number)
-        name = short if names[short] == 1 else sweep.number.replace(".", "-")
-        yield f"over-{name}", _SWEEP.format(name), curve_figure(sweep, summary)
+    names = Counter(map(sweep_name, sweeps))
+    for number, lines in sweeps.items():
+        short = sweep_name(number)
+        name = short if names[short] == 1 else number.replace(".", "-")
+        yield f"over-{name}", _SWEEP.format(name), curve_figure(number, lines, summary)
     yield "outcomes", _OUTCOMES, outcome_figure(summary)
     yield "distributions", _DISTRIBUTIONS, distribution_figure(summary, report.episodes)
-    for place, (title, lines) in enumerate(report.sheets.shown, start=1):
+    for place, (title, sheet) in enumerate(report.sheets.shown, start=1):
         name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place}"
-        yield name, _FAILURES.format(title), failure_figure(lines)
+        yield name, _FAILURES.format(title), failure_figure(sheet)
 
 
 def _trajectories(folder: Path, summary: pd.DataFrame) -> Drawn:

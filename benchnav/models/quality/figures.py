@@ -31,6 +31,7 @@ from benchnav.core.figures import (
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
 from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
+from benchnav.models.quality.report import numbers
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 
@@ -183,14 +184,11 @@ def severity_figure(
         all_series: by scenario, its pairs as (severity, split), ascending.
         qualities: of all these splits.
     """
-    rows = []
-    for scenario, series in all_series.items():
-        for severity, split in series:
-            values = {"scenario": scenario, "severity": severity, **vars(qualities[split].traversability)}
-            rows.append(
-                values | {name: v for own in qualities[split].classes for name, v in vars(own).items()}
-            )
-    table = pd.DataFrame(rows)
+    table = pd.DataFrame(
+        {"scenario": scenario, "severity": severity, **numbers(qualities[split])}
+        for scenario, series in all_series.items()
+        for severity, split in series
+    )
     measured = table.dropna(axis=1)
     quantities = [*_CLASS_SEVERITY * ("accuracy" in measured), *_LATENT_SEVERITY]
     figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
@@ -321,4 +319,4 @@ def _grid(
 def _explain(figure: Figure, most: int = 4) -> None:
     """Lays a legend over the panels, in at most so many columns where the figure is of full width."""
     columns = most if figure.get_figwidth() == TWO_COLUMNS_IN else 2
-    legend_outside(figure, columns=columns, side="upper")
+    legend_outside(figure, columns=columns, side="upper center")

@@ -155,7 +155,8 @@ def map_sheet_figure(
                 most=2 if is_error else 4,
             )
         )
-    shown = _shown_classes(sheet)
+    kinds = [sheet.layers[name] for name in ("class_true", "class_found") if name in sheet.layers]
+    shown = np.setdiff1d(kinds, UNLABELLED).astype(int)
     patches = class_patches(
         [classes[number].name.replace("_", " ") for number in shown], class_colours(classes)[shown]
     )
@@ -165,16 +166,9 @@ def map_sheet_figure(
     return sheet_of_maps(columns, rows, sheet.extent_m, f"{title}, split {sheet.split}", patches)
 
 
-def _shown_classes(sheet: MapSheet) -> list[int]:
-    layers = [sheet.layers[name] for name in ("class_true", "class_found") if name in sheet.layers]
-    return [number for number in np.unique(layers).tolist() if number != UNLABELLED] if layers else []
-
-
 def _round_up(value: float) -> float:
     """The next of 1, 1.5, 2, 3, 4, 5, 6, 8 and 10 times a power of ten; 1 for 0."""
     if value <= 0:
         return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(
-        next(step * power for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= 0.999 * value)
-    )
+    steps = 10.0 ** np.floor(np.log10(value)) * np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
+    return float(steps[steps >= 0.999 * value][0])

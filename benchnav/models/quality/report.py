@@ -172,22 +172,18 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
         qualities: by split.
         whole: with the numbers that a terminal is too narrow for.
     """
-    rows = {split: numbers(quality) for split, quality in qualities.items()}
+    table = pd.DataFrame([numbers(quality) for quality in qualities.values()], index=list(qualities))
     # Those that some split has, and the one whose truth may be unknown.
-    names = [
-        name
-        for name in COLUMNS
-        if (whole or name not in _FILES_ONLY)
-        and (name == "rmse_expected" or any(math.isfinite(row.get(name, math.nan)) for row in rows.values()))
-    ]
+    kept = table.columns[np.isfinite(table).any() | (table.columns == "rmse_expected")]
+    names = [name for name in COLUMNS if name in kept and (whole or name not in _FILES_ONLY)]
     explained = [(" ".join(heading.split()), text) for heading, text in (COLUMNS[name] for name in names)]
     return Table(
         title=title,
         headings=("split\n", "maps\n", *(COLUMNS[name][0] for name in names)),
         numbers=True,
         rows=tuple(
-            (split, str(qualities[split].maps), *(_decimal(row.get(name, math.nan)) for name in names))
-            for split, row in rows.items()
+            (split, str(qualities[split].maps), *map(_decimal, row))
+            for split, row in zip(qualities, table[names].to_numpy(), strict=True)
         ),
         explained=(("split", "the maps that were measured; their number is under maps."), *explained),
     )
@@ -225,16 +221,10 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
         scenario, severity = places.get(split, ("", math.nan))
         place = {"split": split, "scenario": scenario, "severity": severity, "maps": quality.maps}
         rows.append({**place, **numbers(quality)})
-    alike = any(LOOK_ALIKES[0] in row for row in rows)
-    columns = [
-        "split",
-        "scenario",
-        "severity",
-        "maps",
-        *(name for name in COLUMNS if alike or name not in LOOK_ALIKES),
-    ]
-    table = pd.DataFrame(rows, columns=columns).replace((math.inf, -math.inf), math.nan)
-    return table.to_csv(index=False, float_format="%.6g")
+    table = pd.DataFrame(rows, columns=["split", "scenario", "severity", "maps", *COLUMNS])
+    if table[LOOK_ALIKES[0]].isna().all():
+        table = table.drop(columns=list(LOOK_ALIKES))
+    return table.replace((math.inf, -math.inf), math.nan).to_csv(index=False, float_format="%.6g")
 
 
 def quality_markdown(

@@ -1,22 +1,12 @@
-"""What the ground looks like, against counts by hand and a model of colour blindness."""
+"""What the ground looks like, against a model of colour blindness."""
 
 import matplotlib
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from matplotlib.colors import to_rgb
 
 from benchnav.core.figures import bytes_of
-from benchnav.eval.report.layers import (
-    IMMOBILISING,
-    field_colours,
-    hatching,
-    outline,
-)
-
-REGIONS = arrays(bool, st.tuples(st.integers(1, 7), st.integers(1, 9)))
+from benchnav.eval.report.layers import IMMOBILISING, field_colours
 
 # Machado, Oliveira and Fernandes (2009), full severity, on linear RGB.
 SEEN = {
@@ -58,45 +48,3 @@ def test_cells_have_the_colour_of_their_own_traversability_or_that_of_what_holds
     usual = np.round(255 * matplotlib.colormaps["viridis"](field)[..., :3])
     np.testing.assert_array_equal(colours[~immobilising], usual[~immobilising])
     assert (colours[immobilising] == bytes_of(IMMOBILISING)[:3]).all()
-
-
-def cells_beside(region: np.ndarray, edge: np.ndarray, resolution_m: float) -> list[bool]:
-    """Whether the cells on the two sides of an edge are of a region; off the map none is."""
-    middle, along = edge.mean(axis=0) / resolution_m, (edge[1] - edge[0]) / resolution_m
-    across = 0.5 * along[::-1]
-    found = []
-    for column, row in (middle - across, middle + across):
-        inside = 0 <= row < region.shape[0] and 0 <= column < region.shape[1]
-        found.append(bool(inside and region[int(row), int(column)]))
-    return found
-
-
-@given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
-def test_an_outline_is_every_edge_between_what_is_in_a_region_and_what_is_not(
-    region: np.ndarray, resolution_m: float
-) -> None:
-    edges = outline(region, resolution_m)
-    np.testing.assert_allclose(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1), resolution_m)
-    for edge in edges:
-        assert sorted(cells_beside(region, edge, resolution_m)) == [False, True]
-    # Each cell has four sides, and two cells of the region share what is between them.
-    shared = (region[1:] & region[:-1]).sum() + (region[:, 1:] & region[:, :-1]).sum()
-    assert len(np.unique(edges, axis=0)) == len(edges) == 4 * region.sum() - 2 * shared
-
-
-@given(region=REGIONS, resolution_m=st.sampled_from([0.25, 0.5, 1.0]))
-def test_hatching_lies_in_its_region_alone(region: np.ndarray, resolution_m: float) -> None:
-    lines = hatching(region, resolution_m)
-    column, row = np.floor(lines.mean(axis=1) / resolution_m).astype(int).T
-    assert region[row, column].all()
-    np.testing.assert_allclose(lines[:, 1] - lines[:, 0], resolution_m)
-
-
-def test_hatching_goes_through_all_of_a_region_without_breaks() -> None:
-    lines = hatching(np.ones((9, 12), bool), 1.0)
-    column, row = lines[:, 0].astype(int).T
-    for line in range(9):
-        np.testing.assert_array_equal(np.diff(np.sort(column[row == line])), 4)
-        assert (row == line).sum() == 3
-    starts = {tuple(point) for point in lines[:, 0]}
-    assert all(tuple(end) in starts for end in lines[:, 1] if end[0] < 12 and end[1] < 9)

@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, to_rgb, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from benchnav.core.figures import (
     ONE_COLUMN_IN,
@@ -23,7 +21,6 @@ from benchnav.core.figures import (
     frame_map,
     legend_outside,
     mark,
-    mark_handle,
     show_map,
     stack_panels,
     styled,
@@ -53,7 +50,7 @@ _SAME_MAP = ["data", "scenario", "map", "seed", "realisation"]
 _PATH_STYLES = ("solid", "dashed")
 _DARKEST = 0.35  # grey of λ = 0
 _LAMBDA: dict[str, Any] = {"cmap": TRAVERSABILITY_COLOURS, "vmin": 0, "vmax": 1}
-_HOLDS = Patch(color=IMMOBILISING, label="immobilises a robot")
+_HOLDS = {"label": "immobilises a robot", "color": IMMOBILISING}
 
 
 def choose_recordings(recordings: Sequence[Recording], conditions: Sequence[str]) -> list[Recording]:
@@ -125,7 +122,7 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         for panel in drawn:
             panel.tick_params(labelleft=place % across == 0)
             panel.set_ylabel("y [m]" if place % across == 0 else "")
-    legend_outside(figure, _ground_entries(recordings), 1 if across == 1 else 4)
+    legend_outside(figure, columns=1 if across == 1 else 4)
     shrink = min(1.0, 4 / figure.get_figheight())
     figure.colorbar(
         driven,
@@ -147,9 +144,10 @@ def _name_panel(panel: Axes, letters: int, *lines: str) -> None:
 def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
     """Draws the terrain, and the path driven by that moment, coloured by the observed λ."""
     show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
-    if recording.field is not None:
+    if recording.field is not None and recording.soft.any():
         for lines in soft_lines(recording.soft, recording.resolution_m):
             panel.add_collection(lines)
+        _name_ground(panel, "soft ground, which does not show", fc="0.45", ec=SOFT, hatch="////")
     driven = recording.track[: recording.now + 1]
     coloured = driven_path(2)
     draw_driven(coloured, driven, recording.traversability)
@@ -165,6 +163,7 @@ def _draw_predicted(panel: Axes, recording: Recording, letters: int) -> None:
     if not recording.free.all():
         closed = np.where(recording.free, np.nan, 1.0)
         show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([_CLOSED]))
+        _name_ground(panel, "not free", color=_CLOSED)
     blind = recording.about["model"] == NOT_USED
     words = "E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner"
     _name_panel(panel, letters, words)
@@ -179,6 +178,8 @@ def _draw_field(panel: Axes, recording: Recording, field: np.ndarray, letters: i
     _mark_places(panel, recording, recording.track[-1])
     if recording.immobilised_at is not None:
         mark(panel, "end", recording.immobilised_at, label="immobilised")
+    if recording.immobilising.any():
+        _name_ground(panel, **_HOLDS)
     _name_panel(panel, letters, f"driven to the end ({recording.end_s:g} s), on λ as it was")
 
 
@@ -189,17 +190,9 @@ def _mark_places(panel: Axes, recording: Recording, robot: np.ndarray) -> None:
     frame_map(panel)
 
 
-def _ground_entries(recordings: Sequence[Recording]) -> list[Artist]:
-    """Entries of the legend for what is drawn of the ground."""
-    known = [recording for recording in recordings if recording.field is not None]
-    entries: list[Artist] = []
-    if not all(recording.free.all() for recording in recordings):
-        entries.append(Patch(color=_CLOSED, label="not free"))
-    if any(recording.soft.any() for recording in known):
-        entries.append(Patch(fc="0.45", ec=SOFT, hatch="////", label="soft ground, which does not show"))
-    if any(recording.immobilising.any() for recording in known):
-        entries.append(_HOLDS)
-    return entries
+def _name_ground(panel: Axes, label: str, **look: Any) -> None:
+    """Lets the legend name a kind of ground, of which images have no entry."""
+    panel.fill([], [], label=label, **look)
 
 
 def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] | None:
@@ -217,10 +210,10 @@ def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] |
     ground, rows = Ground.load(path), read_table(folder, EPISODES)
     rows = rows[(rows[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
     place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
-    steps = [read_steps(folder, condition=condition, **place) for condition in rows["condition"]]
-    kept = [len(own) > 0 for own in steps]
-    tracks = [own[["x_m", "y_m"]].to_numpy() for own in steps if len(own)]
-    return (ground, rows[kept], tracks) if tracks else None
+    steps = read_steps(folder, condition=list(rows["condition"]), **place).groupby("condition")
+    rows = rows[rows["condition"].isin(steps.groups)]
+    tracks = [steps.get_group(condition)[["x_m", "y_m"]].to_numpy() for condition in rows["condition"]]
+    return (ground, rows, tracks) if tracks else None
 
 
 @styled()
@@ -246,18 +239,16 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         label = f"{names[place]}: {outcome_in_words(row['outcome'])}, {row['end_time_s']:.0f} s"
         draw_edged(panel, track, 0.9 + 2.2 * smaller, colours[place], ls=style, label=label)
         if not row["success"]:
-            mark(panel, "end", track[-1], 0.6 + smaller, color=colours[place])
+            words = "end of a failure, in the colour of its path"
+            mark(panel, "end", track[-1], 0.6 + smaller, color=colours[place], label=words)
     mark(panel, "start", tracks[0][0], label="start")
     mark(panel, "goal", ground.goal_m, label="goal")
-    more: list[Artist] = []
-    if not rows["success"].all():
-        more.append(mark_handle("end", "end of a failure, in the colour of its path"))
     if ground.immobilising.any():
-        more.append(_HOLDS)
+        _name_ground(panel, **_HOLDS)
     title = "terrain, faded" if ground.field is None else "λ as it was: the lighter the faster"
     panel.set(xlabel="x [m]", ylabel="y [m]", title=title)
     frame_map(panel)
-    figure.legend(handles=[*panel.get_legend_handles_labels()[0], *more], loc="outside right upper")
+    legend_outside(figure, columns=1, side="right upper")
     return figure
 
 
@@ -298,8 +289,7 @@ def failure_figure(lines: Sequence[FailedLine]) -> Figure:
         count = f"({len(line.failures)} of {line.among} failures)"
         row_of_panels[0].set_ylabel(f"{line.name}\n{count}", fontsize="small")
     figure.colorbar(panels[0, 0].images[0], ax=panels, fraction=0.03, aspect=30, label="predicted λ̂")
-    held = any(recording.immobilising.any() for line in lines for recording in line.recordings)
-    legend_outside(figure, [_HOLDS] * held, 5 if across > 2 else 3)
+    legend_outside(figure, columns=5 if across > 2 else 3)
     return figure
 
 
@@ -310,6 +300,7 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
         colours = np.zeros((*recording.grid.shape, 4))
         colours[recording.immobilising] = to_rgba(IMMOBILISING, 0.75)
         show_map(panel, colours, recording.grid.extent_m)
+        _name_ground(panel, **_HOLDS)
     track = recording.track
     draw_edged(panel, track, 1.1, label="driven")
     for name, position in (("start", track[0]), ("goal", recording.goal_m), ("end", track[-1])):

@@ -35,7 +35,6 @@ _MEASURES = {
     "success [%]": ("success_rate", "success_low", "success_high", 100.0),
     "T_total [s]": ("total_time_mean_s", "total_time_low_s", "total_time_high_s", 1.0),
 }
-_STYLES: tuple[Any, ...] = ("--", ":", "-.", (0, (7, 2, 1, 2, 1, 2)), (0, (1, 3)), (0, (9, 2)))
 _MOST_LINES, _MOST_ACROSS = 7, 4
 _SAME = ("data", "scenario", "world", "robot", "objective")
 
@@ -60,20 +59,7 @@ class Line:
     rest: Mapping[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sweep:
-    """All lines over one number.
-
-    Args:
-        number: its name with dots, such as `risk.options.level`; `severity` for that of scenarios.
-        lines: in the order of the run.
-    """
-
-    number: str
-    lines: tuple[Line, ...]
-
-
-def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
+def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[Line]]:
     """Finds the sweeps of a run.
 
     A number that others follow, such as two that were changed together, makes no sweep.
@@ -82,39 +68,35 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> list[Sweep]:
         conditions: by id, with `value`, as `run.json` holds them.
 
     Returns:
-        By name of the number.
+        Lines in the order of the run, by the name of their number with dots, such as `risk.options.level`;
+        `severity` is that of scenarios.
     """
-    points = []
-    flat = {
-        condition: pd.json_normalize(dict(about["value"])).to_dict("records")[0]
-        for condition, about in conditions.items()
-        if "split" in about["value"]
-    }
-    for condition, value in flat.items():
-        for name, number in value.items():
-            if isinstance(number, int | float) and not isinstance(number, bool):
-                rest = {key: other for key, other in value.items() if key != name}
-                points.append((name, condition, float(number), rest))
-    points.sort(key=lambda point: point[0])
-    for scenario, pairs in find_series(dict.fromkeys(value["split"] for value in flat.values())).items():
+    values = {name: dict(about["value"]) for name, about in conditions.items() if "split" in about["value"]}
+    flat = [pd.json_normalize(value).to_dict("records")[0] for value in values.values()]
+    known = pd.DataFrame(flat, index=list(values), dtype=object)
+    tables = [(number, known) for number in sorted(known)]
+    for scenario, pairs in find_series(dict.fromkeys(known.get("split", ()))).items():
         severities = {split: severity for severity, split in pairs}
-        for condition, value in flat.items():
-            if value["split"] in severities:
-                rest = {**value, "split": scenario}
-                points.append((SEVERITY, condition, severities[value["split"]], rest))
-    lines: dict[str, list[Line]] = {}
-    table = pd.DataFrame(points, columns=["number", "condition", "value", "rest"])
-    table["key"] = [repr(sorted(rest.items())) for rest in table["rest"]]
-    for (number, _), group in table.groupby(["number", "key"], sort=False):
-        if group["value"].nunique() >= LEAST_VALUES:
-            ordered = group.sort_values("value", kind="stable")
-            line = Line(
-                values=tuple(ordered["value"]),
-                conditions=tuple(ordered["condition"]),
-                rest=group["rest"].iloc[0],
-            )
-            lines.setdefault(number, []).append(line)
-    return [Sweep(number=number, lines=tuple(own)) for number, own in lines.items()]
+        own = known[known["split"].isin(list(severities))]
+        tables.append((SEVERITY, own.assign(severity=own["split"].map(severities), split=scenario)))
+    sweeps: dict[str, list[Line]] = {}
+    for number, table in tables:
+        table = table[table[number].map(_is_number)]
+        rest = table.drop(columns=number)
+        for _, alike in table.groupby(rest.astype(str).apply(tuple, axis=1), sort=False):
+            if alike[number].nunique() >= LEAST_VALUES:
+                ordered = alike[number].astype(float).sort_values(kind="stable")
+                line = Line(
+                    values=tuple(ordered),
+                    conditions=tuple(ordered.index),
+                    rest=rest.loc[ordered.index[0]].dropna().to_dict(),
+                )
+                sweeps.setdefault(number, []).append(line)
+    return sweeps
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and pd.notna(value)
 
 
 def sweep_name(number: str) -> str:
@@ -123,18 +105,19 @@ def sweep_name(number: str) -> str:
 
 
 @styled()
-def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
+def curve_figure(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> Figure:
     """Draws a sweep: success above with Wilson's band, T_total below with the bootstrap's.
 
     A panel a scenario, world, model and what else there is of that kind; where lines are many, a panel a planner
     too. Over a number of a risk setting, the other settings of the same planner are horizontal lines.
 
     Args:
-        sweep: from `find_sweeps`.
+        number: a name from `find_sweeps`.
+        lines: those of the number.
         summary: of the run.
     """
     rows = summary.set_index("condition", drop=False)
-    labels = _label_lines(sweep, rows)
+    labels = _label_lines(number, lines, rows)
     planners = labels.drop_duplicates("name").set_index("name")["planner"]
     colours = dict(zip(planners.index, condition_colours(planners.tolist(), LINE_COLOURS), strict=True))
     groups = _panels(labels)
@@ -146,14 +129,13 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
     for above, below in stacks[1:]:
         above.sharey(stacks[0][0])
         below.sharey(stacks[0][1])
-    values = sorted({value for line in sweep.lines for value in line.values})
-    swept = [condition for line in sweep.lines for condition in line.conditions]
-    others = rows.drop(swept).to_dict("records") if sweep.number.startswith("risk.") else []
+    values = sorted({value for line in lines for value in line.values})
+    swept = [condition for line in lines for condition in line.conditions]
+    others = rows.drop(swept).to_dict("records") if number.startswith("risk.") else []
     references: dict[str, str] = {}
-    for place, ((above, below), (title, lines)) in enumerate(zip(stacks, groups, strict=True)):
+    for place, ((above, below), (title, shown)) in enumerate(zip(stacks, groups, strict=True)):
         for panel, (measure, (*names, scale)) in zip((above, below), _MEASURES.items(), strict=True):
-            for number in lines:
-                line, name = sweep.lines[number], labels["name"][number]
+            for line, name in zip([lines[i] for i in shown], labels["name"][shown], strict=True):
                 own = rows.loc[list(line.conditions)]
                 for label, row in _references(own.iloc[0], others):
                     blind = row["model"] == NOT_USED
@@ -163,7 +145,7 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
                     panel.axhline(scale * row[names[0]], color=colour, ls=style, lw=1, zorder=1)
                 rate, low, high = (scale * own[column] for column in names)
                 marker = MARKERS[list(colours).index(name) // len(LINE_COLOURS) % len(MARKERS)]
-                places = _places(sweep, line.values)
+                places = _places(number, line.values)
                 panel.fill_between(places, low, high, color=colours[name], alpha=0.15, lw=0)
                 panel.plot(places, rate, color=colours[name], marker=marker, ms=3.5, lw=1.2, label=name)
             panel.grid(axis="y", color="0.9")
@@ -171,8 +153,8 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
             panel.set_ylabel("" if place % across else measure)
         above.set_title(title)
         below.tick_params(labelbottom=True)
-        below.set_xlabel(_NAMES.get(sweep.number, sweep_name(sweep.number)))
-        below.set_xticks(_places(sweep, values), [f"{value:g}" for value in values])
+        below.set_xlabel(_NAMES.get(number, sweep_name(number)))
+        below.set_xticks(_places(number, values), [f"{value:g}" for value in values])
     # Matplotlib names every pattern of dashes "--", so that a style cannot be read back from a line.
     handles = [
         Line2D([], [], color=colour, lw=1, ls=_style(place), label=label)
@@ -182,52 +164,51 @@ def curve_figure(sweep: Sweep, summary: pd.DataFrame) -> Figure:
     return figure
 
 
-def _label_lines(sweep: Sweep, rows: pd.DataFrame) -> pd.DataFrame:
+def _label_lines(number: str, lines: Sequence[Line], rows: pd.DataFrame) -> pd.DataFrame:
     """What names lines and their panels: a row a line, with the `planner` and the `name` of the line beside `_LABELS`.
 
     Of the part that is swept it is the name alone, since its label holds the number.
     """
-    table = []
-    for line in sweep.lines:
-        first = rows.loc[line.conditions[0]]
-        labels = {name: first[name] for name in ("model", "planner", "risk", "robot", "objective")}
-        for name, label in labels.items():
-            if sweep.number.startswith(f"{name}.") and label != NOT_USED:
-                labels[name] = str(line.rest[f"{name}.part"])
-        world = first["world"]
-        table.append(
-            {
-                "scenario": str(line.rest["split"]).removeprefix("test/"),
-                "data": str(line.rest.get("data", first["data"])),
-                "world": world.split(" ")[0] if sweep.number.startswith(("world.", "rules.")) else world,
-                **labels,
-                "planner": first["planner"],
-                "who": planner_name(labels["planner"]),
-            }
-        )
-    labelled = pd.DataFrame(table)
+    labelled = rows.loc[[line.conditions[0] for line in lines]].reset_index(drop=True)
+    labelled["scenario"] = [str(line.rest["split"]).removeprefix("test/") for line in lines]
+    labelled["who"] = labelled["planner"]
+    if number.startswith(("world.", "rules.")):
+        labelled["world"] = labelled["world"].str.partition(" ")[0]
+    part = number.partition(".")[0]
+    column = "who" if part == "planner" else part
+    if f"{part}.part" in lines[0].rest:
+        parts = np.array([line.rest.get(f"{part}.part") for line in lines])
+        labelled[column] = labelled[column].where(labelled[column] == NOT_USED, parts)
+    labelled["who"] = labelled["who"].map(planner_name)
     names = {}
     for _, alike in labelled.groupby(list(_LABELS), sort=False):
-        rests = [sweep.lines[number].rest for number in alike.index]
-        for number, rest in zip(alike.index, rests, strict=True):
+        rests = [lines[place].rest for place in alike.index]
+        for place, rest in zip(alike.index, rests, strict=True):
             # What labels do not say is said where that is needed.
             differing = [key for key in rest if len({repr(other.get(key)) for other in rests}) > 1]
             more = (f"{sweep_name(key)} {rest[key]}" for key in differing)
-            names[number] = joined([alike["who"][number], alike["risk"][number], *more])
+            names[place] = joined([alike["who"][place], alike["risk"][place], *more])
     return labelled.assign(name=pd.Series(names))
 
 
 def _panels(labels: pd.DataFrame) -> list[tuple[str, list[int]]]:
-    """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish."""
-    for left_out in (("who", "risk"), ("risk",), ()):
+    """Titles and lines of the panels: split until no panel holds more lines than a reader can distinguish.
+
+    What is blind stands in the panels of the models that it stands beside.
+    """
+    numbered = labels.assign(line=labels.index)
+    blind = numbered["model"] == NOT_USED
+    for left_out in ({"who", "risk"}, {"risk"}, set()):
         columns = [name for name in _LABELS if name not in left_out]
-        groups = {key: group.index.tolist() for key, group in labels.groupby(columns, sort=False)}
-        if len(left_out) == 2:
-            groups = _with_blind(groups)
-        if max(map(len, groups.values())) <= _MOST_LINES:
+        panels = numbered.loc[~blind, columns].drop_duplicates()
+        shared = [name for name in columns if name != "model"]
+        beside = numbered[blind].drop(columns="model").merge(panels, "left", shared)
+        every = pd.concat([numbered[~blind], beside.fillna({"model": NOT_USED})])
+        groups = every.groupby(columns, sort=False)["line"].agg(list).reset_index()
+        if groups["line"].map(len).max() <= _MOST_LINES:
             break
-    differing = [place for place, own in enumerate(zip(*groups, strict=True)) if len(set(own)) > 1]
-    return [(joined(key[place] for place in differing) or key[0], lines) for key, lines in groups.items()]
+    differing = [name for name in columns if groups[name].nunique() > 1]
+    return [(joined(own[differing]) or own["scenario"], own["line"]) for _, own in groups.iterrows()]
 
 
 def _references(first: Labels, others: Iterable[Labels]) -> Iterator[tuple[str, Labels]]:
@@ -239,27 +220,12 @@ def _references(first: Labels, others: Iterable[Labels]) -> Iterator[tuple[str, 
             yield planner_name(row["planner"]) if blind else row["risk"], row
 
 
-def _places(sweep: Sweep, values: Sequence[float]) -> np.ndarray:
+def _places(number: str, values: Sequence[float]) -> np.ndarray:
     """Where values stand: levels by the logarithm of the tail's share, since they crowd toward 1."""
     numbers = np.asarray(values)
-    return -np.log(1 - numbers) if sweep.number == _LEVEL and numbers.max() < 1 else numbers
-
-
-def _with_blind(groups: dict[Any, list[int]]) -> dict[Any, list[int]]:
-    """Puts what is blind into the panels of the models that it stands beside."""
-    merged: dict[Any, list[int]] = {}
-    for key, lines in groups.items():
-        scenario, data, world, model, *rest = key
-        beside = [k for k in groups if k != key and (*k[:3], *k[4:]) == (scenario, data, world, *rest)]
-        if model != NOT_USED or not beside:
-            merged[key] = [*merged.get(key, []), *lines]
-            continue
-        for other in beside:
-            merged[other] = [*lines, *merged.get(other, [])]
-    return merged
+    return -np.log(1 - numbers) if number == _LEVEL and numbers.max() < 1 else numbers
 
 
 def _style(place: int) -> Any:
-    """A pattern of dashes for each setting: those of `_STYLES`, then dashes with more and more dots between."""
-    more = place - len(_STYLES) + 3
-    return _STYLES[place] if place < len(_STYLES) else (0, (8, 2, *(1, 1.5) * more))
+    """A pattern of dashes for each setting, with more and more dots between."""
+    return (0, (6, 2, *(1, 1.5) * place))

@@ -147,27 +147,25 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
-    recording = drivers[0].recording
-    about = recording.about
+    about, driven = drivers[0].recording.about, [driver.recording for driver in drivers]
+    used = [name for name in NAMING if any(own.about.get(name, NOT_USED) != NOT_USED for own in driven)]
+    rows = {
+        **{name: [own.about.get(name, NOT_USED) for own in driven] for name in used},
+        "outcome": [Bold(own.outcome) for own in driven],
+        "time": [f"{own.end_s:.1f} s of {own.time_budget_s:g} s" for own in driven],
+        "observed λ": [_mean_observed(own) for own in driven],
+        "free": [free_rule(own) for own in driven],
+    }
+    table = Table(
+        headings=("", *(driver.name for driver in drivers)),
+        rows=tuple((name, *cells) for name, cells in rows.items()),
+    )
     lines = [
         f"# {about['data']}, {about['scenario']} {about['map']}",
         f"Seed {about['seed']}, realisation {about['realisation']}",
+        to_markdown(table),
     ]
-    if len(drivers) == 1:
-        ended = f"**{recording.outcome}** after {recording.end_s:.1f} s of {recording.time_budget_s:g} s"
-        met = f"observed λ on average: {_mean_observed(recording)}"
-        used = tuple((name, about[name]) for name in NAMING if about.get(name, NOT_USED) != NOT_USED)
-        table = Table(headings=("", ""), rows=used)
-        return "\n\n".join([*lines, ended, met, f"Free: {free_rule(recording)}", to_markdown(table)])
-    rows = []
-    for driver in drivers:
-        own = driver.recording
-        rows.append((driver.name, Bold(own.outcome), f"{own.end_s:.1f}", _mean_observed(own), free_rule(own)))
-    table = Table(
-        headings=("condition", "outcome", "time [s]", "observed λ", "free"),
-        rows=tuple(rows),
-    )
-    return "\n\n".join([*lines, to_markdown(table)])
+    return "\n\n".join(lines)
 
 
 def free_rule(recording: Recording) -> str:

@@ -28,7 +28,7 @@ _PIECE = 10
 # An X in one stroke, and its half width.
 _CROSS = np.array([(-1, -1), (1, 1), (0, 0), (-1, 1), (1, -1)], dtype=np.float32)
 _CROSS_M = 1.0
-_MARK, _EDGE = (255, 255, 255), (0, 0, 0)
+_MARK = (255, 255, 255)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,23 +119,20 @@ def log_driven(stream: Any, driver: Driver) -> None:
 
 def log_plans(stream: Any, driver: Driver) -> None:
     """Logs what was planned, when it was planned; of a robot that is not alone, the path alone."""
-    known: dict[str, list[np.ndarray]] = {}
+    known: dict[str, list[bytes]] = {}
     for plan in map(thinned, driver.recording.own_plans):
         stream.set_time(TIMELINE, duration=plan.step * driver.recording.dt_s)
         for name, style in STYLES.items():
             lines = list(plan.lines.get(name, ()))
+            content = [line.tobytes() for line in lines]
             # A layer without lines is logged too: it wipes out the earlier plan's. One that stays is not.
-            if (driver.name and name != "path") or _same(known.get(name), lines):
+            if (driver.name and name != "path") or known.get(name) == content:
                 continue
-            known[name] = lines
+            known[name] = content
             colours = [bytes_of(driver.colour, 0.628) if driver.name else bytes_of(style.colour)]
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
             entities = driver.entities(f"plan/{name}")
             log_both(stream, driver.recording, entities, STRIPS, lines, radii, colors=colours)
-
-
-def _same(known: list[np.ndarray] | None, lines: list[np.ndarray]) -> bool:
-    return known is not None and len(known) == len(lines) and all(map(np.array_equal, known, lines))
 
 
 def log_outcome(stream: Any, driver: Driver) -> None:
@@ -147,12 +144,9 @@ def log_outcome(stream: Any, driver: Driver) -> None:
         stream, recording, driver.entities("outcome"), POINTS, [recording.track[-1]],
         (0.05, 0.1), LIFT_M + 0.6, labels=words, show_labels=True, colors=[bytes_of(driver.colour)],
     )  # fmt: skip
-    if recording.immobilised_at is None:
-        return
-    cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
-    lifted, flat = over_ground(recording, cross, LIFT_M + 0.3), on_map(recording.grid, cross)
-    world, overlay = driver.entities("immobilised")
-    stream.log(world, rr.LineStrips3D([lifted], colors=[_MARK], radii=0.12))
-    for name, colour, radius, order in (("edge", _EDGE, 0.55, 40), ("cross", _MARK, 0.3, 41)):
-        crossed = rr.LineStrips2D([flat], colors=[colour], radii=radius, draw_order=order)
-        stream.log(f"{overlay}/{name}", crossed)
+    if recording.immobilised_at is not None:
+        cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)
+        log_both(
+            stream, recording, driver.entities("immobilised"), STRIPS, [cross], (0.12, 0.3), LIFT_M + 0.3,
+            colors=[_MARK],
+        )  # fmt: skip

@@ -17,7 +17,7 @@ def condition(split: str = "test/std", level: float | None = None, **options: An
 
 def found(*conditions: dict[str, Any]) -> dict[str, list[tuple[tuple[float, ...], tuple[str, ...]]]]:
     sweeps = find_sweeps({str(place): about for place, about in enumerate(conditions)})
-    return {sweep.number: [(line.values, line.conditions) for line in sweep.lines] for sweep in sweeps}
+    return {number: [(line.values, line.conditions) for line in lines] for number, lines in sweeps.items()}
 
 
 def test_three_values_of_one_number_make_a_line_and_are_put_in_order() -> None:
@@ -52,7 +52,7 @@ def test_scenarios_of_a_series_make_a_line_over_severity_that_std_begins() -> No
 
 @pytest.mark.parametrize("value", [{"world": {"time_budget_s": 100.0}}])
 def test_conditions_that_say_too_little_of_themselves_make_none(value: dict[str, Any]) -> None:
-    assert find_sweeps({str(i): {"value": value} for i in range(4)}) == []
+    assert find_sweeps({str(i): {"value": value} for i in range(4)}) == {}
 
 
 LEVELS = (0.5, 0.8, 0.9)
@@ -85,8 +85,8 @@ def drawn(*conditions: tuple[dict[str, str], int], **changes: Any) -> Figure:
         "+".join(made.row(labels)["condition"].split("+")): values(labels, **changes)
         for labels, _ in conditions
     }
-    (sweep,) = find_sweeps(known)
-    return curve_figure(sweep, made.summarised(rows))
+    ((number, lines),) = find_sweeps(known).items()
+    return curve_figure(number, lines, made.summarised(rows))
 
 
 def shown(figure: Figure) -> list[Axes]:

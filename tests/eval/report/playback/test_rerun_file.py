@@ -5,9 +5,9 @@ import matplotlib
 import numpy as np
 import pytest
 
-from benchnav.core.figures import bytes_of
+from benchnav.core.figures import bytes_of, hatching, outline
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
-from benchnav.eval.report.layers import IMMOBILISING, field_colours, hatching, outline
+from benchnav.eval.report.layers import IMMOBILISING, field_colours
 from benchnav.eval.report.playback.rerun_file import arrange, describe, drivers_of, map_views, write_rerun
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
@@ -144,7 +144,7 @@ def test_an_immobilised_robot_is_crossed_out_from_that_moment_on(tmp_path: Path)
     flat = (x / 0.5, 40 - y / 0.5)
     for entity, place, size in (
         ("/world/immobilised", (x, y), 2),
-        ("/map/overlay/immobilised/cross", flat, 4),
+        ("/map/overlay/immobilised", flat, 4),
     ):
         times, ((cross,),) = column(path, entity, "strips")  # type: ignore[misc]
         np.testing.assert_allclose(times, [4.3], atol=1e-6)
@@ -285,8 +285,9 @@ def test_an_episode_is_told_with_its_outcome_and_the_threshold() -> None:
     recording = made.held_recording(43, free_by="mean", free_above=0.1, time_budget_s=90.0)
     text = describe(drivers_of([recording]))
     for words in (
-        "**immobilised** after 4.3 s of 90 s",
-        "Free: mean λ above 0.1",
+        "| outcome | **immobilised** |",
+        "| time | 4.3 s of 90 s |",
+        "| free | mean λ above 0.1 |",
         "| planner | mppi |",
         "std 4",
     ):
@@ -297,9 +298,10 @@ def test_conditions_are_told_side_by_side() -> None:
     first = made.recording(200, labels=made.condition(risk="cvar:0.9"))
     about = {**made.recording().about, "risk": "mean", "outcome": "out_of_bounds"}
     text = describe(drivers_of([first, made.recording(150, about=about)]))
-    assert "| cvar:0.9 | **success** | 20.0 |" in text
-    assert "| mean | **out of bounds** | 15.0 |" in text
+    assert "|  | cvar:0.9 | mean |" in text
+    assert "| outcome | **success** | **out of bounds** |" in text
+    assert "| time | 20.0 s of 100 s | 15.0 s of 100 s |" in text
 
 
 def test_an_episode_that_ended_at_once_met_nothing() -> None:
-    assert "observed λ on average: –" in describe(drivers_of([made.recording(0)]))
+    assert "| observed λ | – |" in describe(drivers_of([made.recording(0)]))
