@@ -259,17 +259,17 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = T
     """
     squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
     for terrain in chunks:
-        table, labelled = table.to(terrain.class_id.device), terrain.class_id != UNLABELLED
-        class_id = torch.where(labelled, terrain.class_id, 0)
-        own, known = table.own(class_id, terrain.slope_deg), labelled & ~terrain.traversability.isnan()
-        off = (own.means[:, 0] - terrain.truth.means[:, 0])[labelled]
-        squares += float(off.double().square().sum())
-        cells += off.numel()
-        observed = terrain.traversability[known].unsqueeze(0)
-        surprise -= float(own.at(known).log_prob(observed).double().sum())
+        labelled = terrain.class_id != UNLABELLED
+        layers = (terrain.class_id, terrain.slope_deg, terrain.traversability)
+        class_id, slope_deg, observed = (layer[labelled].unsqueeze(0) for layer in layers)
+        own, true = table.own(class_id, slope_deg), terrain.truth.at(labelled)
+        known = ~observed.isnan()
+        surprise -= float(own.log_prob(observed)[known].double().sum())
         seen += int(known.sum())
-        ratio = (table.noise_std[class_id] / terrain.truth.stds[:, 0])[labelled]
-        if len(ratio):
+        squares += float((own.means[0] - true.means[0]).double().square().sum())
+        cells += class_id.numel()
+        if class_id.numel():
+            ratio = table.noise_std[class_id] / true.stds[0]
             noise_error = max(noise_error, float((ratio - 1).abs().max()))
     errors = {"latent_rmse": (squares / max(1, cells)) ** 0.5, "noise_error": noise_error} if truth else {}
     return {**errors, "nll": surprise / max(1, seen)}

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.settings import hint
-from benchnav.models.slope_gp.cells import Cells, observed_cells
+from benchnav.models.slope_gp.cells import Cells
 
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
 COLUMNS = ("class", "slope_deg", "traversability")
@@ -34,60 +34,30 @@ _MOST_CLASSES = 256  # class ids are stored in a byte
 
 @dataclass(frozen=True, kw_only=True)
 class SlipLogs:
-    """The rows of a slip log. Letters in shapes: N rows.
+    """What is learned from of a slip log.
 
     Args:
-        class_names: in alphabetical order; for integer ids "0", "1", … up to the largest.
-        by_id: whether the log names classes by integer ids.
-        class_id: index into `class_names`, int64, shape [N].
-        slope_deg: in [0, 90], float32, shape [N].
-        traversability: observed λ in [0, 1], float32, shape [N].
+        class_names: the class table.
+        cells: the rows with a slope and a traversability, in order, under the ids of that table.
         digest: SHA-256 of the file.
     """
 
     class_names: tuple[str, ...]
-    by_id: bool
-    class_id: Tensor
-    slope_deg: Tensor
-    traversability: Tensor
+    cells: Cells
     digest: str
 
-    def cells(self, class_names: tuple[str, ...]) -> Cells:
-        """Gives the rows with the ids of a class table.
 
-        Args:
-            class_names: the class table; integer ids of the log are indices into it.
-
-        Raises:
-            DatasetError: the log has a class that the table lacks.
-        """
-        if self.by_id:
-            if len(self.class_names) > len(class_names):
-                raise DatasetError(
-                    f"Expected class ids in 0–{len(class_names) - 1} in the slip log, got "
-                    f"{self.class_names[-1]}. Number the classes as in the class table."
-                )
-            ids = self.class_id
-        else:
-            for name in self.class_names:
-                if name not in class_names:
-                    near = hint(name, class_names) or " Name classes as in the class table."
-                    raise DatasetError(
-                        f"Expected classes among {', '.join(class_names)} in the slip log, got {name!r}.{near}"
-                    )
-            ids = torch.tensor([class_names.index(name) for name in self.class_names])[self.class_id]
-        return observed_cells(ids, self.slope_deg, self.traversability, len(class_names))
-
-
-def read_slip_logs(path: str | Path) -> SlipLogs:
+def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipLogs:
     """Reads a slip log.
 
     Args:
         path: a file that ends in one of `ENDINGS`.
+        class_names: the class table, into which integer ids of the log are indices. Where none is given it is that of
+            the log: its classes in alphabetical order; for integer ids "0", "1", … up to the largest.
 
     Raises:
-        DatasetError: there is no such file, it cannot be read, lacks a column or rows, or a value is no
-            number or out of range.
+        DatasetError: there is no such file, it cannot be read, lacks a column or rows, has a class that the table
+            lacks, or a value is no number or out of range.
     """
     path = Path(path)
     rows = _read(path)
@@ -110,14 +80,11 @@ def read_slip_logs(path: str | Path) -> SlipLogs:
             f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {observed.sum()} rows, as of "
             "radians. Multiply radians by 57.2958. Ground that level in degrees looks the same: log steeper too."
         )
-    names, by_id, ids = _read_classes(rows["class"], observed, path)
+    class_names, class_id = _read_classes(rows["class"], observed, path, class_names)
     slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
     return SlipLogs(
-        class_names=names,
-        by_id=by_id,
-        class_id=torch.from_numpy(ids),
-        slope_deg=slope,
-        traversability=value,
+        class_names=class_names,
+        cells=Cells(class_id=class_id, slope_deg=slope, traversability=value),
         digest=hashlib.sha256(path.read_bytes()).hexdigest(),
     )
 
@@ -160,9 +127,9 @@ def _read_numbers(column: pd.Series, name: str, most: float, path: Path) -> np.n
 
 
 def _read_classes(
-    column: pd.Series, observed: np.ndarray, path: Path
-) -> tuple[tuple[str, ...], bool, np.ndarray]:
-    """Gives class names, whether they are ids, and the index of each observed row's class."""
+    column: pd.Series, observed: np.ndarray, path: Path, names: tuple[str, ...]
+) -> tuple[tuple[str, ...], Tensor]:
+    """Gives the class table, that of the log where it has no names yet, and the id of each observed row."""
     text = column.astype("string").str.strip().fillna("").to_numpy(str)
     absent = np.flatnonzero(observed & (text == ""))
     if len(absent):
@@ -171,18 +138,28 @@ def _read_classes(
         )
     found = text[observed]
     # pandas writes ids so where some are missing: 0.0
-    by_id = all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found)
-    if by_id:
+    if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
         if broken := [name for name in found if float(name) % 1]:
             raise DatasetError(
                 f"Expected class ids as whole numbers in {path}, got {broken[0]}. Number or name the classes."
             )
-        ids: Any = [int(name.partition(".")[0]) for name in found]
-        names: Any = range(max(ids) + 1)
+        ids = np.array([int(name.partition(".")[0]) for name in found])
+        own: Any = range(int(ids.max()) + 1)
+        if names and len(own) > len(names):
+            raise DatasetError(
+                f"Expected class ids in 0–{len(names) - 1} in the slip log, got {ids.max()}. "
+                "Number the classes as in the class table."
+            )
     else:
-        names, ids = np.unique(found, return_inverse=True)
-    if len(names) > _MOST_CLASSES:
+        own = np.unique(found)
+        if names and (others := [name for name in own if name not in names]):
+            near = hint(others[0], names) or " Name classes as in the class table."
+            raise DatasetError(
+                f"Expected classes among {', '.join(names)} in the slip log, got {str(others[0])!r}.{near}"
+            )
+        ids = pd.Index(names or own).get_indexer(found)
+    if len(own) > _MOST_CLASSES:
         raise DatasetError(
-            f"Expected at most {_MOST_CLASSES} classes in {path}, got {len(names)}. Number classes from 0."
+            f"Expected at most {_MOST_CLASSES} classes in {path}, got {len(own)}. Number classes from 0."
         )
-    return tuple(map(str, names)), by_id, np.array(ids, np.int64)
+    return names or tuple(map(str, own)), torch.from_numpy(ids.astype(np.int64))

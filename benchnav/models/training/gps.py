@@ -89,10 +89,9 @@ def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: 
 
 def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
-    logs = read_slip_logs(data)
     there = existing(Path(out), options.overwrite)
-    names = there.class_names if there else logs.class_names
-    cells = logs.cells(names)
+    logs = read_slip_logs(data, there.class_names if there else ())
+    names, cells = logs.class_names, logs.cells
     sums, digest = SlopeSums.of(cells, len(names)), f"file:{logs.digest}"
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))

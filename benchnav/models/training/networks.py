@@ -211,11 +211,8 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
     parts = member_names(target.checkpoint)
     if not isinstance(config, ClassifierConfig) or len(parts) == 1 or not is_first_process():
         return
-    # The classifiers as they are kept.
     members = [
-        TerrainClassifier.from_tensors(
-            part.config, len(target.checkpoint.class_names), as_stored(part.tensors, part.half_precision)
-        )
+        TerrainClassifier.from_tensors(part.config, len(target.checkpoint.class_names), part.tensors)
         for part in map(target.checkpoint.part, parts)
     ]
     temperature = fit_pool_temperature(members, read_maps(dataset, VALID), options.seed, options.place)

@@ -63,24 +63,24 @@ class Target:
             return False
         # A part of an earlier version does not name settings that came later, nor those of the trainer.
         options, defaults = self.options, asdict(type(config)())
-        wanted, there = asdict(config), {key: part.config.get(key, usual) for key, usual in defaults.items()}
+        wanted = {**asdict(config), "seed": seed, "data": self.digest}
+        there = {key: part.config.get(key, usual) for key, usual in defaults.items()}
+        there |= {"seed": part.seed, "data": part.data_digest}
         if isinstance(config, NetworkConfig):
             wanted["half_precision"], there["half_precision"] = options.half_precision, part.half_precision
             if part.trainer is not None:
                 wanted |= {f"trainer.{key}": value for key, value in options.trainer_settings.items()}
                 there |= {f"trainer.{key}": value for key, value in part.trainer.items()}
-        named = f", {others}" if (others := differing(wanted, there)) else ""
-        if not named and part.seed == seed:
-            if part.data_digest == self.digest:
-                forget(options, name)  # a kill may have come between saving and forgetting
-                return True
-            named = ", other maps or another class table, or maps as recorded by benchnav before 0.7"
+        others = differing(wanted, there)
+        if not others:
+            forget(options, name)  # a kill may have come between saving and forgetting
+            return True
         remedy = "pass --overwrite instead of --resume"
         if interrupted(options, [name]):
             remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
-            f"{part.seed} and {part.data_id}{named}. Repeat its settings, or {remedy}."
+            f"{part.seed} and {part.data_id}, {others}. Repeat its settings, or {remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:
