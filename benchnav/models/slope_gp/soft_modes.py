@@ -110,11 +110,9 @@ def _find_in_class(counts: Tensor) -> _Modes | None:
     flat = _Modes(mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD)
     single, single_fit = _maximise(cells, flat, _MOST_STEPS)
     places = torch.tensor(_STARTS, dtype=torch.float64).unsqueeze(1)
-    same = torch.ones_like(places)
-    seconds = (_FIRST_WEIGHT * same, places, _FIRST_STD * same)
-    starts, fits = _maximise(
-        cells, _Modes(single.main * same, single.main_std * same, *seconds), _FIRST_STEPS
-    )
+    weights, stds = torch.full_like(places, _FIRST_WEIGHT), torch.full_like(places, _FIRST_STD)
+    second = _Modes(single.main, single.main_std, weights, places, stds)
+    starts, fits = _maximise(cells, second, _FIRST_STEPS)
     double, double_fit = _maximise(cells, starts.select(int(fits.argmax())), _MOST_STEPS)
     gain, weight = float(double_fit - single_fit), float(double.weight)
     least = max(LEAST_GAIN * total, (_FREE_PARAMETERS * math.log(total) + _STRONG) / 2)

@@ -5,7 +5,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchnav.core.command import Device, tell
-from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import GP, Checkpoint, Part
 from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
@@ -61,7 +60,6 @@ def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions
         options: how to train.
     """
     check_seed(options.seed)
-    output_path(out)  # refuses addresses
     how = FitOptions(**vars(options))
     if data.endswith(ENDINGS):
         _train_on_logs(data, out, config, how)

@@ -4,7 +4,6 @@ Every refusal comes before any work is done. Where processes train together, the
 and writes.
 """
 
-import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from typing import Any
 from rich.filesize import decimal
 
 from benchnav.core.errors import CheckpointError
-from benchnav.core.store import building, real_place, refuse_taken, restore
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -20,9 +18,9 @@ from benchnav.models.checkpoint import (
     FUSED,
     Checkpoint,
     Part,
-    foreign,
     is_member,
     load_checkpoint,
+    open_place,
     save_checkpoint,
 )
 from benchnav.models.config import NetworkConfig
@@ -126,26 +124,25 @@ def open_target(
         CheckpointError: what is there would be lost or does not fit.
         ConfigError: the folder is something else.
     """
-    folder = real_place(Path(os.path.normpath(out)))  # a/../b is b, whether or not there is an a
-    is_first, left = is_first_process(), interrupted(options, parts)
-    if left and is_first and not (options.resume or options.overwrite):
+    left = interrupted(options, parts)
+    # The first process alone refuses; those beside it begin without what it may have saved meanwhile.
+    may_replace = options.overwrite or not (options.resume or is_first_process())
+    if left and not (options.resume or may_replace):
         raise CheckpointError(
             f"Expected no interrupted training in {options.folder}, got one of {' and '.join(left)}. "
             "Pass --resume to go on with it, or --overwrite to begin anew."
         )
-    restore(folder)
-    refuse_taken(folder, True, foreign)
     # Whether a checkpoint can be written there shows now rather than after the training.
-    with building(folder):
-        checkpoint = existing(folder, options.overwrite) or fresh
+    with open_place(out) as (folder, _):
+        checkpoint = existing(folder, may_replace) or fresh
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
-        if not options.overwrite:
+        if not may_replace:
             raise CheckpointError(
                 f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(checkpoint)}. "
                 "Choose another `out`, or pass --overwrite to replace it."
             )
         checkpoint = fresh
-    if options.overwrite:
+    if may_replace:
         # Members of an ensemble stand or fall together.
         kept = {
             name: part
@@ -154,17 +151,13 @@ def open_target(
         }
         checkpoint = replace(checkpoint, parts=kept)
     elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):
-        if is_first:
-            # The processes alone are trained in a moment, and so not gone on with.
-            resume = (
-                ", or --resume to go on with what an interrupted training has left" if options.folder else ""
-            )
-            raise CheckpointError(
-                f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
-                f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
-                f"{resume}."
-            )
-        checkpoint = fresh
+        # The processes alone are trained in a moment, and so not gone on with.
+        resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
+        raise CheckpointError(
+            f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
+            f"{resume}."
+        )
     return Target(folder, checkpoint, digest, options)
 
 

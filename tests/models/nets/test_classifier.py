@@ -12,8 +12,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier
-from benchnav.models.nets.network import build_network
+from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier, build_network
 from benchnav.models.nets.trainable import MapScale
 from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.networks import fit_network
