@@ -25,7 +25,6 @@ import timm
 import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
-from torchmetrics import Metric
 from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardIndex
 
 from benchnav.core import rng
@@ -47,14 +46,7 @@ class MeanIoU(MulticlassJaccardIndex):
     """Intersection over union in the mean over the classes that occur in truth; not a number where none does.
 
     torchmetrics' own mean counts a class that no cell has as 0 as soon as one cell is taken for it.
-
-    Args:
-        class_count: C.
     """
-
-    def __init__(self, class_count: int) -> None:
-        """Starts with no cells."""
-        super().__init__(class_count, average="none", ignore_index=UNLABELLED)
 
     def compute(self) -> Tensor:
         """The mean over all cells so far."""
@@ -80,8 +72,11 @@ class TerrainClassifier(TrainableNetwork):
         self, config: ClassifierConfig, class_count: int, scale: MapScale = NO_SCALE, seed: int = 0
     ) -> None:
         """Builds the network with fresh weights."""
-        self.class_count = class_count
-        super().__init__(config)
+        super().__init__(
+            config,
+            accuracy=MulticlassAccuracy(class_count, average="micro", ignore_index=UNLABELLED),
+            miou=MeanIoU(class_count, average="none", ignore_index=UNLABELLED),
+        )
         # Logits are divided by it once training is over (see `fit_temperature`).
         self.temperature = 1.0
         self.register_buffer("colour_mean", scale.colour_mean.clone().view(3, 1, 1))
@@ -114,13 +109,6 @@ class TerrainClassifier(TrainableNetwork):
             overlap = smp.losses.DiceLoss("multiclass", ignore_index=UNLABELLED)
             loss = loss + self.config.dice * overlap(logits, class_id)
         return loss
-
-    def configure_metrics(self) -> dict[str, Metric]:
-        """Share of the labelled cells that are right, and mean intersection over union."""
-        return {
-            "accuracy": MulticlassAccuracy(self.class_count, average="micro", ignore_index=UNLABELLED),
-            "miou": MeanIoU(self.class_count),
-        }
 
     def settings(self) -> dict[str, Any]:
         """The configuration and the temperature."""

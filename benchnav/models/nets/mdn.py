@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchmetrics import MeanSquaredError, Metric
+from torchmetrics import MeanSquaredError
 
 from benchnav.core.mixture import TraversabilityMixture, component_log_prob
 from benchnav.core.terrain import Observation
@@ -92,7 +92,7 @@ class MixtureDensityNetwork(TrainableNetwork):
         self, config: MDNConfig, class_count: int, scale: MapScale = NO_SCALE, seed: int = 0
     ) -> None:
         """Builds the network with fresh weights."""
-        super().__init__(config)
+        super().__init__(config, rmse=MeanSquaredError(squared=False))
         self.register_buffer("slope_scale_deg", scale.slope_deg.clone())
         image = ClassifierConfig(
             architecture=config.architecture, encoder=config.encoder, pretrained=config.pretrained
@@ -112,10 +112,6 @@ class MixtureDensityNetwork(TrainableNetwork):
         width = math.log(math.expm1(_FIRST_STD - LEAST_STD))  # softplus⁻¹
         first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
         self.head.load_state_dict({"weight": _FIRST_SPREAD * self.head.weight, "bias": first})
-
-    def configure_metrics(self) -> dict[str, Metric]:
-        """The error of the expectation, in root mean square over the observed cells."""
-        return {"rmse": MeanSquaredError(squared=False)}
 
     def forward(self, rgb: Tensor, slope_deg: Tensor) -> Parameters:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.

@@ -17,8 +17,6 @@ from benchnav.core.mixture import TraversabilityMixture
 STEP_DEG = 0.1
 STEEPEST_DEG = 90.0
 
-_TABLES = ("mean", "std", "noise_std")
-
 
 def table_slopes() -> Tensor:
     """The nodes 0°, 0.1°, …, 90°, float64, shape [G]."""
@@ -96,9 +94,9 @@ class SlopeTable:
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the tables by name, for a checkpoint."""
-        tables = {name: getattr(self, name) for name in _TABLES}
         soft = vars(self.soft) if self.soft else {}
-        return {**tables, **{f"soft_{name}": values for name, values in soft.items()}}
+        tables = {"mean": self.mean, "std": self.std, "noise_std": self.noise_std}
+        return tables | {f"soft_{name}": values for name, values in soft.items()}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> "SlopeTable":
@@ -111,7 +109,7 @@ class SlopeTable:
         soft = None
         if "soft_weight" in tensors:
             soft = SoftModes(**{name: tensors[f"soft_{name}"] for name in ("weight", "mean", "std")})
-        return cls(**{name: tensors[name] for name in _TABLES}, soft=soft)
+        return cls(mean=tensors["mean"], std=tensors["std"], noise_std=tensors["noise_std"], soft=soft)
 
     def _read(self, classes: Tensor | slice, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
         """Means and standard deviations of classes, between the node under each slope and the next."""

@@ -8,9 +8,16 @@ from benchnav.core.command import Device, tell
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import GP, Checkpoint, Part
 from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
-from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, measure_latent, sum_split
+from benchnav.models.slope_gp.cells import (
+    ENDINGS,
+    SlopeSums,
+    cell_nll,
+    hold_out,
+    measure_latent,
+    read_slip_logs,
+    sum_split,
+)
 from benchnav.models.slope_gp.gp import LatentGPs, load_batches
-from benchnav.models.slope_gp.slip_logs import ENDINGS, read_slip_logs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say

@@ -9,8 +9,7 @@ import torch
 
 from benchnav.core.errors import DatasetError
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out
-from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, read_slip_logs
 from benchnav.models.training.gps import fit_gps
 from tests.models.support import make_cells
 
