@@ -29,8 +29,6 @@ _FIRST_STD, _FIRST_SPREAD = 0.2, 0.1
 _FEATURES = 32
 _CHUNK_CELLS = 2**17
 
-Parameters = tuple[Tensor, Tensor, Tensor]
-
 
 class LogNormalCDF(torch.autograd.Function):
     """log Φ(z) with the gradient φ/Φ as √(2/π) / erfcx(−z/√2).
@@ -113,7 +111,7 @@ class MixtureDensityNetwork(TrainableNetwork):
         first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
         self.head.load_state_dict({"weight": _FIRST_SPREAD * self.head.weight, "bias": first})
 
-    def forward(self, rgb: Tensor, slope_deg: Tensor) -> Parameters:
+    def forward(self, rgb: Tensor, slope_deg: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.
 
         Args:

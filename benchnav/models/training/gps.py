@@ -3,6 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
 
 from benchnav.core.command import Device, tell
 from benchnav.datagen.files.reader import TerrainDataset
@@ -17,7 +21,7 @@ from benchnav.models.slope_gp.cells import (
     read_slip_logs,
     sum_split,
 )
-from benchnav.models.slope_gp.gp import LatentGPs, load_batches
+from benchnav.models.slope_gp.gp import LatentGPs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
@@ -44,16 +48,11 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu") -> 
         soft, share = find_soft_modes(sums)
         bins = main_bins(sums, soft, share) if soft else bins
     model = LatentGPs(config, sums.steepest_deg, soft)
-    fit(
-        model,
-        GP,
-        FitOptions(device=device),
-        {},
-        [],
-        {"train_dataloaders": load_batches(config, bins)},
-        max_epochs=config.epochs,
-        precision="64-true",
-    )
+    # All cells are in each batch. A generator of its own keeps the loader from drawing on PyTorch's global one.
+    batches: Any = [bins] * config.epoch_steps
+    loader = DataLoader(batches, batch_size=None, generator=torch.Generator())
+    data = {"train_dataloaders": loader}
+    fit(model, GP, FitOptions(device=device), {}, [], data, max_epochs=config.epochs, precision="64-true")
     return model.cpu().eval()
 
 
