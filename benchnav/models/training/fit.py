@@ -264,9 +264,11 @@ class KeepBest(Callback):
     def __init__(self) -> None:
         """Starts with none."""
         self.best: dict[str, Any] = {"loss": float("inf"), "metrics": {}, "weights": {}}
+        self.validated = False
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Copies the weights when they are the best so far."""
+        self.validated = True
         metrics = {name: value for name, value in measured(trainer).items() if name.startswith("valid_")}
         if metrics["valid_loss"] < self.best["loss"]:
             weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
@@ -278,7 +280,7 @@ class KeepBest(Callback):
         if not self.best["weights"]:
             raise ConfigError(
                 "Expected a finite validation loss, got none. Train with a lower `learning_rate`."
-                if "valid_loss" in trainer.callback_metrics
+                if self.validated
                 else "Expected settings of `trainer` under which the split valid is measured, got an end of training "
                 "before it ever was. Train for longer, or validate more often."
             )
