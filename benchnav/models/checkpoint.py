@@ -25,6 +25,7 @@ import benchnav
 from benchnav.core.errors import BenchnavError, CheckpointError
 from benchnav.core.store import (
     building,
+    output_path,
     real_place,
     refuse_taken,
     replacing,
@@ -106,7 +107,7 @@ class Checkpoint:
         class_names: names of the C classes, in the order of their ids.
         parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
         model: registered name of the family that rebuilds the model.
-        pool_temperature: of the averaged probabilities of several classifiers (see `models.nets.temperature`);
+        pool_temperature: of the averaged probabilities of several classifiers (see `models.nets.classifier`);
             1 changes nothing.
     """
 
@@ -172,18 +173,27 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         ConfigError: the name is that of something else.
         BenchnavError: another process is writing it.
     """
-    folder = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
-    with sole_writer(folder, str(folder)):
-        restore(folder)
-        refuse_taken(folder, True, foreign)
-        with building(folder) as partial:
-            _write(partial, checkpoint)
-            take_place(partial, folder, last=CONFIG)
+    with sole_writer(Path(folder), str(folder)), open_place(folder) as (place, partial):
+        _write(partial, checkpoint)
+        take_place(partial, place, last=CONFIG)
 
 
-def foreign(folder: Path) -> str:
-    """Says why what is at a place is no checkpoint; empty where it is one. For `refuse_taken`."""
-    return "" if (folder / CONFIG).is_file() else "is something else than a checkpoint"
+@contextmanager
+def open_place(folder: str | Path) -> Iterator[tuple[Path, Path]]:
+    """Gives the place that the name of a checkpoint stands for, and an empty folder to write it in.
+
+    Raises:
+        OSError: it cannot be written.
+        ConfigError: the name is that of something else.
+    """
+    output_path(str(folder))  # refuses addresses
+    place = real_place(Path(os.path.normpath(folder)))  # a/../b is b, whether or not there is an a
+    restore(place)
+    refuse_taken(
+        place, True, lambda path: "" if (path / CONFIG).is_file() else "is something else than a checkpoint"
+    )
+    with building(place) as partial:
+        yield place, partial
 
 
 def load_checkpoint(folder: str | Path) -> Checkpoint:

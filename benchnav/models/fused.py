@@ -29,7 +29,7 @@ class FusedModel(ModelFamily):
         classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
         table: the GPs over slope.
         class_names: names of the C classes.
-        pool_temperature: of the averaged probabilities (see `models.nets.temperature`).
+        pool_temperature: of the averaged probabilities (see `models.nets.classifier`).
     """
 
     def __init__(

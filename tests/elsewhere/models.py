@@ -17,9 +17,13 @@ from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.classifier import (
+    TerrainClassifier,
+    fit_pool_temperature,
+    fit_temperature,
+    sample_logits,
+)
 from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
-from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.nets.trainable import MapScale
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module

@@ -13,8 +13,12 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.classifier import (
+    TerrainClassifier,
+    fit_pool_temperature,
+    fit_temperature,
+    sample_logits,
+)
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.data import read_maps

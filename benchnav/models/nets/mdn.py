@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torchmetrics import MeanSquaredError, Metric
+from torchmetrics import MeanSquaredError
 
 from benchnav.core.mixture import TraversabilityMixture, component_log_prob
 from benchnav.core.terrain import Observation
@@ -28,8 +28,6 @@ LEAST_STD = 0.01
 _FIRST_STD, _FIRST_SPREAD = 0.2, 0.1
 _FEATURES = 32
 _CHUNK_CELLS = 2**17
-
-Parameters = tuple[Tensor, Tensor, Tensor]
 
 
 class LogNormalCDF(torch.autograd.Function):
@@ -92,7 +90,7 @@ class MixtureDensityNetwork(TrainableNetwork):
         self, config: MDNConfig, class_count: int, scale: MapScale = NO_SCALE, seed: int = 0
     ) -> None:
         """Builds the network with fresh weights."""
-        super().__init__(config)
+        super().__init__(config, rmse=MeanSquaredError(squared=False))
         self.register_buffer("slope_scale_deg", scale.slope_deg.clone())
         image = ClassifierConfig(
             architecture=config.architecture, encoder=config.encoder, pretrained=config.pretrained
@@ -113,11 +111,7 @@ class MixtureDensityNetwork(TrainableNetwork):
         first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
         self.head.load_state_dict({"weight": _FIRST_SPREAD * self.head.weight, "bias": first})
 
-    def configure_metrics(self) -> dict[str, Metric]:
-        """The error of the expectation, in root mean square over the observed cells."""
-        return {"rmse": MeanSquaredError(squared=False)}
-
-    def forward(self, rgb: Tensor, slope_deg: Tensor) -> Parameters:
+    def forward(self, rgb: Tensor, slope_deg: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.
 
         Args:

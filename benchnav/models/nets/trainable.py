@@ -11,7 +11,7 @@ import lightning
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
-from torchmetrics import MeanMetric, Metric, MetricCollection
+from torchmetrics import MeanMetric, MetricCollection
 
 from benchnav.core.settings import of, read
 from benchnav.models.config import NetworkConfig
@@ -43,22 +43,20 @@ class TrainableNetwork(lightning.LightningModule):
 
     Args:
         config: what it is, and how it is trained.
+        metrics: what is measured on the validation maps beside the loss, by name.
     """
 
     part: ClassVar[str]  # name of the part of a model that it is
     kind: ClassVar[type[NetworkConfig]]  # of its settings
     fields: ClassVar[tuple[str, ...]]  # that are read beside `rgb`; the last is what it learns
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: NetworkConfig, **metrics: Any) -> None:
         """Prepares what is measured."""
         super().__init__()
         self.config: Any = config
         # A loss that is no number is to be seen, not left out.
-        metrics: dict[str, Any] = {
-            "loss": MeanMetric(nan_strategy=math.nan),
-            **self.configure_metrics(),
-        }
-        self.metrics = MetricCollection(metrics, prefix="valid_", compute_groups=False)
+        measured = {"loss": MeanMetric(nan_strategy=math.nan), **metrics}
+        self.metrics = MetricCollection(measured, prefix="valid_", compute_groups=False)
 
     @classmethod
     def from_tensors(cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]) -> Self:
@@ -77,10 +75,6 @@ class TrainableNetwork(lightning.LightningModule):
         network: Any = cls(built, class_count)  # type: ignore[call-arg]
         network.load_state_dict(tensors)
         return network.eval()
-
-    def configure_metrics(self) -> dict[str, Metric]:
-        """What is measured on the validation maps beside the loss, by name."""
-        return {}
 
     def assess(self, batch: dict[str, Tensor]) -> tuple[Tensor, int]:
         """Computes the loss of a batch, and of how many cells it is the mean; in evaluation updates `metrics`."""

@@ -49,8 +49,6 @@ def evaluate(
     dataset = TerrainDataset(find_dataset(data))
     if splits == []:
         raise ConfigError(f"Expected `splits` among {', '.join(dataset.splits)}, got none.")
-    for split in splits or ():
-        dataset.map_count(split)  # refuses an unknown one before the slow imports
 
     from benchnav.core.device import find_device
     from benchnav.core.figures import save_twice

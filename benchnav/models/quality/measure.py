@@ -236,21 +236,18 @@ def measure(
             tail_rate=in_tail,
             pit=tuple(histogram.tolist()),
         ),
-        classes=(tally.quality(),) if tally and tally.cells else (),
+        classes=(tally.quality(),) if tally and tally.confusion.any() else (),
     )
 
 
 def _predict(model: TraversabilityModel, terrain: Terrain) -> tuple[TraversabilityMixture, Tensor]:
     """The prediction, and the class probabilities of M members, shape [M, B, C, H, W], M = 0 where there are none."""
-    if isinstance(model, FusedModel):
-        observation = terrain.observe()
-        with exact_convolutions():
-            members = model.member_probabilities(observation)
-        return model.fuse(members, observation), members
-    mixture = predict(model, terrain)
+    observation = terrain.observe()
     with exact_convolutions():
-        found = model.member_probabilities(terrain.observe())
-    return mixture, torch.zeros(0) if found is None else found
+        members = model.member_probabilities(observation)
+    if isinstance(model, FusedModel) and members is not None:
+        return model.fuse(members, observation), members
+    return predict(model, terrain), torch.zeros(0) if members is None else members
 
 
 class _ClassTally:
@@ -263,7 +260,7 @@ class _ClassTally:
     """
 
     def __init__(self, count: int, device: torch.device, alike: Sequence[tuple[int, ...]]) -> None:
-        self.count, self.cells, self.brier = count, 0, 0.0
+        self.count, self.brier = count, 0.0
         self.confusion = torch.zeros(count, count, dtype=torch.int64, device=device)
         self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
         self.reliability = ReliabilityCurve(device)
@@ -282,7 +279,6 @@ class _ClassTally:
             class_id, slope_deg = (layer[labelled][None, None] for layer in (class_id, slope_deg))
         found = probabilities.argmax(1)
         wrong = found != class_id
-        self.cells += class_id.numel()
         self.confusion += multiclass_confusion_matrix(found, class_id, self.count)
         self.brier += float(brier_score(probabilities, class_id).double().sum())
         self.reliability.update(probabilities, class_id)
@@ -306,7 +302,7 @@ class _ClassTally:
             miou=miou,
             miou_predicted=miou_predicted,
             ece=calibration_error(curve),
-            brier=self.brier / self.cells,
+            brier=self.brier / int(self.confusion.sum()),
             entropy=entropy,
             mutual_information=information,
             entropy_auroc=entropy_auroc,

@@ -117,8 +117,7 @@ def pit_counts(transformed: Tensor) -> Tensor:
     Returns:
         int64 on the CPU, shape [20].
     """
-    place = (transformed.double() * PIT_BINS).floor().long().clamp(0, PIT_BINS - 1)
-    return torch.bincount(place.flatten(), minlength=PIT_BINS).cpu()
+    return torch.bincount(_bin(transformed.double(), PIT_BINS), minlength=PIT_BINS).cpu()
 
 
 def brier_score(probabilities: Tensor, class_id: Tensor) -> Tensor:
@@ -169,9 +168,8 @@ class ReliabilityCurve:
     def update(self, probabilities: Tensor, class_id: Tensor) -> None:
         """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
         confidence, found = probabilities.max(1)
-        place = (confidence * CONFIDENCE_BINS).floor().long().clamp(0, CONFIDENCE_BINS - 1).flatten()
         terms = torch.stack([torch.ones_like(confidence), confidence, found == class_id]).double().flatten(1)
-        self.sums.index_add_(1, place, terms)
+        self.sums.index_add_(1, _bin(confidence, CONFIDENCE_BINS), terms)
 
     def compute(self) -> Tensor:
         """Cells, mean confidence and accuracy of each bin, float64, shape [3, 15] on the CPU; 0 in empty bins."""
@@ -188,6 +186,11 @@ def calibration_error(curve: Tensor) -> float:
     """
     cells, confidence, accuracy = curve
     return float((cells * (accuracy - confidence).abs()).sum() / cells.sum())
+
+
+def _bin(values: Tensor, count: int) -> Tensor:
+    """The bin of each value among equal ones of [0, 1], int64, shape [N]."""
+    return (values * count).floor().long().clamp(0, count - 1).flatten()
 
 
 def _integrated_cdf(mixture: TraversabilityMixture, value: Tensor) -> Tensor:

@@ -6,19 +6,32 @@ observations at one slope enter the likelihood of the GPs by five sums. A bin of
 0.1 % of it. Sums of parts of the data add up, so that memory does not grow with them. A second mode of λ shows in no
 sum, so the cells are also counted by bins of λ. Letters in shapes: N cells, C classes, B bins of slope, V = 258 bins of
 λ: that at 0, 256 inside (0, 1), that at 1.
+
+A robot's own slip logs are tables with a row for each place driven over, CSV, TSV or Parquet. Columns: `class` (a
+class's name, or its integer id), `slope_deg` (0–90) and `traversability` (λ, 0–1; 1 minus the slip ratio where the
+robot holds its commanded speed). Others are ignored, and so are rows in which slope or traversability is missing.
 """
 
+import hashlib
+import re
+import warnings
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import reduce
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
+from pandas.api.types import is_numeric_dtype
 from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.core.mixture import map_tensors
+from benchnav.core.settings import hint
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
@@ -27,9 +40,15 @@ from benchnav.models.slope_gp.table import SlopeTable
 CHUNK_CELLS = 2**18
 BIN_DEG = 0.25
 INSIDE_BINS = 256
+ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
+COLUMNS = ("class", "slope_deg", "traversability")
 
 _BINS = round(90 / BIN_DEG) + 1
 _VALUES = INSIDE_BINS + 2
+_LIMITS = {"slope_deg": 90, "traversability": 1}
+_MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
+_ENOUGH = 20  # rows of which some would be steeper than 1.6° if slopes were in degrees
+_MOST_CLASSES = 256  # class ids are stored in a byte
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,17 +278,150 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = T
     """
     squares, cells, surprise, seen, noise_error = 0.0, 0, 0.0, 0, 0.0
     for terrain in chunks:
-        table, labelled = table.to(terrain.class_id.device), terrain.class_id != UNLABELLED
-        class_id = torch.where(labelled, terrain.class_id, 0)
-        own, known = table.own(class_id, terrain.slope_deg), labelled & ~terrain.traversability.isnan()
-        off = (own.means[:, 0] - terrain.truth.means[:, 0])[labelled]
-        squares += float(off.double().square().sum())
-        cells += off.numel()
-        observed = terrain.traversability[known].unsqueeze(0)
-        surprise -= float(own.at(known).log_prob(observed).double().sum())
+        labelled = terrain.class_id != UNLABELLED
+        layers = (terrain.class_id, terrain.slope_deg, terrain.traversability)
+        class_id, slope_deg, observed = (layer[labelled].unsqueeze(0) for layer in layers)
+        own, true = table.own(class_id, slope_deg), terrain.truth.at(labelled)
+        known = ~observed.isnan()
+        surprise -= float(own.log_prob(observed)[known].double().sum())
         seen += int(known.sum())
-        ratio = (table.noise_std[class_id] / terrain.truth.stds[:, 0])[labelled]
-        if len(ratio):
+        squares += float((own.means[0] - true.means[0]).double().square().sum())
+        cells += class_id.numel()
+        if class_id.numel():
+            ratio = table.noise_std[class_id] / true.stds[0]
             noise_error = max(noise_error, float((ratio - 1).abs().max()))
     errors = {"latent_rmse": (squares / max(1, cells)) ** 0.5, "noise_error": noise_error} if truth else {}
     return {**errors, "nll": surprise / max(1, seen)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipLogs:
+    """What is learned from of a slip log.
+
+    Args:
+        class_names: the class table.
+        cells: the rows with a slope and a traversability, in order, under the ids of that table.
+        digest: SHA-256 of the file.
+    """
+
+    class_names: tuple[str, ...]
+    cells: Cells
+    digest: str
+
+
+def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipLogs:
+    """Reads a slip log.
+
+    Args:
+        path: a file that ends in one of `ENDINGS`.
+        class_names: the class table, into which integer ids of the log are indices. Where none is given it is that of
+            the log: its classes in alphabetical order; for integer ids "0", "1", … up to the largest.
+
+    Raises:
+        DatasetError: there is no such file, it cannot be read, lacks a column or rows, has a class that the table
+            lacks, or a value is no number or out of range.
+    """
+    path = Path(path)
+    rows = _read(path)
+    missing = [name for name in COLUMNS if name not in rows]
+    if missing:
+        raise DatasetError(
+            f"Expected columns {', '.join(COLUMNS)} in {path}, got no {' and no '.join(missing)}. "
+            f"It has {', '.join(str(name) for name in rows.columns) or 'none'}."
+        )
+    numbers = {name: _read_numbers(rows[name], name, most, path) for name, most in _LIMITS.items()}
+    observed = ~np.logical_or(*(np.isnan(column) for column in numbers.values()))
+    if not observed.any():
+        raise DatasetError(
+            f"Expected rows with a slope and a traversability in {path}, got none among {len(rows)}. "
+            "Log places that the robot has driven over."
+        )
+    steepest = numbers["slope_deg"][observed].max()
+    if 0 < steepest <= np.pi / 2 and observed.sum() >= _ENOUGH:
+        raise DatasetError(
+            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {observed.sum()} rows, as of "
+            "radians. Multiply radians by 57.2958. Ground that level in degrees looks the same: log steeper too."
+        )
+    class_names, class_id = _read_classes(rows["class"], observed, path, class_names)
+    slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
+    return SlipLogs(
+        class_names=class_names,
+        cells=Cells(class_id=class_id, slope_deg=slope, traversability=value),
+        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            # As text: a class may be called NA, and a bad number is to be found in its row.
+            rows = pd.read_csv(
+                path,
+                sep="\t" if ".tsv" in path.suffixes else ",",
+                dtype=str,
+                keep_default_na=False,
+                skipinitialspace=True,
+                index_col=False,
+            )
+        return rows.rename(columns=str.strip)
+    except (OSError, EOFError, ValueError, zlib.error, pd.errors.ParserWarning) as error:
+        why = [*str(error).strip().splitlines(), type(error).__name__]
+        raise DatasetError(
+            f"Expected a {path.suffix.removeprefix('.').upper()} table in {path}, got one that cannot be read: {why[0]}"
+        ) from error
+
+
+def _read_numbers(column: pd.Series, name: str, most: float, path: Path) -> np.ndarray:
+    """Gives the numbers of a column, float64, NaN where missing."""
+    text = column if is_numeric_dtype(column) else column.astype("string").str.strip()
+    values = pd.to_numeric(text, errors="coerce").to_numpy(np.float64, na_value=np.nan)
+    given = (text.notna() & ~text.isin(_MISSING)).to_numpy(bool)
+    bad = np.flatnonzero(given & ~((values >= 0) & (values <= most)))
+    if len(bad):
+        raise DatasetError(
+            f"Expected `{name}` to be numbers within [0, {most}] in {path}, got {column.iloc[bad[0]]!s} in row "
+            f"{bad[0] + 1} below the header. Mend that row, or leave the value out."
+        )
+    return values
+
+
+def _read_classes(
+    column: pd.Series, observed: np.ndarray, path: Path, names: tuple[str, ...]
+) -> tuple[tuple[str, ...], Tensor]:
+    """Gives the class table, that of the log where it has no names yet, and the id of each observed row."""
+    text = column.astype("string").str.strip().fillna("").to_numpy(str)
+    absent = np.flatnonzero(observed & (text == ""))
+    if len(absent):
+        raise DatasetError(
+            f"Expected a `class` in every row of {path}, got none in row {absent[0] + 1} below the header."
+        )
+    found = text[observed]
+    # pandas writes ids so where some are missing: 0.0
+    if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
+        ids = found.astype(float)
+        if len(broken := found[ids % 1 > 0]):
+            raise DatasetError(
+                f"Expected class ids as whole numbers in {path}, got {broken[0]}. Number or name the classes."
+            )
+        own: Any = range(int(ids.max()) + 1)
+        if names and len(own) > len(names):
+            raise DatasetError(
+                f"Expected class ids in 0–{len(names) - 1} in the slip log, got {len(own) - 1}. "
+                "Number the classes as in the class table."
+            )
+    else:
+        own = np.unique(found)
+        if names and (others := [name for name in own if name not in names]):
+            near = hint(others[0], names) or " Name classes as in the class table."
+            raise DatasetError(
+                f"Expected classes among {', '.join(names)} in the slip log, got {str(others[0])!r}.{near}"
+            )
+        ids = pd.Index(names or own).get_indexer(found)
+    if len(own) > _MOST_CLASSES:
+        raise DatasetError(
+            f"Expected at most {_MOST_CLASSES} classes in {path}, got {len(own)}. Number classes from 0."
+        )
+    return names or tuple(map(str, own)), torch.from_numpy(ids.astype(np.int64))

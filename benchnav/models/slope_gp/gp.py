@@ -29,7 +29,6 @@ from gpytorch.constraints import Interval
 from gpytorch.distributions import MultivariateNormal
 from gpytorch.variational import NaturalVariationalDistribution, UnwhitenedVariationalStrategy
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes, table_slopes
@@ -186,17 +185,6 @@ class LatentGPs(lightning.LightningModule):
         """Gives the table and all parameters by name, for a checkpoint."""
         state = {f"state.{name}": value for name, value in self.state_dict().items()}
         return {**self.tabulate().to_tensors(), **state}
-
-
-def load_batches(config: LatentGPConfig, bins: dict[str, Tensor]) -> DataLoader[dict[str, Tensor]]:
-    """Makes the loader of training batches, each of them all cells.
-
-    Args:
-        config: what is trained.
-        bins: from `SlopeSums.bins`.
-    """
-    # A generator of its own keeps the loader from drawing on PyTorch's global one.
-    return DataLoader([bins] * config.epoch_steps, batch_size=None, generator=torch.Generator())  # type: ignore[arg-type]
 
 
 def expected_log_prob(bins: dict[str, Tensor], mean: Tensor, variance: Tensor, noise: Tensor) -> Tensor:

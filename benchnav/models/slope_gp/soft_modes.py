@@ -67,9 +67,8 @@ def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, Tensor]:
     weight, mean, std = torch.zeros(classes), torch.zeros(classes), torch.ones(classes)
     share = torch.ones(sums.cells.shape, dtype=torch.float64)
     for c, counts in enumerate(sums.cells):
-        found = _find_in_class(counts)
-        if found is not None:
-            modes, share[c] = found
+        if modes := _find_in_class(counts):
+            share[c, : modes.main.shape[1]] -= _soft_share(modes)[1][0]
             weight[c], mean[c], std[c] = modes.weight, modes.mean, modes.std
     soft = SoftModes(weight=weight, mean=mean, std=std) if bool(weight.any()) else None
     return soft, share
@@ -96,8 +95,8 @@ def main_bins(sums: SlopeSums, soft: SoftModes, share: Tensor) -> dict[str, Tens
     return bins
 
 
-def _find_in_class(counts: Tensor) -> tuple[_Modes, Tensor] | None:
-    """The second mode of a class and the main one's share of its cells [B, V]; None where it has one mode."""
+def _find_in_class(counts: Tensor) -> _Modes | None:
+    """The two modes of a class, up to its steepest bin with cells; None where it has one mode."""
     total = int(counts.sum())
     if total < LEAST_CELLS:
         return None
@@ -111,20 +110,15 @@ def _find_in_class(counts: Tensor) -> tuple[_Modes, Tensor] | None:
     flat = _Modes(mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD)
     single, single_fit = _maximise(cells, flat, _MOST_STEPS)
     places = torch.tensor(_STARTS, dtype=torch.float64).unsqueeze(1)
-    same = torch.ones_like(places)
-    seconds = (_FIRST_WEIGHT * same, places, _FIRST_STD * same)
-    starts, fits = _maximise(
-        cells, _Modes(single.main * same, single.main_std * same, *seconds), _FIRST_STEPS
-    )
+    weights, stds = torch.full_like(places, _FIRST_WEIGHT), torch.full_like(places, _FIRST_STD)
+    second = _Modes(single.main, single.main_std, weights, places, stds)
+    starts, fits = _maximise(cells, second, _FIRST_STEPS)
     double, double_fit = _maximise(cells, starts.select(int(fits.argmax())), _MOST_STEPS)
     gain, weight = float(double_fit - single_fit), float(double.weight)
-    if weight <= LEAST_WEIGHT or gain <= LEAST_GAIN * total:
+    least = max(LEAST_GAIN * total, (_FREE_PARAMETERS * math.log(total) + _STRONG) / 2)
+    if weight <= LEAST_WEIGHT or gain <= least:
         return None
-    if 2 * gain <= _FREE_PARAMETERS * math.log(total) + _STRONG:
-        return None
-    share = torch.ones(counts.shape, dtype=torch.float64)
-    share[:size] = 1 - _soft_share(double)[1][0]
-    return double, share
+    return double
 
 
 def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Tensor]:

@@ -12,12 +12,10 @@ import torch
 from torch import Tensor
 
 from benchnav.core.errors import ConfigError
-from benchnav.core.mixture import TraversabilityMixture, map_tensors
+from benchnav.core.mixture import TraversabilityMixture
 
 STEP_DEG = 0.1
 STEEPEST_DEG = 90.0
-
-_TABLES = ("mean", "std", "noise_std")
 
 
 def table_slopes() -> Tensor:
@@ -39,17 +37,6 @@ class SoftModes:
     mean: Tensor
     std: Tensor
 
-    def __post_init__(self) -> None:
-        """Checks shapes and values."""
-        is_whole = self.weight.shape == self.mean.shape == self.std.shape
-        shares = (self.weight >= 0) & (self.weight < 1)
-        if not is_whole or not bool(
-            (shares & self.mean.isfinite() & self.std.isfinite() & (self.std > 0)).all()
-        ):
-            raise ConfigError(
-                "Expected soft modes of one shape [C], of `weight` in [0, 1), finite `mean` and `std` > 0, got others."
-            )
-
 
 @dataclass(frozen=True, kw_only=True)
 class SlopeTable:
@@ -69,16 +56,11 @@ class SlopeTable:
 
     def __post_init__(self) -> None:
         """Checks shapes and values."""
-        wanted = (len(self.noise_std), len(table_slopes()))
-        if not self.mean.shape == self.std.shape == wanted:
+        is_finite = all(bool(values.isfinite().all()) for values in self.to_tensors().values())
+        if not is_finite or not bool((self.std > 0).all()) or self.mean.shape[1:] != table_slopes().shape:
             raise ConfigError(
-                f"Expected `mean` and `std` of shape {list(wanted)}, "
-                f"got {list(self.mean.shape)} and {list(self.std.shape)}."
+                f"Expected finite tables of {len(table_slopes())} slopes and `std` > 0, got others."
             )
-        if not bool(self.mean.isfinite().all() and self.std.isfinite().all() and (self.std > 0).all()):
-            raise ConfigError("Expected finite `mean` and finite `std` > 0, got others.")
-        if self.soft is not None and len(self.soft.weight) != wanted[0]:
-            raise ConfigError(f"Expected soft modes of {wanted[0]} classes, got {len(self.soft.weight)}.")
 
     def lookup(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
         """Reads every class at each cell's slope; of a class with a second mode the main one.
@@ -110,15 +92,11 @@ class SlopeTable:
         weights, means, stds = (torch.stack(values, -3) for values in zip(*components, strict=True))
         return TraversabilityMixture(weights, means, stds, (0,) * len(components))
 
-    def to(self, device: torch.device | str) -> "SlopeTable":
-        """Copies the tables to `device`."""
-        return map_tensors(self, lambda values: values.to(device))
-
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the tables by name, for a checkpoint."""
-        tables = {name: getattr(self, name) for name in _TABLES}
         soft = vars(self.soft) if self.soft else {}
-        return {**tables, **{f"soft_{name}": values for name, values in soft.items()}}
+        tables = {"mean": self.mean, "std": self.std, "noise_std": self.noise_std}
+        return tables | {f"soft_{name}": values for name, values in soft.items()}
 
     @classmethod
     def from_tensors(cls, tensors: dict[str, Tensor]) -> "SlopeTable":
@@ -131,7 +109,7 @@ class SlopeTable:
         soft = None
         if "soft_weight" in tensors:
             soft = SoftModes(**{name: tensors[f"soft_{name}"] for name in ("weight", "mean", "std")})
-        return cls(**{name: tensors[name] for name in _TABLES}, soft=soft)
+        return cls(mean=tensors["mean"], std=tensors["std"], noise_std=tensors["noise_std"], soft=soft)
 
     def _read(self, classes: Tensor | slice, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
         """Means and standard deviations of classes, between the node under each slope and the next."""

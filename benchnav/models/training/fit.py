@@ -40,10 +40,11 @@ STATE, SETTINGS, HISTORY = "last.ckpt", "settings.json", "metrics.csv"
 _PARTIAL = f".{STATE}.*.partial"  # what a kill in the middle of writing has left
 
 # Settings of Lightning's trainer that are made here, and those that the outcome does not depend on.
-_OWN = {"self", "logger", "callbacks", "plugins", "default_root_dir", "accelerator", "fast_dev_run"}
-_OWN |= {"enable_checkpointing", "enable_progress_bar", "enable_model_summary", "enable_autolog_hparams"}
-_OWN |= {"barebones", "num_sanity_val_steps", "use_distributed_sampler", "inference_mode"}
-_OWN |= {"model_registry", "profiler"}
+_OWN = {
+    "self", "logger", "callbacks", "plugins", "default_root_dir", "accelerator", "fast_dev_run",
+    "enable_checkpointing", "enable_progress_bar", "enable_model_summary", "enable_autolog_hparams",
+    "barebones", "num_sanity_val_steps", "use_distributed_sampler", "inference_mode", "model_registry", "profiler",
+}  # fmt: skip
 _DEFAULTS = inspect.signature(lightning.Trainer.__init__).parameters
 _OF_NO_ACCOUNT = {"max_epochs", "log_every_n_steps", "detect_anomaly", "accelerator"}
 
@@ -131,9 +132,10 @@ def fit(
     """
     folder = options.folder / part if options.folder else None
     held = sole_writer(folder, str(folder)) if folder and is_first_process() else nullcontext()
-    in_terminal = sys.stderr.isatty()
-    shown = RichProgressBar(console_kwargs={"stderr": True}) if in_terminal else EpochLines(part)
-    callbacks, state = [*callbacks, shown], None
+    in_terminal, state = sys.stderr.isatty(), None
+    callbacks = [*callbacks, History(folder / HISTORY if folder else None, "" if in_terminal else part)]
+    if in_terminal:
+        callbacks.append(RichProgressBar(console_kwargs={"stderr": True}))
     kept: dict[str, Any] = {"logger": False, "enable_checkpointing": False}
     with quietly(), held:
         if folder:
@@ -142,7 +144,7 @@ def fit(
             last = ModelCheckpoint(
                 folder, Path(STATE).stem, save_on_train_epoch_end=True, enable_version_counter=False
             )
-            callbacks += [History(folder / HISTORY), last]
+            callbacks.append(last)
             kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
         trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
         handler = signal.getsignal(signal.SIGINT)
@@ -162,10 +164,8 @@ def fit(
         return measured(trainer)
 
 
-def say(line: str) -> None:
-    """Prints a line once, also where several processes train together."""
-    if is_first_process():
-        print(line)
+say = rank_zero_only(print)
+"""Prints a line once, also where several processes train together."""
 
 
 def is_first_process() -> bool:
@@ -205,8 +205,7 @@ def _prepare(folder: Path, resume: bool, settings: Mapping[str, Any]) -> Path | 
     folder.mkdir(parents=True, exist_ok=True)
     state, described = folder / STATE, json.dumps(settings, default=str, indent=1) + "\n"
     if resume and state.exists():
-        there = json.loads((folder / SETTINGS).read_text()) if (folder / SETTINGS).exists() else {}
-        if others := differing(settings, there):
+        if others := differing(settings, json.loads((folder / SETTINGS).read_text())):
             raise CheckpointError(
                 f"Expected the settings of the interrupted training in {folder} to resume it, got {others}. "
                 "Repeat its settings, or pass --overwrite to begin anew."
@@ -301,25 +300,30 @@ class KeepBest(Callback):
 
 @dataclass(eq=False)
 class History(Callback):
-    """Writes what was measured to a table, a row an epoch.
+    """Writes what was measured to a table, a row an epoch, and says it on standard error.
 
     Lightning's `CSVLogger` writes training and validation to rows of their own, and begins anew when it is resumed.
 
     Args:
-        path: the table, CSV.
-        rows: what it holds.
+        path: the table, CSV; None where none is kept.
+        part: what is trained; empty where nothing is said, since Lightning's bar is shown in a terminal.
+        rows: what the table holds.
     """
 
-    path: Path
+    path: Path | None
+    part: str
     rows: list[dict[str, float]] = field(default_factory=list)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         """Adds a row."""
+        found, epoch = measured(trainer), trainer.current_epoch + 1
         rate = float(trainer.optimizers[0].param_groups[0]["lr"])
-        row = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "learning_rate": rate}
-        self.rows.append({**row, **measured(trainer)})
-        if trainer.is_global_zero:
+        self.rows.append({"epoch": epoch, "step": trainer.global_step, "learning_rate": rate, **found})
+        if self.path and trainer.is_global_zero:
             write_text(self.path, pd.DataFrame(self.rows).to_csv(index=False))
+        if self.part and trainer.is_global_zero:
+            told = in_words(found, "valid_") or in_words(found)
+            tell(f"{self.part}: epoch {epoch}/{trainer.max_epochs}, {told}")
 
     def state_dict(self) -> dict[str, Any]:
         """Gives what `load_state_dict` takes."""
@@ -328,23 +332,6 @@ class History(Callback):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from an earlier state."""
         self.rows = list(state["rows"])
-
-
-@dataclass(eq=False)
-class EpochLines(Callback):
-    """Says on standard error what each epoch brought, where there is no terminal for Lightning's bar.
-
-    Args:
-        what: what is trained.
-    """
-
-    what: str
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
-        """Says it."""
-        found, epoch = measured(trainer), f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-        if trainer.is_global_zero:
-            tell(f"{self.what}: {epoch}, {in_words(found, 'valid_') or in_words(found)}")
 
 
 class WholeFiles(TorchCheckpointIO):

@@ -3,15 +3,25 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
 
 from benchnav.core.command import Device, tell
-from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import GP, Checkpoint, Part
 from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
-from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, measure_latent, sum_split
-from benchnav.models.slope_gp.gp import LatentGPs, load_batches
-from benchnav.models.slope_gp.slip_logs import ENDINGS, read_slip_logs
+from benchnav.models.slope_gp.cells import (
+    ENDINGS,
+    SlopeSums,
+    cell_nll,
+    hold_out,
+    measure_latent,
+    read_slip_logs,
+    sum_split,
+)
+from benchnav.models.slope_gp.gp import LatentGPs
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
@@ -38,16 +48,11 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu") -> 
         soft, share = find_soft_modes(sums)
         bins = main_bins(sums, soft, share) if soft else bins
     model = LatentGPs(config, sums.steepest_deg, soft)
-    fit(
-        model,
-        GP,
-        FitOptions(device=device),
-        {},
-        [],
-        {"train_dataloaders": load_batches(config, bins)},
-        max_epochs=config.epochs,
-        precision="64-true",
-    )
+    # All cells are in each batch. A generator of its own keeps the loader from drawing on PyTorch's global one.
+    batches: Any = [bins] * config.epoch_steps
+    loader = DataLoader(batches, batch_size=None, generator=torch.Generator())
+    data = {"train_dataloaders": loader}
+    fit(model, GP, FitOptions(device=device), {}, [], data, max_epochs=config.epochs, precision="64-true")
     return model.cpu().eval()
 
 
@@ -61,7 +66,6 @@ def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions
         options: how to train.
     """
     check_seed(options.seed)
-    output_path(out)  # refuses addresses
     how = FitOptions(**vars(options))
     if data.endswith(ENDINGS):
         _train_on_logs(data, out, config, how)
@@ -89,10 +93,9 @@ def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: 
 
 def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
-    logs = read_slip_logs(data)
     there = existing(Path(out), options.overwrite)
-    names = there.class_names if there else logs.class_names
-    cells = logs.cells(names)
+    logs = read_slip_logs(data, there.class_names if there else ())
+    names, cells = logs.class_names, logs.cells
     sums, digest = SlopeSums.of(cells, len(names)), f"file:{logs.digest}"
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))

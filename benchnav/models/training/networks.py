@@ -9,7 +9,6 @@ from lightning.pytorch.callbacks import EarlyStopping
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
-from benchnav.core.store import output_path
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -22,9 +21,8 @@ from benchnav.models.checkpoint import (
     training_folder,
 )
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, NetworkConfig, TrainOptions, check_seed
-from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.classifier import TerrainClassifier, fit_pool_temperature
 from benchnav.models.nets.mdn import MixtureDensityNetwork
-from benchnav.models.nets.temperature import fit_pool_temperature
 from benchnav.models.training.data import (
     TRAIN,
     VALID,
@@ -73,7 +71,6 @@ def train_networks(
     if members < 1:
         raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
     check_seed(how.seed, members)
-    output_path(out)  # refuses addresses
     dataset, trainer = open_dataset(data), dict(how.trainer or {})
     # The length of training is the network's own setting, wherever it is said.
     config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
@@ -191,11 +188,8 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
         if target.holds(part, config, seed):
             continue
         network, metrics = fit_network(config, dataset, seed, options, part, options.half_precision)
-        calibrated = sorted(set(network.settings()) - set(asdict(config)))
-        shown = [
-            in_words(metrics, "valid_"),
-            *(f"{name} {getattr(network, name):.3f}" for name in calibrated),
-        ]
+        calibrated = {name: value for name, value in network.settings().items() if name not in vars(config)}
+        shown = filter(None, [in_words(metrics, "valid_"), in_words(calibrated)])
         say(f"{part}: best epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")
         trained = Part(
             config=network.settings(),
@@ -211,11 +205,8 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
     parts = member_names(target.checkpoint)
     if not isinstance(config, ClassifierConfig) or len(parts) == 1 or not is_first_process():
         return
-    # The classifiers as they are kept.
     members = [
-        TerrainClassifier.from_tensors(
-            part.config, len(target.checkpoint.class_names), as_stored(part.tensors, part.half_precision)
-        )
+        TerrainClassifier.from_tensors(part.config, len(target.checkpoint.class_names), part.tensors)
         for part in map(target.checkpoint.part, parts)
     ]
     temperature = fit_pool_temperature(members, read_maps(dataset, VALID), options.seed, options.place)

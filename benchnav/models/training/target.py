@@ -4,7 +4,6 @@ Every refusal comes before any work is done. Where processes train together, the
 and writes.
 """
 
-import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ from typing import Any
 from rich.filesize import decimal
 
 from benchnav.core.errors import CheckpointError
-from benchnav.core.store import building, real_place, refuse_taken, restore
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -20,9 +18,9 @@ from benchnav.models.checkpoint import (
     FUSED,
     Checkpoint,
     Part,
-    foreign,
     is_member,
     load_checkpoint,
+    open_place,
     save_checkpoint,
 )
 from benchnav.models.config import NetworkConfig
@@ -63,24 +61,24 @@ class Target:
             return False
         # A part of an earlier version does not name settings that came later, nor those of the trainer.
         options, defaults = self.options, asdict(type(config)())
-        wanted, there = asdict(config), {key: part.config.get(key, usual) for key, usual in defaults.items()}
+        wanted = {**asdict(config), "seed": seed, "data": self.digest}
+        there = {key: part.config.get(key, usual) for key, usual in defaults.items()}
+        there |= {"seed": part.seed, "data": part.data_digest}
         if isinstance(config, NetworkConfig):
             wanted["half_precision"], there["half_precision"] = options.half_precision, part.half_precision
             if part.trainer is not None:
                 wanted |= {f"trainer.{key}": value for key, value in options.trainer_settings.items()}
                 there |= {f"trainer.{key}": value for key, value in part.trainer.items()}
-        named = f", {others}" if (others := differing(wanted, there)) else ""
-        if not named and part.seed == seed:
-            if part.data_digest == self.digest:
-                forget(options, name)  # a kill may have come between saving and forgetting
-                return True
-            named = ", other maps or another class table, or maps as recorded by benchnav before 0.7"
+        others = differing(wanted, there)
+        if not others:
+            forget(options, name)  # a kill may have come between saving and forgetting
+            return True
         remedy = "pass --overwrite instead of --resume"
         if interrupted(options, [name]):
             remedy = "pass --overwrite with --resume to go on with the training that was to replace it"
         raise CheckpointError(
             f"Expected the {name} in {self.folder} to be of these settings, seed and maps, got others: of seed "
-            f"{part.seed} and {part.data_id}{named}. Repeat its settings, or {remedy}."
+            f"{part.seed} and {part.data_id}, {others}. Repeat its settings, or {remedy}."
         )
 
     def add(self, name: str, part: Part) -> None:
@@ -126,26 +124,25 @@ def open_target(
         CheckpointError: what is there would be lost or does not fit.
         ConfigError: the folder is something else.
     """
-    folder = real_place(Path(os.path.normpath(out)))  # a/../b is b, whether or not there is an a
-    is_first, left = is_first_process(), interrupted(options, parts)
-    if left and is_first and not (options.resume or options.overwrite):
+    left = interrupted(options, parts)
+    # The first process alone refuses; those beside it begin without what it may have saved meanwhile.
+    may_replace = options.overwrite or not (options.resume or is_first_process())
+    if left and not (options.resume or may_replace):
         raise CheckpointError(
             f"Expected no interrupted training in {options.folder}, got one of {' and '.join(left)}. "
             "Pass --resume to go on with it, or --overwrite to begin anew."
         )
-    restore(folder)
-    refuse_taken(folder, True, foreign)
     # Whether a checkpoint can be written there shows now rather than after the training.
-    with building(folder):
-        checkpoint = existing(folder, options.overwrite) or fresh
+    with open_place(out) as (folder, _):
+        checkpoint = existing(folder, may_replace) or fresh
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
-        if not options.overwrite:
+        if not may_replace:
             raise CheckpointError(
                 f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(checkpoint)}. "
                 "Choose another `out`, or pass --overwrite to replace it."
             )
         checkpoint = fresh
-    if options.overwrite:
+    if may_replace:
         # Members of an ensemble stand or fall together.
         kept = {
             name: part
@@ -154,17 +151,13 @@ def open_target(
         }
         checkpoint = replace(checkpoint, parts=kept)
     elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):
-        if is_first:
-            # The processes alone are trained in a moment, and so not gone on with.
-            resume = (
-                ", or --resume to go on with what an interrupted training has left" if options.folder else ""
-            )
-            raise CheckpointError(
-                f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
-                f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
-                f"{resume}."
-            )
-        checkpoint = fresh
+        # The processes alone are trained in a moment, and so not gone on with.
+        resume = ", or --resume to go on with what an interrupted training has left" if options.folder else ""
+        raise CheckpointError(
+            f"Expected `out` without a trained {' or '.join(parts)}, got {folder} with "
+            f"{' and '.join(sorted(checkpoint.parts))}. Choose another `out`, or pass --overwrite to replace it"
+            f"{resume}."
+        )
     return Target(folder, checkpoint, digest, options)
 
 

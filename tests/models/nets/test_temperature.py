@@ -3,7 +3,7 @@ import torch
 
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.fused import sharpen
-from benchnav.models.nets.temperature import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.classifier import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 from benchnav.models.training.data import MapData, MapDataset
 
@@ -47,7 +47,7 @@ def test_sampled_logits_stay_beside_their_class(
         def forward(self, rgb: torch.Tensor) -> torch.Tensor:
             return rgb.float()
 
-    monkeypatch.setattr("benchnav.models.nets.temperature._MOST_CELLS", 200)
+    monkeypatch.setattr("benchnav.models.nets.classifier._MOST_CELLS", 200)
     logits, class_id = sample_logits(Colour(), maps)
     assert logits.shape == (200, 3)
     stored = maps.read(range(len(maps)))

@@ -9,8 +9,7 @@ import torch
 
 from benchnav.core.errors import DatasetError
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out
-from benchnav.models.slope_gp.slip_logs import read_slip_logs
+from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, read_slip_logs
 from benchnav.models.training.gps import fit_gps
 from tests.models.support import make_cells
 
@@ -27,10 +26,9 @@ def test_a_csv_gives_its_observed_rows(tmp_path: Path) -> None:
     path = write(tmp_path, GOOD)
     logs = read_slip_logs(path)
     assert logs.class_names == ("NA", "rock", "sand")
-    assert not logs.by_id
-    assert logs.class_id.tolist() == [2, 1, 0]
-    assert logs.slope_deg.tolist() == [3.5, 10, 0]
-    np.testing.assert_allclose(logs.traversability, [0.9, 1, 0])
+    assert logs.cells.class_id.tolist() == [2, 1, 0]
+    assert logs.cells.slope_deg.tolist() == [3.5, 10, 0]
+    np.testing.assert_allclose(logs.cells.traversability, [0.9, 1, 0])
     assert logs.digest == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -41,33 +39,31 @@ def test_parquet_and_csv_give_the_same(tmp_path: Path, classes: list[str]) -> No
     rows.to_parquet(tmp_path / "log.parquet")
     text, binary = (read_slip_logs(tmp_path / name) for name in ("log.csv", "log.parquet"))
     assert text.class_names == binary.class_names
-    assert text.by_id == binary.by_id == isinstance(rows["class"][0], np.integer)
     for name in ("class_id", "slope_deg", "traversability"):
-        assert torch.equal(getattr(text, name), getattr(binary, name))
-    assert text.class_id.tolist() == [1, 0]
+        assert torch.equal(getattr(text.cells, name), getattr(binary.cells, name))
+    assert text.cells.class_id.tolist() == [1, 0]
 
 
 def test_rows_are_put_under_the_ids_of_a_class_table(tmp_path: Path) -> None:
-    logs = read_slip_logs(write(tmp_path, GOOD))
-    cells = logs.cells(("rock", "mud", "sand", "NA"))
+    path, table = write(tmp_path, GOOD), ("rock", "mud", "sand", "NA")
+    logs = read_slip_logs(path, table)
+    assert logs.class_names == table
+    cells = logs.cells
     assert cells.class_id.tolist() == [2, 0, 3]
     assert cells.slope_deg.tolist() == [3.5, 10, 0]
     with pytest.raises(DatasetError, match=r"among rock, sands, NA .* got 'sand'\. Did you mean 'sands'\?"):
-        logs.cells(("rock", "sands", "NA"))
+        read_slip_logs(path, ("rock", "sands", "NA"))
 
 
 def test_integer_classes_are_indices_into_the_class_table(tmp_path: Path) -> None:
-    logs = read_slip_logs(
-        write(tmp_path, "class,slope_deg,traversability\n3,1,0.25\n0,2,0.5\n3,5,\n10,3,0.75\n")
-    )
-    assert logs.by_id
-    assert logs.class_names == tuple(str(i) for i in range(11))
-    cells = logs.cells(tuple("abcdefghijkl"))
-    assert cells.class_id.tolist() == [3, 0, 10]
-    assert cells.slope_deg.tolist() == [1, 2, 3]
-    assert logs.cells(logs.class_names).class_id.tolist() == [3, 0, 10]
+    path = write(tmp_path, "class,slope_deg,traversability\n3,1,0.25\n0,2,0.5\n3,5,\n10,3,0.75\n")
+    alone, logs = read_slip_logs(path), read_slip_logs(path, tuple("abcdefghijkl"))
+    assert alone.class_names == tuple(str(i) for i in range(11))
+    assert logs.class_names == tuple("abcdefghijkl")
+    assert logs.cells.slope_deg.tolist() == [1, 2, 3]
+    assert logs.cells.class_id.tolist() == alone.cells.class_id.tolist() == [3, 0, 10]
     with pytest.raises(DatasetError, match=r"in 0–9 .* got 10"):
-        logs.cells(tuple("abcdefghij"))
+        read_slip_logs(path, tuple("abcdefghij"))
 
 
 HEADER = "class,slope_deg,traversability\n"
@@ -118,7 +114,7 @@ def test_gps_learn_from_logs_and_report_a_held_out_nll(tmp_path: Path) -> None:
     )
     rows.sample(frac=1, random_state=0).to_parquet(tmp_path / "log.parquet")
     logs = read_slip_logs(tmp_path / "log.parquet")
-    kept, held = hold_out(logs.cells(logs.class_names), 0.25)
+    kept, held = hold_out(logs.cells, 0.25)
     sums, fresh = SlopeSums.of(kept, 3), make_cells(40_000, 5)
     table = fit_gps(LatentGPConfig(), sums).tabulate()
     nll = cell_nll(fresh, table)
@@ -132,9 +128,8 @@ def test_ids_that_pandas_wrote_with_a_decimal_are_ids(tmp_path: Path, kind: str)
     path = tmp_path / f"log.{kind}"
     rows.to_csv(path, index=False) if kind == "csv" else rows.to_parquet(path)
     logs = read_slip_logs(path)
-    assert logs.by_id
     assert logs.class_names == ("0", "1", "2")
-    assert logs.class_id.tolist() == [0, 2]
+    assert logs.cells.class_id.tolist() == [0, 2]
     with pytest.raises(DatasetError, match="class ids as whole numbers"):
         read_slip_logs(write(tmp_path, "class,slope_deg,traversability\n0.5,3,1\n1,3,1\n"))
 
@@ -146,7 +141,7 @@ def test_tables_of_tabs_and_packed_ones_are_read(tmp_path: Path, name: str) -> N
     expected = read_slip_logs(write(tmp_path, GOOD, "plain.csv"))
     logs = read_slip_logs(write(tmp_path, content, name))
     assert logs.class_names == expected.class_names
-    assert logs.slope_deg.tolist() == expected.slope_deg.tolist()
+    assert logs.cells.slope_deg.tolist() == expected.cells.slope_deg.tolist()
     if name.endswith(".gz"):
         with pytest.raises(DatasetError, match="cannot be read"):
             read_slip_logs(write(tmp_path, content[:-9], name))
@@ -160,4 +155,4 @@ def test_slopes_in_radians_are_refused(tmp_path: Path) -> None:
             with pytest.raises(DatasetError, match="as of radians"):
                 read_slip_logs(path)
         else:
-            assert len(read_slip_logs(path).slope_deg) == count
+            assert len(read_slip_logs(path).cells) == count

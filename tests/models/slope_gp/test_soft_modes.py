@@ -3,7 +3,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import Cells, SlopeSums, sum_cells
@@ -183,12 +182,3 @@ def test_a_class_without_a_second_mode_is_fitted_to_the_bit_as_without_looking_f
 def test_a_second_mode_goes_with_the_censored_likelihood_alone() -> None:
     sums = SlopeSums.of(draw(5_000, 0.15), 1)
     assert fit_gps(LatentGPConfig(epochs=1, epoch_steps=2, likelihood="gaussian"), sums).soft is None
-
-
-def test_what_is_no_second_mode_is_refused() -> None:
-    with pytest.raises(ConfigError, match="one shape"):
-        SoftModes(weight=torch.zeros(2), mean=torch.zeros(2), std=torch.ones(3))
-    with pytest.raises(ConfigError, match=r"`weight` in \[0, 1\)"):
-        SoftModes(weight=torch.ones(2), mean=torch.zeros(2), std=torch.ones(2))
-    with pytest.raises(ConfigError, match="`std` > 0"):
-        SoftModes(weight=torch.zeros(2), mean=torch.zeros(2), std=torch.zeros(2))

@@ -21,8 +21,7 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
-from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.nets.temperature import fit_temperature, sample_logits
+from benchnav.models.nets.classifier import TerrainClassifier, fit_temperature, sample_logits
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
 from benchnav.models.training.data import MapData
