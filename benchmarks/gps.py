@@ -38,7 +38,7 @@ from benchnav.models.config import LatentGPConfig
 from benchnav.models.quality.scores import coverage, crps, pit, tail_rate
 from benchnav.models.slope_gp.cells import Cells, SlopeSums, read_cells, sum_cells, sum_split
 from benchnav.models.slope_gp.table import SlopeTable
-from benchnav.models.training.gps import fit_gps
+from benchnav.models.training.gaussian_processes import fit_gps
 
 REPEATS = 5
 EXACT_CELLS, EXACT_STEPS, EXACT_TIMED = 2000, 50, 3

@@ -20,7 +20,7 @@ from scipy.stats import beta, binomtest, bootstrap, norm
 
 from benchnav.eval.stats.best import best_set_p
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import (
+from benchnav.eval.stats.paired_difference import (
     sign_flip_p,
     sign_flips,
     signed_rank_p,

@@ -28,11 +28,11 @@ from statsmodels.stats.multitest import multipletests
 from benchnav.core.tables import Table, to_markdown
 from benchnav.eval.compare import read_conditions
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.folder.folder import EPISODES, open_run
+from benchnav.eval.folder.run_folder import EPISODES, open_run
 from benchnav.eval.report.hypotheses import hypothesis_table
 from benchnav.eval.report.write import read_report
 from benchnav.eval.stats.comparison import compare
-from benchnav.eval.stats.pairing import Pair, find_pairs
+from benchnav.eval.stats.pairs import Pair, find_pairs
 from benchnav.eval.stats.summary import wilson_interval
 
 # MPPI under CVaR at 0.9; Endo, Honda and Ishigami (2024), Table I: success, mean and standard deviation of T_total.

@@ -5,7 +5,7 @@ Importing the package registers the Gymnasium environment `benchnav/OffRoad-v0`,
 
 import gymnasium
 
-from benchnav.core.face import face
+from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,

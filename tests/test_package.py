@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from benchnav.core import shipped
-
 ROOT = Path(__file__).parents[1]
 MOST_BYTES = 60e6
 

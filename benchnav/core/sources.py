@@ -20,7 +20,7 @@ from typing import Any
 
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.settings import hint, one_line
-from benchnav.core.shipped import PACKAGE
+from benchnav.core.shipped_files import PACKAGE
 
 # Modules and names of earlier versions, with what users import from today.
 _MOVED = {

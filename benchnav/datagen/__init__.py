@@ -1,6 +1,6 @@
 """Terrain: recipes, synthesis, datasets and how they are read."""
 
-from benchnav.core.face import face
+from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,

@@ -1,6 +1,6 @@
 """Evaluation: experiments, running them, statistics and reports."""
 
-from benchnav.core.face import face
+from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,
@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = face(
         "benchnav.eval.compare": ("compare_runs",),
         "benchnav.eval.experiment.condition": ("Condition",),
         "benchnav.eval.experiment.suite": ("Suite",),
-        "benchnav.eval.folder.folder": ("open_run",),
+        "benchnav.eval.folder.run_folder": ("open_run",),
         "benchnav.eval.folder.steps": ("read_steps",),
         "benchnav.eval.report.write": ("read_report", "write_report"),
         "benchnav.eval.run.runner": ("run_suite",),

@@ -1,7 +1,7 @@
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.report.write import read_report, write_report
 from benchnav.eval.run.runner import run_suite

@@ -197,7 +197,7 @@ def _check_workers(jobs: int, backend: str, scheduler: str) -> None:
 
 def _finish(folder: Path) -> int:
     """Reports on a finished run; gives the exit status."""
-    from benchnav.eval.report.playback.rerun_file import write_viewer_files
+    from benchnav.eval.report.playback.viewer_file import write_viewer_files
 
     write_viewer_files(folder)
     _report(folder, folder)
@@ -212,7 +212,7 @@ def _say(line: str) -> None:
 
 def _report(folder: Path, place: Path) -> None:
     from benchnav.eval.report.write import PAGE, print_report, write_report
-    from benchnav.eval.run.again import record_failures
+    from benchnav.eval.run.recordings import record_failures
 
     print_report(write_report(folder, partial(record_failures, folder), place))
     print(f"report:  {place / PAGE}")
@@ -230,7 +230,7 @@ def _print_replay(folder: Path) -> None:
     import yaml
 
     from benchnav.eval.experiment.condition import NOT_USED
-    from benchnav.eval.folder.folder import open_run
+    from benchnav.eval.folder.run_folder import open_run
 
     every = [condition.labels for condition, _ in open_run(folder).conditions.values()]
     # What looks at a prediction has more to show.
@@ -245,7 +245,7 @@ def _print_replay(folder: Path) -> None:
 
 def _failed(folder: Path) -> int:
     """Exit status of a finished run or shard: 1 where a planner or model failed, which one line says."""
-    from benchnav.eval.folder.folder import EPISODES, ERRORS, read_table
+    from benchnav.eval.folder.run_folder import EPISODES, ERRORS, read_table
 
     if not (folder / ERRORS).exists():
         return 0

@@ -8,7 +8,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.settings import hint
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.experiment.unit import Unit, units
-from benchnav.eval.folder.folder import Run, open_run
+from benchnav.eval.folder.run_folder import Run, open_run
 
 
 def find_episodes(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from benchnav.core.grid import Grid
 from benchnav.core.store import replacing
-from benchnav.eval.folder.folder import damaged
+from benchnav.eval.folder.run_folder import damaged
 from benchnav.planning.world.outcome import Outcome
 
 # The ground that whole driven paths of a run are shown on, in its folder.

@@ -130,14 +130,14 @@ def other_folder(run: str, out: str) -> Path:
 
 
 def _recordings(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> "list[Recording]":
-    from benchnav.eval.run.again import find_recording
+    from benchnav.eval.run.recordings import find_recording
 
     return [find_recording(folder, unit, member, out) for unit, member in found]
 
 
 def _viewer_file(folder: Path, found: "list[tuple[Unit, int]]", out: Path) -> Path:
     """The viewer's file of the episodes, which is made in a folder where it is not there."""
-    from benchnav.eval.report.playback.rerun_file import write_rerun
+    from benchnav.eval.report.playback.viewer_file import write_rerun
 
     unit, member = found[0]
     path = out / unit.recording_path(member, ".rrd")

@@ -1,6 +1,6 @@
 """Models that predict traversability: their base classes, checkpoints, training and quality."""
 
-from benchnav.core.face import face
+from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,

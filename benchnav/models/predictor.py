@@ -16,7 +16,7 @@ import torch
 from benchnav.core import registry
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.mixture import TraversabilityMixture
-from benchnav.core.shipped import shipped_folder
+from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (

@@ -1,6 +1,6 @@
 """Planning under predicted traversability: problems, planners, robots, objectives, risk and worlds."""
 
-from benchnav.core.face import face
+from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,

@@ -1,6 +1,6 @@
 """Checks for the tests of whoever writes a planner, model, robot, objective or risk measure."""
 
-from benchnav.core.face import face
+from benchnav.core.public_names import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,

@@ -16,7 +16,7 @@ from torch import Tensor
 from benchnav.core import registry
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.datagen.files.terrain import terrain_of
+from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.recipe.recipe import Split, load_recipe
 from benchnav.datagen.synth.generate import generate
 from benchnav.models.base import TraversabilityModel, predict

@@ -19,8 +19,8 @@ from benchnav.core.terrain import Terrain
 from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit, units
-from benchnav.eval.folder.folder import open_run, write_run
-from benchnav.eval.run import again
+from benchnav.eval.folder.run_folder import open_run, write_run
+from benchnav.eval.run import recordings
 from benchnav.eval.run import unit as units_of_run
 from benchnav.eval.run.rollout import run_episodes
 from benchnav.eval.run.runner import run_suite
@@ -210,10 +210,10 @@ def test_an_episode_is_replayed_on_the_device_of_its_run(
     (unit,) = units(open_run(tmp_path / "run").conditions)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="GPU, on which this run was computed"):
-        again.find_recording(tmp_path / "run", unit, 0)
+        recordings.find_recording(tmp_path / "run", unit, 0)
     with elsewhere() as device:
-        monkeypatch.setattr(again, "device_of_run", lambda about: device)
-        assert again.find_recording(tmp_path / "run", unit, 0).about["map"] == "0"
+        monkeypatch.setattr(recordings, "device_of_run", lambda about: device)
+        assert recordings.find_recording(tmp_path / "run", unit, 0).about["map"] == "0"
         assert waits
 
 

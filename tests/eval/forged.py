@@ -8,8 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from benchnav.eval.folder.folder import EPISODES, FORMAT_VERSION, open_run, write_run
 from benchnav.eval.folder.provenance import code_digest
+from benchnav.eval.folder.run_folder import EPISODES, FORMAT_VERSION, open_run, write_run
 
 CODE: dict[str, dict[str, Any]] = {
     "modules": {"benchnav.eval.run.unit": "s"},

@@ -13,10 +13,10 @@ from benchnav.eval import cli
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.comparison import compare
-from benchnav.eval.stats.pairing import Compared, find_pairs
+from benchnav.eval.stats.pairs import Compared, find_pairs
 from tests.eval.forged import code_with, forge_run
 from tests.eval.report.made import condition, row, rows
-from tests.eval.stats.test_pairing import value_of
+from tests.eval.stats.test_pairs import value_of
 
 MAPS = 12
 

@@ -11,7 +11,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.eval import cli as eval_cli
 from benchnav.eval.cli import SUITES
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.run.runner import run_suite
 
 SMALL = (

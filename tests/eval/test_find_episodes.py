@@ -9,7 +9,7 @@ from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Extent
 from benchnav.eval.find_episodes import find_episodes
-from benchnav.eval.folder.folder import FORMAT, FORMAT_VERSION, write_run
+from benchnav.eval.folder.run_folder import FORMAT, FORMAT_VERSION, write_run
 
 DRAWS = ((4, 0, 60), (4, 1, 60), (9, 0, 2))
 

@@ -14,7 +14,7 @@ from benchnav.eval.recording import (
     read_recordings,
     thinned,
 )
-from benchnav.eval.report.layers import STYLES
+from benchnav.eval.report.plan_layers import STYLES
 from benchnav.planning.planners.planner import Plan
 from tests.eval.report import made
 

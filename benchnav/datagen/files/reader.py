@@ -22,7 +22,7 @@ import numpy as np
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
 from benchnav.core.settings import plain
-from benchnav.core.shipped import shipped_folder
+from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.store import unseal
 from benchnav.datagen import schema
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
@@ -298,7 +298,7 @@ class TerrainDataset:
 
     def terrain(self, split: str, indices: Sequence[int] | None = None) -> "Terrain":
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
-        from benchnav.datagen.files.terrain import terrain_of
+        from benchnav.datagen.files.stored_terrain import terrain_of
 
         return terrain_of(self.read(split, indices, schema.MAP_FIELDS), self.recipe)
 

@@ -16,7 +16,7 @@ from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
 from benchnav.datagen.schema import FIELDS, Maps, quantise
 from benchnav.datagen.synth import appearance, elevation
-from benchnav.datagen.synth.noise import fractal_perlin
+from benchnav.datagen.synth.fractal_noise import fractal_perlin
 from benchnav.datagen.synth.slope import framed, framed_gradient, inclination_deg
 
 MOST_ATTEMPTS = 200

@@ -25,7 +25,7 @@ import torch
 import benchnav
 from benchnav.core import registry
 from benchnav.core.device import gpu_name
-from benchnav.core.shipped import PACKAGE
+from benchnav.core.shipped_files import PACKAGE
 from benchnav.core.sources import digest_of, package_modules
 from benchnav.core.store import text_digest
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset

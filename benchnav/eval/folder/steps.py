@@ -21,7 +21,7 @@ from benchnav.core.settings import check_known
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.folder import DamageError, damaged, metadata, open_run, with_metadata
+from benchnav.eval.folder.run_folder import DamageError, damaged, metadata, open_run, with_metadata
 
 STEPS = "steps"
 

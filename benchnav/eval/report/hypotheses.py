@@ -11,7 +11,7 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import LEAST_MAPS
+from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
 _TESTS = {
     "difference": "differences by a sign-flip test by {unit}",

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
-from benchnav.eval.folder.folder import ERRORS, caveats, open_run, read_table
 from benchnav.eval.folder.provenance import command_lines
+from benchnav.eval.folder.run_folder import ERRORS, caveats, open_run, read_table
 from benchnav.eval.recording import MAP, read_recordings
 from benchnav.eval.report.charts.conditions import (
     distribution_figure,
@@ -35,7 +35,7 @@ from benchnav.eval.report.failures import failures_table
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
 from benchnav.eval.report.page import write_page
-from benchnav.eval.report.tables import LATENCIES, is_grouped, paper_table, result_table
+from benchnav.eval.report.result_tables import LATENCIES, is_grouped, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
@@ -98,7 +98,7 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
 
     Args:
         folder: a finished run.
-        record_failures: records failures again, as `run.again.record_failures` does of the folder; without it none is
+        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none is
             shown on a map.
 
     Raises:
@@ -139,7 +139,7 @@ def write_report(
 
     Args:
         folder: a finished run.
-        record_failures: records failures again, as `run.again.record_failures` does of the folder; without it none is
+        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none is
             shown on a map.
         out: where to; the run folder when not given.
 

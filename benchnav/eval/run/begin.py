@@ -17,7 +17,7 @@ from benchnav.eval.experiment.condition import Condition, check_labels, differen
 from benchnav.eval.experiment.suite import Record
 from benchnav.eval.experiment.unit import Conditions
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import (
+from benchnav.eval.folder.run_folder import (
     EPISODES,
     FORMAT,
     FORMAT_VERSION,

@@ -17,8 +17,8 @@ import torch
 from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.core.store import replacing
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.folder import clear_unit
 from benchnav.eval.folder.provenance import Origin
+from benchnav.eval.folder.run_folder import clear_unit
 from benchnav.eval.run.unit import Settings, run_unit
 
 

@@ -14,7 +14,7 @@ import torch
 
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Extent, Unit
-from benchnav.eval.folder.folder import open_run, write_run
+from benchnav.eval.folder.run_folder import open_run, write_run
 from benchnav.eval.run.unit import Settings, build, one_thread, simulate
 
 _MOST_STEPS = 100

@@ -16,7 +16,7 @@ from benchnav.core.store import Shard, new_folder, replacing, sole_writer, take_
 from benchnav.eval.experiment.condition import label_words
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import (
+from benchnav.eval.folder.run_folder import (
     RUN,
     Finished,
     Run,
@@ -29,7 +29,7 @@ from benchnav.eval.folder.folder import (
     write_run,
 )
 from benchnav.eval.folder.steps import align_steps
-from benchnav.eval.run.again import keep_ground
+from benchnav.eval.run.recordings import keep_ground
 
 
 def merge_shards(parts: Sequence[Path], folder: Path) -> Iterator[tuple[int, int]]:

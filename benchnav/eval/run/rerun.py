@@ -16,7 +16,7 @@ from benchnav.core.store import sole_writer
 from benchnav.eval.experiment.condition import Condition
 from benchnav.eval.experiment.unit import Unit, units
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import (
+from benchnav.eval.folder.run_folder import (
     EPISODES,
     KEYS,
     RUN,

@@ -19,14 +19,14 @@ from benchnav.core.store import Shard, sole_writer
 from benchnav.core.workers import connected, run_calls
 from benchnav.eval.experiment.suite import RECORDS, Suite
 from benchnav.eval.experiment.unit import Unit, in_table_order, units
-from benchnav.eval.folder.folder import Finished, caveats, find_units, finish_run, write_errors
 from benchnav.eval.folder.provenance import Origin, Origins, code_differences
+from benchnav.eval.folder.run_folder import Finished, caveats, find_units, finish_run, write_errors
 from benchnav.eval.folder.steps import align_steps
-from benchnav.eval.run.again import keep_ground
 from benchnav.eval.run.begin import Work, begin, drop
 from benchnav.eval.run.check import Say, check_suite
 from benchnav.eval.run.cluster import run_on_worker, store_files
 from benchnav.eval.run.latency import measure_latencies
+from benchnav.eval.run.recordings import keep_ground
 from benchnav.eval.run.unit import Settings, run_unit
 
 

@@ -25,8 +25,8 @@ from benchnav.core.registry import Part
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.unit import Unit
-from benchnav.eval.folder.folder import clear_unit, write_unit
 from benchnav.eval.folder.provenance import Origin, Origins, code_differences
+from benchnav.eval.folder.run_folder import clear_unit, write_unit
 from benchnav.eval.folder.steps import write_steps
 from benchnav.eval.run.isolation import IsolatedPlanner
 from benchnav.eval.run.recorder import Recorder

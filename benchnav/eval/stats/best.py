@@ -18,7 +18,7 @@ from scipy.stats import norm
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import (
+from benchnav.eval.stats.paired_difference import (
     sign_flips,
     smallest_difference,
     standard_deviation,

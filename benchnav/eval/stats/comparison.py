@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from statsmodels.stats.multitest import multipletests
 
-from benchnav.eval.stats.difference import (
+from benchnav.eval.stats.paired_difference import (
     by_map,
     maps_needed,
     mean_interval,
@@ -18,7 +18,7 @@ from benchnav.eval.stats.difference import (
     success_interval,
     total_time_interval,
 )
-from benchnav.eval.stats.pairing import Pair
+from benchnav.eval.stats.pairs import Pair
 from benchnav.eval.stats.summary import units_of
 
 ALPHA = 0.05

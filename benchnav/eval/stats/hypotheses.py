@@ -17,8 +17,8 @@ from statsmodels.stats.multitest import multipletests
 
 from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
 from benchnav.eval.stats.comparison import ALPHA, gain_by_map, mean_differences, time_difference
-from benchnav.eval.stats.difference import mean_interval, sign_flip_p, sign_flips, success_interval
-from benchnav.eval.stats.pairing import side_by_side
+from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, sign_flips, success_interval
+from benchnav.eval.stats.pairs import side_by_side
 from benchnav.eval.stats.summary import time_budgets, units_of
 
 # Confidence at which a p-value of a margin is looked for, but for what rounds to 0 and 1.

@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.stats import norm
 
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.stats.difference import by_map, total_time_interval
+from benchnav.eval.stats.paired_difference import by_map, total_time_interval
 from benchnav.planning.world.outcome import FAILURES
 
 # Of each column its name in the summary, which the statistic parts, and its unit.

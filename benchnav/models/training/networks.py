@@ -42,7 +42,7 @@ from benchnav.models.training.fit import (
     quietly,
     say,
 )
-from benchnav.models.training.gps import train_gps_on_maps
+from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
 NETWORKS: Mapping[type, Any] = {

@@ -15,7 +15,7 @@ from benchnav.core import rng
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.world.frozen import draw_frozen
+from benchnav.planning.world.frozen_field import draw_frozen
 from benchnav.planning.world.places import Places
 from benchnav.planning.world.world import World
 

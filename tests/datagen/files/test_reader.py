@@ -11,7 +11,7 @@ from benchnav.core.errors import DatasetError
 from benchnav.datagen import schema
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
-from benchnav.datagen.files.terrain import terrain_of
+from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.recipe import classes
 from benchnav.datagen.synth.generate import generate
 from tests.datagen.small import small_stakes

@@ -9,7 +9,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import EPISODES, open_run, read_table
+from benchnav.eval.folder.run_folder import EPISODES, open_run, read_table
 from benchnav.eval.run.runner import run_suite
 
 

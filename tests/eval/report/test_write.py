@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from benchnav.core.errors import ConfigError
-from benchnav.eval.folder.folder import write_run
+from benchnav.eval.folder.run_folder import write_run
 from benchnav.eval.report import write
 from benchnav.eval.report.write import print_report, read_report, write_report
 from tests.eval.forged import forge_run

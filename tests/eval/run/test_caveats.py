@@ -11,7 +11,7 @@ from benchnav.core.store import Shard
 from benchnav.core.tables import to_terminal
 from benchnav.eval.compare import compare_runs
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.report.write import print_report, write_report
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.rerun import rerun

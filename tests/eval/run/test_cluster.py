@@ -20,7 +20,7 @@ from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import units
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run import cluster
 from benchnav.eval.run.cluster import check_worker, run_on_worker

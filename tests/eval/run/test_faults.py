@@ -7,7 +7,7 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import ERRORS
+from benchnav.eval.folder.run_folder import ERRORS
 from benchnav.eval.run.runner import run_suite
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from benchnav.core.store import Shard
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import open_run
-from benchnav.eval.report.tables import ALONE
+from benchnav.eval.folder.run_folder import open_run
+from benchnav.eval.report.result_tables import ALONE
 from benchnav.eval.report.write import read_report
 from benchnav.eval.run import latency
 from benchnav.eval.run.merge import merge_shards

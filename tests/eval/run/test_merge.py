@@ -20,7 +20,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
-from benchnav.eval.folder.folder import metadata, open_run, read_table, with_metadata, write_run
+from benchnav.eval.folder.run_folder import metadata, open_run, read_table, with_metadata, write_run
 from benchnav.eval.folder.steps import read_steps
 from benchnav.eval.run.merge import merge_shards
 from benchnav.eval.run.runner import run_suite

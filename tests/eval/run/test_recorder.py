@@ -17,10 +17,10 @@ from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
-from benchnav.eval.folder.folder import open_run
+from benchnav.eval.folder.run_folder import open_run
 from benchnav.eval.recording import Recording, drawn_plan, thinned
-from benchnav.eval.run.again import find_recording
 from benchnav.eval.run.recorder import Recorder
+from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, build
 from benchnav.planning.planners.planner import Plan
@@ -164,7 +164,7 @@ def test_an_episode_that_is_run_again_is_recorded_on_its_own_ground(
 
 
 def test_what_is_recorded_is_not_run_again(stakes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchnav.eval.run.again.build", None)
+    monkeypatch.setattr("benchnav.eval.run.recordings.build", None)
     assert again(stakes, SEEDS[1], 2).about["map"] == "2"
 
 

@@ -18,7 +18,7 @@ from benchnav.core.store import Shard
 from benchnav.eval import cli
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import open_run, write_run
+from benchnav.eval.folder.run_folder import open_run, write_run
 from benchnav.eval.run.rerun import compare, rerun
 from benchnav.eval.run.runner import run_suite
 from tests import factories

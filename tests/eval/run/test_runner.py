@@ -24,14 +24,14 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.find_episodes import find_episodes
 from benchnav.eval.folder import provenance
-from benchnav.eval.folder.folder import open_run, read_table
 from benchnav.eval.folder.provenance import Origin
+from benchnav.eval.folder.run_folder import open_run, read_table
 from benchnav.eval.folder.steps import read_steps
-from benchnav.eval.report.playback.rerun_file import write_viewer_files
+from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from benchnav.eval.report.write import write_report
 from benchnav.eval.run import runner
 from benchnav.eval.run import unit as units_of_run
-from benchnav.eval.run.again import find_recording
+from benchnav.eval.run.recordings import find_recording
 from benchnav.eval.run.runner import run_suite
 from benchnav.eval.run.unit import Settings, run_unit
 from tests import factories

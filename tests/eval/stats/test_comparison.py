@@ -6,13 +6,13 @@ import pytest
 from scipy.stats import binomtest, wilcoxon
 
 from benchnav.eval.stats.comparison import compare, time_difference
-from benchnav.eval.stats.difference import (
+from benchnav.eval.stats.paired_difference import (
     maps_needed,
     smallest_difference,
     standard_deviation,
     success_interval,
 )
-from benchnav.eval.stats.pairing import Pair
+from benchnav.eval.stats.pairs import Pair
 
 
 def pair(

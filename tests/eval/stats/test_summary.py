@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from benchnav.eval.stats.difference import total_time_interval
+from benchnav.eval.stats.paired_difference import total_time_interval
 from benchnav.eval.stats.summary import (
     cautious_design_effect,
     design_effect,

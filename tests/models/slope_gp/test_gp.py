@@ -18,7 +18,7 @@ from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import Cells, SlopeSums, cell_nll
 from benchnav.models.slope_gp.gp import LatentGPs, expected_log_prob
 from benchnav.models.slope_gp.table import STEP_DEG, SlopeTable, table_slopes
-from benchnav.models.training.gps import fit_gps
+from benchnav.models.training.gaussian_processes import fit_gps
 from tests.models.support import NOISE, latent, linear_table, make_cells, make_sums
 
 STEEPEST = 25.0

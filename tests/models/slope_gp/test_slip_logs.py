@@ -10,7 +10,7 @@ import torch
 from benchnav.core.errors import DatasetError
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import SlopeSums, cell_nll, hold_out, read_slip_logs
-from benchnav.models.training.gps import fit_gps
+from benchnav.models.training.gaussian_processes import fit_gps
 from tests.models.support import make_cells
 
 GOOD = "class,slope_deg,traversability,note\nsand,3.5,0.9,x\nrock,10,1,y\nsand,,0.5,\nsand,4,NaN,\nNA,0,0,\n"

@@ -8,7 +8,7 @@ from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import Cells, SlopeSums, sum_cells
 from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
 from benchnav.models.slope_gp.table import SoftModes
-from benchnav.models.training.gps import fit_gps
+from benchnav.models.training.gaussian_processes import fit_gps
 
 NOISE, FLAT = 0.15, 0.85
 

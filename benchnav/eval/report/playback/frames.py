@@ -18,7 +18,7 @@ from matplotlib.patches import Polygon
 
 from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.layers import (
+from benchnav.eval.report.plan_layers import (
     STYLES,
     draw_driven,
     driven_path,

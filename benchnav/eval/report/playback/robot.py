@@ -8,7 +8,7 @@ import rerun as rr
 
 from benchnav.core.figures import bytes_of
 from benchnav.eval.recording import Recording, drawing_interval, thinned
-from benchnav.eval.report.layers import STYLES, shades
+from benchnav.eval.report.plan_layers import STYLES, shades
 from benchnav.eval.report.playback.scene import (
     LIFT_M,
     POINTS,

@@ -13,7 +13,7 @@ import rerun as rr
 from benchnav.core.figures import MARKS, bytes_of, hatching, outline
 from benchnav.core.grid import Grid
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.layers import SOFT, field_colours, shades
+from benchnav.eval.report.plan_layers import SOFT, field_colours, shades
 
 LIFT_M = 0.12
 _CLOSED = (240, 240, 240)

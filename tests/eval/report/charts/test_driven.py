@@ -12,7 +12,7 @@ from benchnav.core.figures import planner_colours, save_twice
 from benchnav.eval.recording import GROUND, Ground
 from benchnav.eval.report import write
 from benchnav.eval.report.charts.maps import driven_figure, read_driven
-from benchnav.eval.report.layers import IMMOBILISING
+from benchnav.eval.report.plan_layers import IMMOBILISING
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from benchnav.core.figures import MARKS, TWO_COLUMNS_IN, hatching, outline, save_twice
 from benchnav.eval.recording import Recording
 from benchnav.eval.report.charts.maps import MOST_PANELS, choose_recordings, trajectory_figure
-from benchnav.eval.report.layers import field_colours
+from benchnav.eval.report.plan_layers import field_colours
 from tests.eval.report import made
 
 

@@ -8,7 +8,7 @@ from benchnav.eval.experiment.condition import conditions_of
 from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.rerun_file import write_viewer_files
+from benchnav.eval.report.playback.viewer_file import write_viewer_files
 from tests.eval.report import made
 
 

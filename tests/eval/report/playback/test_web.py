@@ -13,7 +13,7 @@ from urllib.request import urlopen
 import psutil
 import pytest
 
-from benchnav.eval.report.playback.rerun_file import write_rerun
+from benchnav.eval.report.playback.viewer_file import write_rerun
 from benchnav.eval.report.playback.web import HOST, _free_port
 from tests.eval.report import made
 

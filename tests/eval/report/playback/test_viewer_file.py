@@ -7,8 +7,8 @@ import pytest
 
 from benchnav.core.figures import bytes_of, hatching, outline
 from benchnav.eval.recording import MOST_POINTS, DrawnPlan, Recording, thinned
-from benchnav.eval.report.layers import IMMOBILISING, field_colours
-from benchnav.eval.report.playback.rerun_file import arrange, describe, drivers_of, map_views, write_rerun
+from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours
+from benchnav.eval.report.playback.viewer_file import arrange, describe, drivers_of, map_views, write_rerun
 from tests.eval.report import made
 from tests.eval.report.playback.rrd import chunks, column, image, read_path, static, verify
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchnav.core.errors import ConfigError
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.stats.pairing import Compared, Pair, check_one_value_each, find_pairs
+from benchnav.eval.stats.pairs import Compared, Pair, check_one_value_each, find_pairs
 from tests.eval.report.made import condition, row, rows
 
 STAKES = {

@@ -25,7 +25,7 @@ from benchnav.eval.report.words import (
 )
 from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import LEAST_MAPS
+from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
 # What `follows` is where a planner follows the user's objective alone.
 _USERS_OWN = ("", "J")

@@ -12,7 +12,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.world.frozen import draw_frozen
+from benchnav.planning.world.frozen_field import draw_frozen
 from benchnav.planning.world.places import Places, joined
 from benchnav.planning.world.world import Immobile, World
 from tests import factories

@@ -9,7 +9,7 @@ from benchnav.core.tables import Table
 from benchnav.eval.experiment.condition import LABELS, NOT_USED
 from benchnav.eval.report.words import count_range, differ, p_value, short, signed, signed_interval
 from benchnav.eval.stats.comparison import ALPHA
-from benchnav.eval.stats.difference import LEAST_MAPS
+from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
 _LABELS = (*LABELS, "run")
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import PermutationMethod, binomtest, permutation_test, t, ttest_1samp, wilcoxon
 
-from benchnav.eval.stats.difference import (
+from benchnav.eval.stats.paired_difference import (
     by_map,
     maps_needed,
     mean_interval,

@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.folder.folder import differences, differing_columns
+from benchnav.eval.folder.run_folder import differences, differing_columns
 
 
 def rows(**changes: list[object]) -> pd.DataFrame:

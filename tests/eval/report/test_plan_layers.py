@@ -6,7 +6,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from benchnav.core.figures import bytes_of
-from benchnav.eval.report.layers import IMMOBILISING, field_colours
+from benchnav.eval.report.plan_layers import IMMOBILISING, field_colours
 
 # Machado, Oliveira and Fernandes (2009), full severity, on linear RGB.
 SEEN = {

@@ -5,7 +5,7 @@ import pytest
 
 from benchnav.core.tables import to_latex, to_markdown, to_terminal
 from benchnav.eval.experiment.condition import LABELS
-from benchnav.eval.report.tables import paper_table, result_table
+from benchnav.eval.report.result_tables import paper_table, result_table
 from tests.eval.report import made
 
 BLIND = {"planner": "straight", "risk": "–", "model": "–"}
