@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from benchnav.core import shipped_files as shipped
+
 ROOT = Path(__file__).parents[1]
 MOST_BYTES = 60e6
 

@@ -98,8 +98,8 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
 
     Args:
         folder: a finished run.
-        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none is
-            shown on a map.
+        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none
+            is shown on a map.
 
     Raises:
         ConfigError: the folder is no run folder, or its run is not finished.
@@ -139,8 +139,8 @@ def write_report(
 
     Args:
         folder: a finished run.
-        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none is
-            shown on a map.
+        record_failures: records failures again, as `run.recordings.record_failures` does of the folder; without it none
+            is shown on a map.
         out: where to; the run folder when not given.
 
     Returns:
