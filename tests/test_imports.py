@@ -1,6 +1,7 @@
 """Imports go one way: core → datagen → planning and models → env → eval, and so do the drawers within them."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,14 @@ def is_module(name: str) -> bool:
 def test_imports_go_one_way(place: Path) -> None:
     wrong = sorted(name for name in imported(PACKAGE / place) if not may_import(place, name))
     assert not wrong, f"{place} imports {', '.join(wrong)}"
+
+
+def test_no_modules_import_one_another_in_a_circle() -> None:
+    # But for a package's `__init__`, which hands names on.
+    graph = {
+        "benchnav." + ".".join(place.with_suffix("").parts): imported(PACKAGE / place) for place in modules()
+    }
+    TopologicalSorter(graph).prepare()  # raises where there is one
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_a_worker_lives_as_long_as_the_process_it_was_given(of_this: bool, print
     # One whose parent was killed before it came up has another parent from the first.
     parent, seconds = (os.getpid(), 1.2) if of_this else (os.getppid(), 60)
     code = LIVES.format(parent=parent, seconds=seconds)
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert ended.stdout == printed
 
 
@@ -97,7 +97,7 @@ def test_an_interruption_or_a_kill_leaves_no_process_and_says_nothing(
         os.killpg(process.pid, how)
     else:
         process.kill()
-    _, printed = process.communicate(timeout=30)
+    _, printed = process.communicate(timeout=120)
     if how == signal.SIGINT:
         assert (process.returncode, printed) == (130, "")
     deadline = time.monotonic() + 20

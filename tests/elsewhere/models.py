@@ -141,7 +141,7 @@ def test_each_command_uses_the_device_that_it_is_given(
 
     # A trial of the network would ask the GPU that is not there.
     monkeypatch.setattr("benchnav.models.training.networks.check_network", lambda *_: None)
-    for name in ("networks.fit_network", "gps.fit_gps"):
+    for name in ("networks.fit_network", "gaussian_processes.fit_gps"):
         monkeypatch.setattr(f"benchnav.models.training.{name}", begin)
     monkeypatch.setattr(measure_module, "evaluate", measure)
     (tmp_path / "logs.csv").write_text("class,slope_deg,traversability\n" + "a,5,0.5\n" * 20)

@@ -30,8 +30,7 @@ from benchnav.core.figures import (
 )
 from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
-from benchnav.models.quality.measure import ClassQuality, Quality, TraversabilityQuality
-from benchnav.models.quality.report import numbers
+from benchnav.models.quality.measure import ClassQuality, TraversabilityQuality
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
 
@@ -176,16 +175,16 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
 
 @styled()
 def severity_figure(
-    all_series: Mapping[str, Sequence[tuple[float, str]]], qualities: Mapping[str, Quality]
+    all_series: Mapping[str, Sequence[tuple[float, str]]], numbers: Mapping[str, Mapping[str, float]]
 ) -> Figure:
     """Draws quality against the severity of a shift, a line a scenario.
 
     Args:
         all_series: by scenario, its pairs as (severity, split), ascending.
-        qualities: of all these splits.
+        numbers: of the quality of all these splits, by name.
     """
     table = pd.DataFrame(
-        {"scenario": scenario, "severity": severity, **numbers(qualities[split])}
+        {"scenario": scenario, "severity": severity, **numbers[split]}
         for scenario, series in all_series.items()
         for severity, split in series
     )

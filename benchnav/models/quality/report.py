@@ -327,7 +327,8 @@ def quality_figures(
     by_cell = {split: quality.traversability for split, quality in qualities.items()}
     drawn["pit"] = partial(figures.pit_figure, by_cell)
     if all_series := find_series(qualities):
-        drawn["severity"] = partial(figures.severity_figure, all_series, qualities)
+        found = {split: numbers(quality) for split, quality in qualities.items()}
+        drawn["severity"] = partial(figures.severity_figure, all_series, found)
     if not isinstance(table, SlopeTable):
         absent.append("no latent functions: the model has no Gaussian processes over slope")
     elif by_class:

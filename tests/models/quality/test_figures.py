@@ -21,6 +21,7 @@ from benchnav.models.quality.figures import (
     severity_figure,
 )
 from benchnav.models.quality.measure import Quality, Reliability, evaluate
+from benchnav.models.quality.report import numbers
 from benchnav.models.slope_gp.table import SoftModes
 from tests.models.stub import ColourModel, true_table
 
@@ -128,7 +129,7 @@ def test_the_series_draws_quality_over_severity(qualities: Qualities) -> None:
         "hg": [(0.0, "test/std"), (0.5, "valid")],
         "hs": [(0.0, "test/std"), (0.5, "train"), (1.0, "test/hs")],
     }
-    figure = severity_figure(all_series, qualities)
+    figure = severity_figure(all_series, {split: numbers(item) for split, item in qualities.items()})
     for title, values in (
         ("Accuracy", [qualities[split].classes[0].accuracy for _, split in all_series["hs"]]),
         ("CRPS", [qualities[split].traversability.crps for _, split in all_series["hs"]]),
@@ -145,7 +146,9 @@ def test_the_series_draws_quality_over_severity(qualities: Qualities) -> None:
 
 def test_a_series_without_classes_is_of_traversability_alone(dataset: TerrainDataset) -> None:
     found = dict(evaluate(Oracle(), dataset))
-    figure = severity_figure({"hs": [(0.0, "test/std"), (1.0, "test/hs")]}, found)
+    figure = severity_figure(
+        {"hs": [(0.0, "test/std"), (1.0, "test/hs")]}, {split: numbers(item) for split, item in found.items()}
+    )
     assert len(figure.axes) == 4
     np.testing.assert_allclose(
         line(panel(figure, "CRPS"), marker="o")[1][1], found["test/hs"].traversability.crps
