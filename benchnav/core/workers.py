@@ -9,12 +9,13 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from itertools import islice
 from multiprocessing import resource_tracker
+from queue import SimpleQueue
 from typing import Any, TypeVar
 from urllib.parse import urlparse
 
@@ -79,13 +80,14 @@ def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Itera
     )
     # A worker whose memory has grown is replaced; that is no concern of a user's.
     warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-    waiting, pending = iter(calls), set[Future[Result]]()
+    # Not `concurrent.futures.wait`: an interruption in the midst of it would leave a future locked for good.
+    waiting, pending, done = iter(calls), set[Future[Result]](), SimpleQueue[Future[Result]]()
     try:
         # Few at a time, so that results do not pile up.
-        while pending := pending | _submit(executor, islice(waiting, jobs + 1 - len(pending))):
-            done, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
+        while pending := pending | _submit(executor, islice(waiting, jobs + 1 - len(pending)), done.put):
+            future = done.get()
+            pending.remove(future)
+            yield future.result()
     except BrokenProcessPool as error:
         raise BenchnavError(
             "A worker was killed, perhaps for want of memory. What was finished is kept: give the same command again, "
@@ -100,15 +102,21 @@ def _run_in_processes(calls: Sequence[Callable[[], Result]], jobs: int) -> Itera
             executor.shutdown()
 
 
-def _submit(executor: Any, calls: Iterable[Callable[[], Result]]) -> set[Future[Result]]:
-    """Hands calls over; processes that are started for them inherit that they hear no interruption.
+def _submit(
+    executor: Any, calls: Iterable[Callable[[], Result]], tell: Callable[[Future[Result]], None]
+) -> set[Future[Result]]:
+    """Hands calls over, each to be told of when it is done.
 
-    An interruption is for this process to act on, and would find them in the middle of their imports.
+    Processes that are started for them inherit that they hear no interruption: it is for this process to act on, and
+    would find them in the middle of their imports.
     """
     resource_tracker.ensure_running()  # its start, which the first process would need, ends the blocking
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return {executor.submit(call) for call in calls}
+        futures = {executor.submit(call) for call in calls}
+        for future in futures:
+            future.add_done_callback(tell)
+        return futures
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
