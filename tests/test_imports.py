@@ -14,8 +14,7 @@ PLANNING = tuple(f"planning.{name}" for name in VALUES)
 SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
 # Whatever is known of models beside their training and their quality.
 MODELS = tuple(
-    f"models.{name}"
-    for name in ("base", "slope_gp", "nets", "checkpoint", "config", "fused", "predictor", "probabilities")
+    f"models.{name}" for name in ("base", "slope_gp", "nets", "checkpoint", "config", "fused", "predictor")
 )
 VALUES_OF_EVAL = ("eval.experiment",)
 # What running writes and reports read.
