@@ -11,7 +11,7 @@ from typing import Literal
 from benchnav.core.command import INTERRUPTED, Command, Device, run, show_progress, tell
 from benchnav.core.errors import ConfigError
 from benchnav.core.store import read_shard
-from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.experiment.suite import Labels, Suite
 from benchnav.eval.replay import other_folder, program, replay
 
 SUITES = Path(__file__).parent / "suites"
@@ -127,17 +127,10 @@ def report(folder: str, out: str = "") -> None:
 
 
 def compare(
+    labels: Labels,
     folders: list[str],
     against: str = "",
     by: str = "",
-    planner: str = "",
-    risk: str = "",
-    scenario: str = "",
-    model: str = "",
-    robot: str = "",
-    objective: str = "",
-    world: str = "",
-    data: str = "",
     points: float = 5.0,
     allow_different: Literal["nothing", "code"] = "nothing",
     out: str = "",
@@ -145,18 +138,11 @@ def compare(
     """Compare conditions that met the same maps with the same draws of λ, with intervals and corrected tests.
 
     Args:
+        labels: Of the conditions that are looked at.
         folders: Folders of finished runs, one or more.
         against: What all others are compared with, such as mean or straight; all pairs when not given.
         by: In what conditions differ, and in nothing else: risk, planner, model, objective, robot, world or run. When
             not given, that in which `against` is found; run where runs share conditions; else risk.
-        planner: Planners that are looked at, as the table calls them, with a comma between; all when not given.
-        risk: Risk settings.
-        scenario: Scenarios.
-        model: Models.
-        robot: Robots.
-        objective: Objectives.
-        world: Worlds.
-        data: Datasets.
         points: Difference of success in percentage points, for which the maps that it needs are told.
         allow_different: code compares conditions that other code made too, and names in every table what differs.
         out: Path without a suffix; .csv, .md and .tex are written there.
@@ -166,12 +152,8 @@ def compare(
 
     if out and (out.endswith(os.sep) or Path(out).name in ("", "..")):
         raise ConfigError(f"Expected `out` as the path of files without a suffix, got the folder {out}.")
-    asked = {
-        **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
-        **{"robot": robot, "objective": objective, "world": world, "data": data},
-    }
     runs = [Path(folder) for folder in folders]
-    table, shown = compare_runs(runs, by, against, asked, points / 100, allow_different == "code")
+    table, shown = compare_runs(runs, by, against, labels.asked, points / 100, allow_different == "code")
     print_table(shown)
     if out:
         print("written:", ", ".join(map(str, write_comparison(Path(out), table, shown))))
@@ -267,8 +249,8 @@ def main() -> None:
         "run": Command(run_command, settings=Suite, configs=SUITES),
         "list": Command(list_command, ("kinds",)),
         "report": Command(report, ("folder",)),
-        "compare": Command(compare, ("folders",)),
-        "replay": Command(replay, ("folder",)),
+        "compare": Command(compare, ("folders",), settings=Labels),
+        "replay": Command(replay, ("folder",), settings=Labels),
         "merge": Command(merge, ("out", "parts")),
         "rerun": Command(rerun, ("folder",)),
     }

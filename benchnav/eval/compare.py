@@ -40,7 +40,7 @@ def compare_runs(
     folders: Sequence[Path],
     by: str,
     against: str,
-    asked: Mapping[str, str],
+    asked: Mapping[str, Sequence[str]],
     difference: float,
     allow_different_code: bool = False,
 ) -> tuple[pd.DataFrame, Table]:
@@ -50,7 +50,7 @@ def compare_runs(
         folders: finished runs.
         by: in what conditions differ; see `pairing.by_what`.
         against: what all others are compared with; all pairs when empty.
-        asked: labels of the conditions that are looked at, several with a comma between; all when empty or not named.
+        asked: labels of the conditions that are looked at, by column; of columns that are not named all.
         difference: of success, for which the maps needed are counted.
         allow_different_code: compare what other code made too, and say so in the table. Runs that are compared with
             each other always are.
@@ -153,15 +153,12 @@ def _names(folders: Sequence[Path]) -> list[str]:
     return ["/".join(path.parts[-parts:]) for path in paths]
 
 
-def _chosen(conditions: Iterable[Compared], asked: Mapping[str, str]) -> list[Compared]:
-    chosen = list(conditions)
+def _chosen(chosen: list[Compared], asked: Mapping[str, Sequence[str]]) -> list[Compared]:
     for name, values in asked.items():
-        if not values:
-            continue
-        known = list(dict.fromkeys(condition.labels[name] for condition in chosen))
-        for value in values.split(","):
+        known = dict.fromkeys(condition.labels[name] for condition in chosen)
+        for value in values:
             check_known(f"`{name}`", value, known)
-        chosen = [condition for condition in chosen if condition.labels[name] in values.split(",")]
+        chosen = [condition for condition in chosen if condition.labels[name] in values]
     return chosen
 
 

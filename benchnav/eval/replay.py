@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchnav.core.errors import ConfigError
+from benchnav.eval.experiment.suite import Labels
 
 if TYPE_CHECKING:
     from benchnav.eval.experiment.unit import Unit
@@ -20,15 +21,8 @@ VIDEO = ".mp4"
 
 
 def replay(
+    labels: Labels,
     folder: str,
-    planner: tuple[str, ...] = (),
-    risk: tuple[str, ...] = (),
-    scenario: tuple[str, ...] = (),
-    model: tuple[str, ...] = (),
-    robot: tuple[str, ...] = (),
-    objective: tuple[str, ...] = (),
-    world: tuple[str, ...] = (),
-    data: tuple[str, ...] = (),
     seed: int | None = None,
     realisation: int = 0,
     map: int = 0,
@@ -39,18 +33,12 @@ def replay(
 ) -> int:
     """Play an episode back, or several on one map, recording first what was not recorded.
 
-    Several labels of a column, such as --risk mean,cvar:0.9, show their conditions together.
+    Several labels of a column, such as --risk mean,cvar:0.9, show their conditions together. Of a column that is not
+    named the run's first label that fits is taken.
 
     Args:
+        labels: Of the conditions.
         folder: Run folder.
-        planner: Planner as the table calls it; the run's first that fits when not given, as all of these.
-        risk: Risk setting.
-        scenario: Scenario.
-        model: Model.
-        robot: Robot.
-        objective: Objective.
-        world: World.
-        data: Dataset.
         seed: Root seed; the run's first when not given.
         realisation: Draw of λ.
         map: Number of the map in the scenario.
@@ -66,13 +54,8 @@ def replay(
         raise ConfigError(f"Expected `video` as a file {VIDEO}, got {video!r}.")
     if video and web:
         raise ConfigError("Expected `video` or `web`, got both.")
-    columns = {
-        **{"planner": planner, "risk": risk, "scenario": scenario, "model": model},
-        **{"robot": robot, "objective": objective, "world": world, "data": data},
-    }
-    asked = {name: labels for name, labels in columns.items() if labels}
     run, place = Path(folder), other_folder(folder, out)
-    found = find_episodes(run, asked, seed, realisation, map)
+    found = find_episodes(run, labels.asked, seed, realisation, map)
     if video:
         from benchnav.core.command import show_progress
         from benchnav.eval.report.playback.video import write_video

@@ -123,7 +123,8 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
     ),
     ("eval run --seeds 1,2", {"suite": {"seeds": (1, 2)}}),
     ("eval run --scenarios '[]'", {"suite": {}}),
-    ("eval replay r --risk mean,cvar:0.9", {"folder": "r", "risk": ("mean", "cvar:0.9")}),
+    ("eval replay r --risk mean,cvar:0.9", {"folder": "r", "labels": {"risk": ("mean", "cvar:0.9")}}),
+    ("eval compare r s --model stakes-v1 --by risk", {"folders": ["r", "s"], "labels": {"model": ("stakes-v1",)}, "by": "risk"}),
     # what is given by place
     ("datagen show f", {"file": "f"}),
     ("datagen create tiny-v1 id=a splits.train.maps=5 --out o",

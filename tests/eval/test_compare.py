@@ -77,7 +77,9 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 def test_the_numbers_are_those_of_the_pairs_of_the_run(tmp_path: Path) -> None:
     episodes = settings()
-    table, _ = compare_runs([run_folder(tmp_path / "run", episodes)], "", "mean", {"planner": "mppi"}, 0.05)
+    table, _ = compare_runs(
+        [run_folder(tmp_path / "run", episodes)], "", "mean", {"planner": ("mppi",)}, 0.05
+    )
     conditions = [
         Compared(
             labels={**condition("mppi", risk), "run": NOT_USED},
@@ -98,14 +100,14 @@ def test_what_is_looked_at_can_be_narrowed(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", settings())
     every, _ = compare_runs([folder], "", "", {}, 0.05)
     assert len(every) == 6
-    some, shown = compare_runs([folder], "", "", {"risk": "mean,var"}, 0.05)
+    some, shown = compare_runs([folder], "", "", {"risk": ("mean", "var")}, 0.05)
     assert [(r["planner"], r["one"], r["other"]) for r in some.to_dict("records")] == [
         ("mppi", "var", "mean"),
         ("cl_rrt", "var", "mean"),
     ]
     assert any("Family: 2 pairs" in note for note in shown.notes)
     assert some["success_p_holm"].iloc[0] < every["success_p_holm"].iloc[1]
-    planners, _ = compare_runs([folder], "planner", "", {"risk": "cvar"}, 0.05)
+    planners, _ = compare_runs([folder], "planner", "", {"risk": ("cvar",)}, 0.05)
     assert [(r["one"], r["other"]) for r in planners.to_dict("records")] == [("cl_rrt", "mppi")]
     blind, _ = compare_runs([folder], "", "straight", {}, 0.05)
     assert len(blind) == 6
@@ -229,12 +231,12 @@ def test_two_settings_under_one_label_are_refused(tmp_path: Path) -> None:
 
 def test_what_found_no_partner_is_named(tmp_path: Path) -> None:
     folder = run_folder(tmp_path / "run", settings())
-    _, shown = compare_runs([folder], "planner", "", {"risk": "mean,–"}, 0.05)
+    _, shown = compare_runs([folder], "planner", "", {"risk": ("mean", "–")}, 0.05)
     assert not any("Without a partner" in note for note in shown.notes)
     lonely = {"part": "mppi", "options": {"theta": 5.0}}
     episodes = settings()[lambda rows: (rows["planner"] != "cl_rrt") | (rows["risk"] != "var")]
     other = run_folder(tmp_path / "other", episodes, values={"var": {"risk": lonely}})
-    _, shown = compare_runs([other], "planner", "", {"planner": "mppi,cl_rrt"}, 0.05)
+    _, shown = compare_runs([other], "planner", "", {"planner": ("mppi", "cl_rrt")}, 0.05)
     assert "Without a partner, so in no row: mppi var." in shown.notes
     _, shown = compare_runs([folder], "", "mean", {}, 0.05)
     assert "Without a partner, so in no row: straight." in shown.notes

@@ -91,3 +91,33 @@ class Suite:
     def all_seeds(self) -> tuple[int, ...]:
         """The root seeds."""
         return self.seeds or (self.seed,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Labels:
+    """Which conditions of a run are meant, by what its table calls them: of each column one label or several.
+
+    Args:
+        planner: Planners, several with a comma between; those of all conditions when not given, as all of these.
+        risk: Risk settings.
+        scenario: Scenarios.
+        model: Models.
+        robot: Robots.
+        objective: Objectives.
+        world: Worlds.
+        data: Datasets.
+    """
+
+    planner: tuple[str, ...] = ()
+    risk: tuple[str, ...] = ()
+    scenario: tuple[str, ...] = ()
+    model: tuple[str, ...] = ()
+    robot: tuple[str, ...] = ()
+    objective: tuple[str, ...] = ()
+    world: tuple[str, ...] = ()
+    data: tuple[str, ...] = ()
+
+    @property
+    def asked(self) -> dict[str, tuple[str, ...]]:
+        """Labels by column, of the columns that are named."""
+        return {column: labels for column, labels in vars(self).items() if labels}

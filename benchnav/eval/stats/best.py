@@ -24,7 +24,6 @@ from benchnav.eval.stats.paired_difference import (
     standard_deviation,
     success_interval,
 )
-from benchnav.eval.stats.summary import units_of
 
 # Conditions of a block met the same maps and the same noise, and were asked the same.
 BLOCK = ("data", "scenario", "world", "robot", "objective")
@@ -47,9 +46,9 @@ def privileged_models(conditions: Mapping[str, Any]) -> dict[str, str]:
         By id one of `PRIVILEGED`.
     """
     looking = {
-        condition: about["value"].get("model", {}).get("part")
+        condition: about["value"]["model"]["part"]
         for condition, about in conditions.items()
-        if about["labels"].get("model") != NOT_USED
+        if about["labels"]["model"] != NOT_USED
     }
     return {condition: part for condition, part in looking.items() if part in PRIVILEGED}
 
@@ -161,12 +160,12 @@ def _compare(rivals: Mapping[str, pd.DataFrame]) -> tuple[dict[str, Any], dict[s
             judged[condition]["total_time_s"].mean(),
         ),
     )
-    episodes, maps = len(judged[best]), units_of(judged[best]).nunique()
+    episodes, maps = len(judged[best]), judged[best]["group"].nunique()
     about = {"best": best, "best_rivals": len(others), "best_episodes": episodes, "best_maps": maps}
     made: dict[str, dict[str, Any]] = {best: {"best_alike": True}}
     if common.empty:  # nothing to compare
         return about, made | {condition: {"best_alike": True, "best_p": 1.0} for condition in others}
-    wins = [judged[one]["success"].groupby(units_of(judged[one])).sum() for one in (best, *others)]
+    wins = [judged[one].groupby("group")["success"].sum() for one in (best, *others)]
     values = np.stack([won.to_numpy(dtype=float) for won in wins], axis=1)
     draws = episodes / maps
     p, critical = best_set_p(values, sign_flips(maps))

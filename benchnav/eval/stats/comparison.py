@@ -19,7 +19,6 @@ from benchnav.eval.stats.paired_difference import (
     total_time_interval,
 )
 from benchnav.eval.stats.pairs import Pair
-from benchnav.eval.stats.summary import units_of
 
 ALPHA = 0.05
 
@@ -70,10 +69,10 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float
     Returns:
         Difference and the ends of its interval in seconds.
     """
-    units, arrived, arrival_s, budget_s = units_of(rows), [], [], []
+    arrived, arrival_s, budget_s = [], [], []
     for suffix in ("", "_other"):
         success = rows[f"success{suffix}"].astype(bool)
-        arrived.append(set(units[success]))
+        arrived.append(set(rows.loc[success, "group"]))
         arrival_s.append(rows.loc[success, f"total_time_s{suffix}"])
         budget_s.append(rows[f"time_budget_s{suffix}"])
     arrivals = pd.concat(arrival_s)
@@ -91,7 +90,7 @@ def time_difference(rows: pd.DataFrame, confidence: float = 0.95) -> tuple[float
 def gain_by_map(rows: pd.DataFrame) -> tuple[np.ndarray, float]:
     """Successes of the one less those of the other by map, shape [M], and the mean number of episodes on a map."""
     gain = rows["success"].astype(int) - rows["success_other"].astype(int)
-    by_unit = gain.groupby(units_of(rows)).sum().to_numpy()
+    by_unit = gain.groupby(rows["group"]).sum().to_numpy()
     return by_unit, len(rows) / max(len(by_unit), 1)
 
 
@@ -128,7 +127,7 @@ def _compare_success(pair: Pair, alpha: float, difference: float) -> dict[str, o
 def mean_differences(rows: pd.DataFrame, column: str = "total_time_s") -> np.ndarray:
     """By how much one condition has more of a column, such as time, by map or group of maps, shape [M]."""
     more = (rows[column] - rows[f"{column}_other"]).to_numpy(dtype=float)
-    return by_map(more, units_of(rows).to_numpy())
+    return by_map(more, rows["group"].to_numpy())
 
 
 def _in_shares(rows: pd.DataFrame) -> pd.DataFrame:

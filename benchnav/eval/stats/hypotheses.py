@@ -19,7 +19,7 @@ from benchnav.eval.experiment.hypotheses import METRICS, Hypothesis
 from benchnav.eval.stats.comparison import ALPHA, gain_by_map, mean_differences, time_difference
 from benchnav.eval.stats.paired_difference import mean_interval, sign_flip_p, sign_flips, success_interval
 from benchnav.eval.stats.pairs import side_by_side
-from benchnav.eval.stats.summary import time_budgets, units_of
+from benchnav.eval.stats.summary import time_budgets
 
 # Confidence at which a p-value of a margin is looked for, but for what rounds to 0 and 1.
 _MOST = 1 - 1e-12
@@ -67,7 +67,7 @@ def _test(test: Hypothesis, rows: pd.DataFrame) -> dict[str, Any]:
     metric = METRICS[test.metric]
     row: dict[str, Any] = {
         "unit": metric.unit,
-        "n_maps": units_of(rows).nunique(),
+        "n_maps": rows["group"].nunique(),
         "n_episodes": len(rows),
         "mean_one": metric.scale * rows[metric.column].mean(),
         "mean_other": metric.scale * rows[f"{metric.column}_other"].mean(),
@@ -113,7 +113,7 @@ def _difference_p(test: Hypothesis, rows: pd.DataFrame) -> float:
         return sign_flip_p(gain_by_map(rows)[0].astype(int), test.direction)
     column = METRICS[test.metric].column
     more = rows[column] - rows[f"{column}_other"]
-    sums = more.groupby(units_of(rows).to_numpy()).sum().to_numpy()
+    sums = more.groupby(rows["group"].to_numpy()).sum().to_numpy()
     flipped, seen = sign_flips(len(sums)) @ sums, sums.sum()
     # Sums are exact to rounding, and ways that tie with what was seen count.
     slack = 1e-9 * np.abs(sums).sum()

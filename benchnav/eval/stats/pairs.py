@@ -18,7 +18,7 @@ _KEYS: Mapping[str, tuple[str, ...]] = {
     "world": ("world", "rules"),
     "run": (),
 }
-# Of an episode, what pairs hold of both sides, where the tables have it.
+# Of an episode, what pairs hold of both sides.
 _MEASURES = ("success", "total_time_s", "time_budget_s", "score", "traversability", "path_length_m")
 
 
@@ -51,7 +51,7 @@ class Pair:
         shared: labels of the two; of a label that one of them does not use, the other's.
         episodes: of both, paired by seed, realisation and map, on all maps that both met: one's `success`,
             `total_time_s`, `time_budget_s` and other measures, the other's with `_other`; and `group`, the statistical
-            unit, where the tables have it. Maps may have unequally many.
+            unit. Maps may have unequally many.
         members: the conditions.
     """
 
@@ -192,8 +192,7 @@ def _field(condition: Compared) -> dict[str, Any]:
 def _pair(one: Compared, other: Compared, by: str) -> Pair:
     names = f"{one.labels[by]!r} and {other.labels[by]!r}"
     check_maps(one, other, names)
-    measures = [name for name in _MEASURES if name in one.episodes and name in other.episodes]
-    both = side_by_side(one.episodes, other.episodes, measures)
+    both = side_by_side(one.episodes, other.episodes, _MEASURES)
     if both.empty:
         raise ConfigError(
             f"Expected conditions with episodes in common, got {names} with {_draws(one)} and {_draws(other)}."
@@ -221,15 +220,10 @@ def side_by_side(one: pd.DataFrame, other: pd.DataFrame, measures: Sequence[str]
         measures: columns that are taken of both, the other's with `_other`.
 
     Returns:
-        `DRAW`, the measures, and `group` where either of them has it.
+        `DRAW`, the measures, and `group`.
     """
     columns = [*DRAW, *measures]
-    both = one[columns].merge(other[columns], on=DRAW, suffixes=("", "_other"))
-    grouped = next((rows for rows in (one, other) if "group" in rows), None)
-    if grouped is not None:
-        known = grouped.dropna(subset=["group"]).drop_duplicates("map").set_index("map")["group"]
-        both["group"] = both["map"].map(known).fillna(both["map"]).astype("int64")
-    return both
+    return one[["group", *columns]].merge(other[columns], on=DRAW, suffixes=("", "_other"))
 
 
 def check_maps(one: Compared, other: Compared, names: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
+from statsmodels.stats.proportion import proportion_confint
 
 from benchnav.eval.experiment.condition import LABELS
 from benchnav.eval.stats.paired_difference import by_map, total_time_interval
@@ -39,11 +39,8 @@ def wilson_interval(rate: float, n: float) -> tuple[float, float]:
     Returns:
         Lower and upper end, in [0, 1].
     """
-    z = float(norm.ppf((1 + 0.95) / 2))
-    centre = rate + z**2 / (2 * n)
-    half = z * (rate * (1 - rate) / n + z**2 / (4 * n**2)) ** 0.5
-    low, high = (centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)
-    return max(low, 0.0), min(high, 1.0)
+    low, high = proportion_confint(rate * n, n, method="wilson")
+    return float(low), float(high)
 
 
 def design_effect(success: np.ndarray, maps: np.ndarray) -> float:
@@ -104,15 +101,6 @@ def cautious_design_effect(success: np.ndarray, maps: np.ndarray) -> float:
     return min(effect, len(success))
 
 
-def units_of(episodes: pd.DataFrame) -> pd.Series:
-    """The statistical unit of each row: its group of maps, or its map where the dataset has no groups.
-
-    Args:
-        episodes: rows of one dataset's split.
-    """
-    return episodes["group" if "group" in episodes else "map"]
-
-
 def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
     """T of each episode in seconds: what a failure counts as, and what a success might have cost.
 
@@ -131,7 +119,7 @@ def time_budgets(episodes: pd.DataFrame, world: Mapping[str, Any]) -> pd.Series:
 def success_mean(episodes: pd.DataFrame) -> tuple[float, float, float]:
     """Success rate of one condition with its 95 % interval, Wilson's on the episodes over `cautious_design_effect`."""
     success = episodes["success"].to_numpy(dtype=bool)
-    effect = cautious_design_effect(success, units_of(episodes).to_numpy())
+    effect = cautious_design_effect(success, episodes["group"].to_numpy())
     return float(success.mean()), *wilson_interval(float(success.mean()), len(success) / effect)
 
 
@@ -145,7 +133,7 @@ def total_time_mean(episodes: pd.DataFrame, world: Mapping[str, Any]) -> tuple[f
     Returns:
         Mean and ends in seconds; the ends are NaN where there are fewer than `difference.LEAST_MAPS` maps.
     """
-    success, maps = episodes["success"].to_numpy(dtype=bool), units_of(episodes).to_numpy()
+    success, maps = episodes["success"].to_numpy(dtype=bool), episodes["group"].to_numpy()
     taken, budgets = episodes["total_time_s"].to_numpy(), time_budgets(episodes, world)
     arrival = taken[success].mean() if success.any() else 0.0  # no arrival takes less
     _, low, high = success_mean(episodes)
@@ -170,20 +158,19 @@ def summarise(episodes: pd.DataFrame, worlds: Mapping[str, Mapping[str, Any]]) -
         `NAME_mean`, `NAME_std` and `NAME_n`, the number of episodes that have it: total time, a failure
         counted as T; time of the successes alone; observed λ; time over the reference time; score; path length;
         share of stuck steps; roughness. `total_time_low_s`, `total_time_high_s`, the 95 % interval of its mean,
-        from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`, which
-        runs of earlier versions do not have; `compiled_share`; and `OUTCOME_count` of each failure.
+        from `total_time_interval`. `planning_ms_median`, and so for `planning_ms_p95` and `planning_start_ms`;
+        `compiled_share`; and `OUTCOME_count` of each failure.
     """
     groups = episodes.groupby("condition", sort=False)
     return pd.DataFrame([_summarise_condition(group, worlds[str(condition)]) for condition, group in groups])
 
 
 def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[str, object]:
-    success, member = group["success"].to_numpy(dtype=bool), units_of(group).to_numpy()
-    effect = cautious_design_effect(success, member)
+    success = group["success"].to_numpy(dtype=bool)
+    effect = cautious_design_effect(success, group["group"].to_numpy())
     rate, low, high = success_mean(group)
     row: dict[str, object] = {name: group[name].iloc[0] for name in ("condition", *LABELS)}
-    row |= {"n_episodes": len(group), "n_maps": group["map"].nunique()}
-    row["n_groups"] = len(np.unique(member))
+    row |= {"n_episodes": len(group), "n_maps": group["map"].nunique(), "n_groups": group["group"].nunique()}
     row |= {"success_rate": rate, "success_low": low, "success_high": high, "design_effect": effect}
     columns = group.assign(success_time_s=group["total_time_s"].where(success))
     for column, (name, unit) in _QUANTITIES.items():
@@ -193,7 +180,7 @@ def _summarise_condition(group: pd.DataFrame, world: Mapping[str, Any]) -> dict[
         if name == "total_time":
             _, row["total_time_low_s"], row["total_time_high_s"] = total_time_mean(group, world)
     for name in ("planning_ms", "planning_ms_p95", "planning_start_ms"):
-        row[f"{name}_median"] = group[name].median() if name in group else np.nan
+        row[f"{name}_median"] = group[name].median()
     row["compiled_share"] = group["compiled"].astype(float).mean()
     outcomes = [outcome.name.lower() for outcome in FAILURES]
     return row | {f"{name}_count": int((group["outcome"] == name).sum()) for name in outcomes}

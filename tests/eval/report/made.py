@@ -34,7 +34,7 @@ def row(
     success = time_s is not None
     made: dict[str, Any] = {
         "condition": "+".join(labels[name] for name in LABELS), **labels, "seed": 0, "realisation": 0,
-        "map": map_index, "outcome": "success" if success else "timeout", "success": success,
+        "map": map_index, "group": map_index, "outcome": "success" if success else "timeout", "success": success,
         "total_time_s": time_s if success else 100.0, "end_time_s": time_s if success else 100.0,
         "traversability": 0.8, "reference_time_s": 25.0, "time_ratio": time_s / 25 if success else np.nan,
         "score": 12.5 / time_s if success else 0.0, "path_length_m": 22.0, "stuck_share": 0.1,

@@ -23,7 +23,8 @@ def pair(
     budgets_s: tuple[float, float] = (100.0, 100.0),
 ) -> Pair:
     """Times of two conditions by episode, T of a failure; `draws` episodes in a row are on one map."""
-    episodes = pd.DataFrame({"map": np.arange(len(one)) // draws})
+    maps = np.arange(len(one)) // draws
+    episodes = pd.DataFrame({"map": maps, "group": maps})
     for suffix, times, budget_s in (("", one, budgets_s[0]), ("_other", other, budgets_s[1])):
         episodes[f"success{suffix}"] = np.array(times) < budget_s
         episodes[f"total_time_s{suffix}"] = times

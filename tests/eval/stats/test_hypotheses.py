@@ -37,7 +37,8 @@ def hypothesis(**changes: Any) -> Hypothesis:
 
 def beside(one: np.ndarray, other: np.ndarray, column: str = "score") -> pd.DataFrame:
     """A metric of two conditions, an episode a map."""
-    return pd.DataFrame({"map": np.arange(len(one)), column: one, f"{column}_other": other})
+    maps = np.arange(len(one))
+    return pd.DataFrame({"map": maps, "group": maps, column: one, f"{column}_other": other})
 
 
 def test_two_conditions_are_named_by_their_labels() -> None:

@@ -254,18 +254,11 @@ def test_what_is_not_used_needs_no_one_value() -> None:
     )
 
 
-def test_pairs_hold_the_group_of_each_map_where_a_table_has_it() -> None:
-    """Tables of earlier versions have none."""
+def test_pairs_hold_the_group_of_each_map() -> None:
     grouped = [row(condition("mppi", "cvar"), i, group=i // 2 + 7) for i in range(4)]
-    for conditions in (
-        [compared(), compared(risk="cvar", episodes=grouped)],
-        [compared(risk="cvar", episodes=grouped)],
-    ):
-        (pair,) = find_pairs([*conditions, *([] if len(conditions) > 1 else [compared(risk="mean")])])
-        assert list(pair.episodes.sort_values("map")["group"]) == [7, 7, 8, 8]
-        assert pair.episodes["group"].dtype == np.int64
-    (pair,) = find_pairs([compared(), compared(risk="cvar")])
-    assert "group" not in pair.episodes
+    (pair,) = find_pairs([compared(episodes=grouped), compared(risk="cvar", episodes=grouped)])
+    assert list(pair.episodes.sort_values("map")["group"]) == [7, 7, 8, 8]
+    assert pair.episodes["group"].dtype == np.int64
 
 
 def test_pairs_hold_every_measure_of_both() -> None:

@@ -46,7 +46,7 @@ def test_intervals_of_the_study_are_those_of_the_tables(generator: np.random.Gen
     success, taken = studies.drives(generator, (0.8, 0.9), (2, 12), draws, (0.3, 0.7))
     found = studies.time_intervals(success, taken)
     for study in range(2):
-        rows = pd.DataFrame({"map": np.repeat(np.arange(12), draws)})
+        rows = pd.DataFrame({"group": np.repeat(np.arange(12), draws)})
         for place, suffix in enumerate(("", "_other")):
             rows[f"success{suffix}"] = success[study, place].ravel()
             rows[f"total_time_s{suffix}"] = taken[study, place].ravel()

@@ -260,7 +260,7 @@ def test_intervals_of_total_time_cover_it_on_few_maps(maps: int, each: int, rate
         )
         table = pd.DataFrame(
             {
-                "map": np.repeat(np.arange(maps), each),
+                "group": np.repeat(np.arange(maps), each),
                 "success": success.ravel(),
                 "total_time_s": taken.ravel(),
             }
