@@ -19,8 +19,9 @@ LIVES = (
 
 # Prints the numbers of its processes, then waits to be interrupted or killed.
 WAITS = """
-import os, sys, time
+import os, signal, sys, time
 from functools import partial
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs do not have
 from benchnav.core.workers import run_calls
 def call(number):
     time.sleep(0.01 if number < 2 else 60)
