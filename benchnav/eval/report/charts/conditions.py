@@ -4,7 +4,7 @@ All but the last have a panel a block and a row a setting. Any number of planner
 since their names stand on the left.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -104,14 +104,13 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
 
 
 @styled()
-def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figure:
+def success_figure(summary: pd.DataFrame) -> Figure:
     """Draws the success rate of every condition with its 95 % interval, a panel a block of the run.
 
     A planner that is blind is drawn as a line through its panel, the baseline that others are seen against.
 
     Args:
-        summary: from `summary.summarise`.
-        marked: conditions whose points are filled, as `best_marked` of `best.against_best` has them.
+        summary: from `summary.summarise`, joined with `best.against_best`, whose `best_marked` fills points.
     """
     (figure, panels), colours = lay_out(summary, ["success [%]"]), planner_colours(list(summary["planner"]))
     for panel, rows in panels:
@@ -119,7 +118,7 @@ def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figur
             # The clairvoyant has a model, and no risk.
             blind = row["model"] == NOT_USED
             colour = BLIND if blind else colours[row["planner"]]
-            face = colour if row["condition"] in marked else "white"
+            face = colour if row.get("best_marked") else "white"
             rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
             panel.plot([low, high], [row["height"]] * 2, color=colour, lw=1.2, solid_capstyle="butt")
             panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
