@@ -23,7 +23,7 @@ from benchnav.eval.report.words import (
     several_models,
     success_interval_in_words,
 )
-from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
+from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
@@ -171,9 +171,7 @@ def bold_note(summary: pd.DataFrame) -> str:
         f"{by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is significantly worse none is "
         "marked"
     )
-    left_out = pd.concat(
-        [rows[~competing(rows)] for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)]
-    )
+    left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
     models = dict.fromkeys(
         model for part in PRIVILEGED for model in left_out.loc[left_out["privileged"] == part, "model"]
     )

@@ -11,6 +11,10 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.best import BLOCK
 from benchnav.planning.world.outcome import FAILURES
 
+# Columns of the summary that count failures, by how these ended, and what sentences call them.
+FAILURE_COUNTS = {
+    f"{outcome.name.lower()}_count": outcome.name.lower().replace("_", " ") for outcome in FAILURES
+}
 # Labels that tell conditions of one map apart.
 NAMING = ("planner", "risk", "model", "robot", "objective", "world")
 
@@ -80,9 +84,8 @@ def failures_in_words(row: Mapping[Any, Any]) -> str:
     Args:
         row: of the summary.
     """
-    names = [outcome.name.lower() for outcome in FAILURES]
-    counts = {outcome_in_words(name): int(row[f"{name}_count"]) for name in names}
-    return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or NOT_USED
+    words = (f"{row[column]} {name}" for column, name in FAILURE_COUNTS.items() if row[column])
+    return ", ".join(words) or NOT_USED
 
 
 def outcome_in_words(outcome: str) -> str:
