@@ -17,16 +17,7 @@ from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.robot import (
-    TIMELINE,
-    Driver,
-    log_driven,
-    log_outcome,
-    log_plans,
-    log_robot,
-    log_series,
-)
-from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
+from benchnav.eval.report.playback.scene import TIMELINE, Driver, log_driver, log_ground
 from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
@@ -54,7 +45,6 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         path: file to write; its name is what the viewer calls it.
     """
     drivers = drivers_of(recordings)
-    first = recordings[0]
     # One chunk an entity, however slow the machine is: each has a header of more than a kilobyte.
     batches = rr.ChunkBatcherConfig.NEVER()
     stream = rr.RecordingStream(APPLICATION, recording_id=path.stem, batcher_config=batches)
@@ -63,13 +53,9 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         try:
             stream.send_recording_name(_title(drivers))
             stream.log("about", rr.TextDocument(describe(drivers), media_type="text/markdown"), static=True)
-            log_terrain(stream, first)
-            log_maps(stream, first)
+            log_ground(stream, recordings[0])
             for driver in drivers:
-                risk, closed = driver.entity("map/risk"), driver.entity("map/closed")
-                log_predicted(stream, driver.recording, risk, closed)
-                for log in (log_robot, log_series, log_driven, log_plans, log_outcome):
-                    log(stream, driver)
+                log_driver(stream, driver)
             stream.flush()
         finally:
             stream.disconnect()
