@@ -119,16 +119,15 @@ def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -
         name: of `MARKS`.
         place: (x, y).
         scale: of the mark's size.
-        **style: what differs, as in `Axes.plot`.
+        **style: what differs, as in `Axes.plot`; a legend calls the mark by its name, unless a `label` is there.
     """
-    looks = MARKS[name]
-    panel.plot(*place, **{**looks, "ms": scale * looks["ms"], **style})
+    looks = MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]}
+    panel.plot(*place, **looks | style)
 
 
-def mark_handle(name: str, label: str = "", scale: float = 1.0) -> Line2D:
-    """The entry of a legend for a mark, under its own name where none is given."""
-    looks = MARKS[name]
-    return Line2D([], [], **{**looks, "ms": scale * looks["ms"]}, label=label or name)
+def mark_handle(name: str, scale: float = 1.0) -> Line2D:
+    """The entry of a legend for a mark."""
+    return Line2D([], [], **MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]})
 
 
 def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **style: Any) -> None:

@@ -9,7 +9,6 @@ import shutil
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 # Stands for a number or a name that there is not.
 NOTHING = "–"
@@ -174,8 +173,10 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
         width: columns of the terminal; not limited when not given.
         styled: set bold cells in bold and show colours; else a star stands behind bold cells.
     """
+    from rich import box
     from rich.console import Console
     from rich.markup import escape
+    from rich.table import Table as Drawn
 
     bold_note = [f"{'Bold' if styled else '*'}: {table.bold_note}"] if table.bold_note else []
     console = Console(
@@ -185,18 +186,6 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
         color_system="256" if styled else None,
         highlight=False,
     )
-    # Square brackets are markup.
-    title = [f"[bold]{escape(table.title)}[/bold]"] if table.title else []
-    console.print(*title, _drawn(table, styled), *map(escape, (*table.notes, *bold_note)), sep="\n")
-    return console.file.getvalue()  # type: ignore[attr-defined]
-
-
-def _drawn(table: Table, styled: bool) -> Any:
-    """The table as rich draws it."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table as Drawn
-
     drawn = Drawn(
         box=box.SIMPLE_HEAD,
         show_edge=False,
@@ -222,7 +211,10 @@ def _drawn(table: Table, styled: bool) -> Any:
 
     for row in table.rows:
         drawn.add_row(*map(drawn_cell, row))
-    return drawn
+    # Square brackets are markup.
+    title = [f"[bold]{escape(table.title)}[/bold]"] if table.title else []
+    console.print(*title, drawn, *map(escape, (*table.notes, *bold_note)), sep="\n")
+    return console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def print_table(table: Table) -> None:

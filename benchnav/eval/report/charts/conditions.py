@@ -87,8 +87,9 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     figure = Figure(figsize=(width, high), layout="constrained")
     shared = "all" if columns == 1 else "col"
     stacks = stack_panels(figure, len(every), across, sharex=shared, sharey=True)
-    panels = [(panel, rows) for (panel,), (_, rows) in zip(stacks, every, strict=True)]
-    for place, (panel, (title, _)) in enumerate(zip(figure.axes, every, strict=True)):
+    panels = []
+    for place, ((panel,), (title, rows)) in enumerate(zip(stacks, every, strict=True)):
+        panels.append((panel, rows))
         panel.set_title(title)
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="x", color="0.9")
@@ -97,7 +98,7 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
             panel.set_xlabel(measures[place % columns])
     several = several_models(summary)
     names = [condition_name(row, several) for row in settings.to_dict("records")]
-    first = figure.axes[0]
+    first, _ = panels[0]
     first.set_yticks(settings["height"].tolist(), names)
     first.set_ylim(settings["height"].max() + 0.7, settings["height"].min() - 0.7)
     return figure, panels

@@ -35,10 +35,10 @@ from benchnav.eval.report.plan_layers import (
     SOFT,
     STYLES,
     draw_driven,
+    draw_soft,
     driven_path,
     field_colours,
     plan_layer,
-    soft_lines,
 )
 from benchnav.eval.report.words import NAMING, condition_name, contender_names, differ, outcome_in_words
 
@@ -66,18 +66,17 @@ def choose_recordings(recordings: Sequence[Recording], conditions: Sequence[str]
     table = pd.DataFrame(
         [recording.about for recording in recordings], columns=["condition", "outcome", *_SAME_MAP]
     )
-    table["order"] = table["condition"].map({condition: place for place, condition in enumerate(conditions)})
-    table["number"] = table["map"].astype(int)
-    table = table.dropna(subset="order").sort_values(["order", "number"], kind="stable")
+    table = table.astype({"condition": pd.CategoricalDtype(conditions), "map": int})
+    table = table.dropna(subset="condition").sort_values(["condition", "map"], kind="stable")
     if table.empty:
         return []
     maps = table.groupby(_SAME_MAP)
     table["differing"] = maps["outcome"].transform("nunique") > 1
     table["failed"] = maps["outcome"].transform(lambda outcomes: set(outcomes) != {"success"})
-    firsts = table[table["order"] == table["order"].min()]
+    firsts = table[table["condition"] == table["condition"].iloc[0]]
     shown = firsts.sort_values(["differing", "failed"], ascending=False, kind="stable").iloc[0]
     table["other"] = (table[_SAME_MAP] != shown[_SAME_MAP]).any(axis=1)
-    chosen = table.sort_values(["order", "other"], kind="stable").drop_duplicates("condition")
+    chosen = table.sort_values(["condition", "other"], kind="stable").drop_duplicates("condition")
     return [recordings[place] for place in chosen.index[:MOST_PANELS]]
 
 
@@ -145,8 +144,7 @@ def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
     """Draws the terrain, and the path driven by that moment, coloured by the observed λ."""
     show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
-        for lines in soft_lines(recording.soft, recording.resolution_m):
-            panel.add_collection(lines)
+        draw_soft(panel, recording.soft, recording.resolution_m)
         _name_ground(panel, "soft ground, which does not show", fc="0.45", ec=SOFT, hatch="////")
     driven = recording.track[: recording.now + 1]
     coloured = driven_path(2)
@@ -186,7 +184,7 @@ def _draw_field(panel: Axes, recording: Recording, field: np.ndarray, letters: i
 def _mark_places(panel: Axes, recording: Recording, robot: np.ndarray) -> None:
     """Marks start, goal and robot."""
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m), ("robot", robot)):
-        mark(panel, name, place, label=name)
+        mark(panel, name, place)
     frame_map(panel)
 
 
@@ -241,8 +239,8 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         if not row["success"]:
             words = "end of a failure, in the colour of its path"
             mark(panel, "end", track[-1], 0.6 + smaller, color=colours[place], label=words)
-    mark(panel, "start", tracks[0][0], label="start")
-    mark(panel, "goal", ground.goal_m, label="goal")
+    mark(panel, "start", tracks[0][0])
+    mark(panel, "goal", ground.goal_m)
     if ground.immobilising.any():
         _name_ground(panel, **_HOLDS)
     title = "terrain, faded" if ground.field is None else "λ as it was: the lighter the faster"
@@ -304,6 +302,6 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
     track = recording.track
     draw_edged(panel, track, 1.1, label="driven")
     for name, position in (("start", track[0]), ("goal", recording.goal_m), ("end", track[-1])):
-        mark(panel, name, position, 0.9, label=name)
+        mark(panel, name, position, 0.9)
     panel.spines[:].set_visible(False)
     panel.set(xticks=[], yticks=[])

@@ -15,7 +15,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.figures import MARKS, TRAVERSABILITY_COLOURS, mark, show_map
@@ -24,10 +23,10 @@ from benchnav.eval.recording import Recording
 from benchnav.eval.report.plan_layers import (
     STYLES,
     draw_driven,
+    draw_soft,
     driven_path,
     field_colours,
     plan_layer,
-    soft_lines,
 )
 from benchnav.eval.report.words import condition_name, contender_names
 
@@ -147,46 +146,33 @@ class _Column:
 
     def __init__(self, panels: Sequence[Axes], recording: Recording, name: str) -> None:
         self.panels, self.recording = panels, recording
-        texts: Any = (
-            (name, 47.5, 12, {"weight": "bold"}),
-            ("", 28.8, 11, {"family": "monospace"}),
-            ("", 10.1, 12, {"weight": "bold"}),
-        )
-        _, self._time, self._outcome = (
-            # Points over the panel.
-            panels[0].annotate(
-                text, (0, 1), (0, over), "axes fraction", "offset points", fontsize=size, **style
-            )
-            for text, over, size, style in texts
-        )
+        above, below = panels
+        # In points over the panel.
+        over: Any = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
+        above.annotate(name, xytext=(0, 47.5), fontsize=12, weight="bold", **over)
+        self._time = above.annotate("", xytext=(0, 28.8), fontsize=11, family="monospace", **over)
+        self._outcome = above.annotate("", xytext=(0, 10.1), fontsize=12, weight="bold", **over)
         self._layers = {name: plan_layer(style) for name, style in STYLES.items()}
         for layer in self._layers.values():
-            panels[0].add_collection(layer)
+            above.add_collection(layer)
         self._driven = driven_path(3.5)
         self._edges = [
             panel.plot([], [], color=colour, lw=width, solid_capstyle="round")[0]
-            for panel, colour, width in (
-                (panels[0], "white", 5.5),
-                (panels[1], "white", 4.5),
-                (panels[1], "black", 2),
-            )
+            for panel, colour, width in ((above, "white", 5.5), (below, "white", 4.5), (below, "black", 2))
         ]
-        panels[0].add_collection(self._driven)
-        self._robots = [Polygon(_ROBOT_M, fc=ROBOT, ec="black", lw=0.8) for _ in panels]
-        for panel, body in zip(panels, self._robots, strict=True):
-            panel.add_patch(body)
+        above.add_collection(self._driven)
+        self._robots = [panel.fill(*_ROBOT_M.T, fc=ROBOT, ec="black", lw=0.8)[0] for panel in panels]
         self._crosses = [panel.plot([], [], **MARKS["end"] | {"ms": 13})[0] for panel in panels]
         extent_m = recording.grid.extent_m
-        show_map(panels[0], np.moveaxis(recording.rgb, 0, -1), extent_m)
-        for lines in soft_lines(recording.soft, recording.grid.resolution_m):
-            panels[0].add_collection(lines)
+        show_map(above, np.moveaxis(recording.rgb, 0, -1), extent_m)
+        draw_soft(above, recording.soft, recording.resolution_m)
         if recording.field is not None:
             shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
         else:
             shown = field_colours(recording.predicted, np.zeros_like(recording.free))
             shown[~recording.free] = round(255 * _CLOSED)
             title = "λ̂ given to the planner"
-        show_map(panels[1], shown, extent_m)
+        show_map(below, shown, extent_m)
         for panel, words in zip(panels, ("terrain and plan", title), strict=True):
             mark(panel, "start", recording.states[0, :2], _MARKS)
             mark(panel, "goal", recording.goal_m, _MARKS)
