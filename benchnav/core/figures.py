@@ -169,9 +169,9 @@ def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
         Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
     """
     framed = np.pad(region, 1)
-    rows, columns = np.nonzero(framed[1:, 1:-1] != framed[:-1, 1:-1])
+    rows, columns = np.nonzero(np.diff(framed[:, 1:-1], axis=0))
     along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
-    rows, columns = np.nonzero(framed[1:-1, 1:] != framed[1:-1, :-1])
+    rows, columns = np.nonzero(np.diff(framed[1:-1], axis=1))
     along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
     edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
     return (edges * resolution_m).astype(np.float32)

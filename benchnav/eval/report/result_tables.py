@@ -22,6 +22,7 @@ from benchnav.eval.report.words import (
     rate_in_words,
     several_models,
     success_interval_in_words,
+    unit_of_statistics,
 )
 from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
@@ -81,7 +82,7 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     counts = [
         name
         for name in ("groups", "maps", "episodes")
-        if summary[f"n_{name}"].nunique() > 1 and (is_grouped(summary) or name != "groups")
+        if summary[f"n_{name}"].nunique() > 1 and (name != "groups" or unit_of_statistics(summary) == "group")
     ]
     times = [heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()]
     headings = (*labels, *counts, *_RESULTS, *times, "failures")
@@ -165,10 +166,9 @@ def bold_note(summary: pd.DataFrame) -> str:
     """
     if not summary["best_marked"].any():
         return ""
-    by = "group" if is_grouped(summary) else "map"
     words = (
         "not significantly worse than the highest success rate of its block (max-T sign-flip test by "
-        f"{by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is significantly worse none is "
+        f"{unit_of_statistics(summary)} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is significantly worse none is "
         "marked"
     )
     left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
@@ -176,11 +176,6 @@ def bold_note(summary: pd.DataFrame) -> str:
         model for part in PRIVILEGED for model in left_out.loc[left_out["privileged"] == part, "model"]
     )
     return f"{words}; privileged models ({', '.join(models)}) do not compete." if models else f"{words}."
-
-
-def is_grouped(summary: pd.DataFrame) -> bool:
-    """Whether the unit of the statistics is a group of maps."""
-    return bool((summary["n_groups"] < summary["n_maps"]).any())
 
 
 def _results(row: Mapping[Any, Any]) -> dict[str, str]:

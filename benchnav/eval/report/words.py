@@ -68,6 +68,11 @@ def joined(labels: Iterable[str]) -> str:
     return ", ".join(label for label in labels if label != NOT_USED)
 
 
+def unit_of_statistics(summary: pd.DataFrame) -> str:
+    """A map, or a group of maps where the dataset has such."""
+    return "group" if (summary["n_groups"] < summary["n_maps"]).any() else "map"
+
+
 def maps_in_words(maps: int | str, groups: int | str) -> str:
     """Says how many maps there are, and in how many groups where they have such."""
     return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"

@@ -33,12 +33,11 @@ from benchnav.eval.report.charts.maps import (
     trajectory_figure,
 )
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
-from benchnav.eval.report.failure_choice import RecordFailures, Sheets, collect_sheets
-from benchnav.eval.report.failures import failures_table
+from benchnav.eval.report.failures import RecordFailures, Sheets, collect_sheets, failures_table
 from benchnav.eval.report.findings import Finding, findings
 from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
-from benchnav.eval.report.result_tables import LATENCIES, is_grouped, paper_table, result_table
-from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
+from benchnav.eval.report.result_tables import LATENCIES, paper_table, result_table
+from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
@@ -81,7 +80,7 @@ class Report:
     @property
     def hypotheses(self) -> Table:
         """The table of `tests`."""
-        return hypothesis_table(self.tests, is_grouped(self.summary))
+        return hypothesis_table(self.tests, unit_of_statistics(self.summary))
 
 
 def read_report(folder: Path, record_failures: RecordFailures | None = None) -> Report:
@@ -112,7 +111,7 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
     if not tests.empty:
         # Beside hypotheses that were fixed before the run all else is exploratory.
         explored = [replace(finding, title=f"Exploratory: {finding.title}") for finding in said]
-        said = [hypothesis_finding(tests, about, is_grouped(summary)), *explored]
+        said = [hypothesis_finding(tests, about, unit_of_statistics(summary)), *explored]
     return Report(
         name=folder.resolve().name,
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),

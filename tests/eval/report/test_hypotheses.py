@@ -35,7 +35,7 @@ ABOUT = {
 
 
 def test_each_hypothesis_is_said_with_its_numbers() -> None:
-    finding = hypothesis_finding(pd.DataFrame([a_test(), a_test(**OTHER)]), ABOUT, False)
+    finding = hypothesis_finding(pd.DataFrame([a_test(), a_test(**OTHER)]), ABOUT, "map")
     assert finding.title == "Hypotheses, fixed before the first unit was run (digest d1)"
     assert finding.sentences == (
         "1. T_total of cvar and of mean differs by less than 0.5 s: equivalent (difference +0.10 s, interval -0.20 to "
@@ -47,7 +47,7 @@ def test_each_hypothesis_is_said_with_its_numbers() -> None:
 
 def test_an_extension_after_the_hypotheses_is_told() -> None:
     conditions = {"a": {"draws": [[0, 0, 200]]}, "b": {"draws": [[0, 0, 80]]}}
-    said = hypothesis_finding(pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, True).sentences
+    said = hypothesis_finding(pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, "group").sentences
     assert said[-1].startswith(
         "They were fixed for 80 episodes of a condition; the run was extended to 80 to 200 later"
     )
@@ -66,14 +66,14 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
     ],
 )
 def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> None:
-    table = hypothesis_table(pd.DataFrame([a_test(**changes)]), False)
+    table = hypothesis_table(pd.DataFrame([a_test(**changes)]), "map")
     assert table.rows[0][-1] == words
     assert bool(made.bold_cells(table)) == (changes.get("supported", True))
 
 
 def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> None:
     for test, said in ((a_test(kind="difference"), True), (a_test(), False), (a_test(**OTHER), False)):
-        notes = hypothesis_table(pd.DataFrame([test]), False).notes
+        notes = hypothesis_table(pd.DataFrame([test]), "map").notes
         assert any("where the interval holds 0" in note for note in notes) == said
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.report.failure_choice import Sheets
+from benchnav.eval.report.failures import Sheets
 from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.write import Report, provenance_lines, render
 from tests.eval.forged import code_with

@@ -29,7 +29,7 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.run_folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
-from benchnav.eval.report.failure_choice import FailedLine
+from benchnav.eval.report.failures import FailedLine
 from benchnav.eval.report.plan_layers import (
     IMMOBILISING,
     SOFT,

@@ -115,8 +115,7 @@ def arrange(drivers: Sequence[Driver]) -> Any:
 def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
     """What each view of a map shows, by its name."""
     recording = drivers[0].recording
-    edges = [driver.entity("/map/closed") for driver in drivers]
-    own = edges if len(drivers) == 1 else []
+    own = ["/map/closed"] if len(drivers) == 1 else []
     colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
     views = {
         colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
