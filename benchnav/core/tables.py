@@ -17,7 +17,9 @@ NOTHING = "–"
 _UNBROKEN = 400
 _WIDEST_LINE = 56  # of a list in a cell, that is not broken
 
+# Words before the characters that they begin with.
 _LATEX = {
+    "λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$",
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "±": r"$\pm$", "–": "--", "λ": r"$\lambda$",
@@ -26,7 +28,7 @@ _LATEX = {
     "¶": r"\P{}",
 }  # fmt: skip
 _LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
-_LATEX_WORDS = {"λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$"}
+_WRITTEN = re.compile("|".join(map(re.escape, _LATEX)))
 _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 
@@ -150,19 +152,12 @@ def _one_line(heading: str) -> str:
 
 def latex(text: str) -> str:
     """Escapes text for LaTeX; a hyphen before a number of its own is a minus."""
-    text = _MINUS.sub("−", text)
-    for word, written in _LATEX_WORDS.items():
-        before, found, after = text.partition(word)
-        if found:
-            return latex(before) + written + latex(after)
-    return "".join(_LATEX.get(character, character) for character in text)
+    return _WRITTEN.sub(lambda found: _LATEX[found[0]], _MINUS.sub("−", text))
 
 
 def markdown(text: str) -> str:
     """Escapes text for Markdown."""
-    for character in "\\|*<`":
-        text = text.replace(character, "\\" + character)
-    return text
+    return re.sub(r"[\\|*<`]", r"\\\g<0>", text)
 
 
 def to_terminal(table: Table, width: int | None = None, styled: bool = False) -> str:

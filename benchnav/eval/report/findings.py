@@ -1,7 +1,6 @@
 """What a run says, in sentences made from its numbers; whether one setting beats another is for the tests to say."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,35 +20,22 @@ from benchnav.eval.stats.comparison import ALPHA
 _MOST_NAMED = 6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """What the run says of one block.
-
-    Args:
-        title: names the block.
-        sentences: in order.
-    """
-
-    title: str
-    sentences: tuple[str, ...]
-
-
 def findings(
     summary: pd.DataFrame, failures: pd.DataFrame, predicted: Mapping[str, np.ndarray]
-) -> list[Finding]:
+) -> dict[str, list[str]]:
     """Says of each block which setting is best, by how much, how sure that is, and how the failures failed.
 
     Args:
         summary: from `summary.summarise`, joined with `best.against_best`.
         failures: from `failures.failures_table`.
         predicted: by condition the λ̂ where its failed episodes ended, where that is known.
+
+    Returns:
+        By the title of a block its sentences.
     """
     several = several_models(summary)
     named = summary.assign(name=[condition_name(row, several) for row in summary.to_dict("records")])
-    return [
-        Finding(title=title, sentences=tuple(_sentences(block, failures, predicted)))
-        for title, block in blocks(named)
-    ]
+    return {title: list(_sentences(block, failures, predicted)) for title, block in blocks(named)}
 
 
 def _sentences(

@@ -8,7 +8,6 @@ import pandas as pd
 
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import LEAST_MAPS
@@ -21,22 +20,23 @@ _TESTS = {
 _OF_MARGINS = {"equivalence": "equivalent", "non-inferiority": "not inferior"}
 
 
-def hypothesis_finding(tests: pd.DataFrame, about: Mapping[str, Any], unit: str) -> Finding:
+def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str) -> dict[str, list[str]]:
     """Says of each hypothesis how its test came out.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
         about: all of `run.json`.
         unit: of the statistics, from `words.unit_of_statistics`.
+
+    Returns:
+        Sentences by the title over them.
     """
     said = [
         f"{number}. {_capital(row['claim'])}: {_verdict(row)} ({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
-    return Finding(
-        title=f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})",
-        sentences=(*said, *_extended(about)),
-    )
+    title = f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})"
+    return {title: [*said, *_extended(about)]}
 
 
 def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:

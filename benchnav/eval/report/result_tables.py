@@ -168,8 +168,8 @@ def bold_note(summary: pd.DataFrame) -> str:
         return ""
     words = (
         "not significantly worse than the highest success rate of its block (max-T sign-flip test by "
-        f"{unit_of_statistics(summary)} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is significantly worse none is "
-        "marked"
+        f"{unit_of_statistics(summary)} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
+        "significantly worse none is marked"
     )
     left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
     models = dict.fromkeys(

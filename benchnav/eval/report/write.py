@@ -3,8 +3,8 @@
 import base64
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,8 @@ from benchnav.eval.report.charts.maps import (
 )
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
 from benchnav.eval.report.failures import RecordFailures, Sheets, collect_sheets, failures_table
-from benchnav.eval.report.findings import Finding, findings
-from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
+from benchnav.eval.report.findings import findings
+from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.result_tables import LATENCIES, paper_table, result_table
 from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
@@ -54,7 +54,7 @@ class Report:
     Args:
         name: of the run.
         header: lines on where the rows come from.
-        findings: what the run says.
+        findings: what the run says, sentences by the title over them.
         table: a row a condition.
         warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
@@ -67,7 +67,7 @@ class Report:
 
     name: str
     header: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    findings: Mapping[str, Sequence[str]]
     table: Table
     warnings: tuple[str, ...]
     summary: pd.DataFrame
@@ -103,21 +103,28 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
     )
     best = against_best(episodes, summary, privileged_models(about["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
-    summary = _with_latency(summary, about["conditions"])
+    # How long a step of one robot takes, where the run measured it.
+    known = [about["conditions"][condition].get("latency", {}) for condition in summary["condition"]]
+    summary = summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(summary, failures, record_failures)
-    left_out = [sheets.left_out] if sheets.left_out else []
     said = findings(summary, failures, sheets.predicted)
     if not tests.empty:
         # Beside hypotheses that were fixed before the run all else is exploratory.
-        explored = [replace(finding, title=f"Exploratory: {finding.title}") for finding in said]
-        said = [hypothesis_finding(tests, about, unit_of_statistics(summary)), *explored]
+        explored = {f"Exploratory: {title}": sentences for title, sentences in said.items()}
+        said = hypothesis_findings(tests, about, unit_of_statistics(summary)) | explored
+    warnings = caveats(about)
+    if count := summary[["planner_error_count", "model_error_count"]].to_numpy().sum():
+        episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
+        warnings.append(f"In {episodes_in_words} a planner or model failed; tracebacks: {folder / ERRORS}")
+    if sheets.left_out:
+        warnings.append(sheets.left_out)
     return Report(
         name=folder.resolve().name,
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
-        findings=tuple(said),
+        findings=said,
         table=result_table(summary, about["conditions"]),
-        warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
+        warnings=tuple(warnings),
         summary=summary,
         tests=tests,
         episodes=episodes,
@@ -144,7 +151,8 @@ def write_report(
     report, out = read_report(folder, record_failures), out or folder
     write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
-    write_text(out / "summary.tex", _as_latex(report))
+    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
+    write_text(out / "summary.tex", comments + paper_table(report.summary, report.name))
     if not report.tests.empty:
         write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
         caption = "Hypotheses that were fixed before the run, and their tests."
@@ -166,7 +174,7 @@ def print_report(report: Report) -> None:
     """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
     print("\n".join(report.header))
     print_table(report.table)
-    said = [line for finding in report.findings for line in (f"{finding.title}:", *finding.sentences)]
+    said = [line for title, lines in report.findings.items() for line in (f"{title}:", *lines)]
     print("\n".join([*report.warnings, *said]))
 
 
@@ -241,12 +249,6 @@ def _driven(folder: Path) -> Drawn:
     yield "driven", caption, driven_figure(ground, shown, tracks[:_MOST_PATHS])
 
 
-def _with_latency(summary: pd.DataFrame, conditions: Mapping[str, Any]) -> pd.DataFrame:
-    """A summary with how long a step of one robot takes, where the run measured it."""
-    known = [conditions[condition].get("latency", {}) for condition in summary["condition"]]
-    return summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
-
-
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
     conditions = [about["conditions"][condition] for condition in summary["condition"]]
     worlds = {condition["labels"]["world"]: _world(condition["value"]) for condition in conditions}
@@ -290,19 +292,6 @@ def _world(value: Mapping[str, Any]) -> str:
     else:
         words.append(f"T = {world['time_budget_s']:g} s")
     return ", ".join([*words, f"free where the {free['by']} map is above {free['above']:g}"])
-
-
-def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:
-    count = int(summary["planner_error_count"].sum() + summary["model_error_count"].sum())
-    if not count:
-        return []
-    episodes = "1 episode" if count == 1 else f"{count} episodes"
-    return [f"In {episodes} a planner or model failed; tracebacks: {folder / ERRORS}"]
-
-
-def _as_latex(report: Report) -> str:
-    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
-    return comments + paper_table(report.summary, report.name)
 
 
 def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:

@@ -8,7 +8,6 @@ import pytest
 
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.report.failures import Sheets
-from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.write import Report, provenance_lines, render
 from tests.eval.forged import code_with
 
@@ -53,7 +52,7 @@ def page(tmp_path: Path) -> Page:
     }  # fmt: skip
     nothing = pd.DataFrame()
     report = Report(
-        name=EVIL, header=(EVIL,), warnings=(EVIL,), findings=(Finding(title=EVIL, sentences=(EVIL,)),),
+        name=EVIL, header=(EVIL,), warnings=(EVIL,), findings={EVIL: [EVIL]},
         table=table, about=about, summary=nothing, tests=nothing, episodes=nothing, failures=nothing,
         sheets=Sheets(shown=(), predicted={}, left_out=""),
     )  # fmt: skip

@@ -96,7 +96,7 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and pd.notna(value)
+    return type(value) in (int, float) and pd.notna(value)
 
 
 def sweep_name(number: str) -> str:
