@@ -106,9 +106,9 @@ def condition_colours(planners: Sequence[str], palette: Sequence[str] = COLOURS)
     return [own[planner] if not alike or own[planner] == BLIND else next(turn) for planner in planners]
 
 
-def bytes_of(colour: Any, opacity: float | None = None) -> tuple[int, ...]:
-    """Red, green, blue and opacity of a colour, in [0, 255]; of another opacity in [0, 1] where that is given."""
-    return tuple(round(255 * value) for value in to_rgba(colour, opacity))
+def bytes_of(colour: Any) -> tuple[int, ...]:
+    """Red, green, blue and opacity of a colour, in [0, 255]."""
+    return tuple(round(255 * value) for value in to_rgba(colour))
 
 
 def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> None:

@@ -17,7 +17,7 @@ from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.folder.steps import open_steps, rows_of
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.words import blocks, condition_name, several_models
+from benchnav.eval.report.words import blocks, with_names
 from benchnav.eval.stats.best import competing
 
 # Gives a recording of each of some failures of one condition, rows of `failures_table`.
@@ -46,9 +46,10 @@ def failures_table(folder: Path, episodes: pd.DataFrame) -> pd.DataFrame:
         in the last step; and `last_traversability`, the mean of observed λ in the last 2 s. The last four are NaN where
         steps were not kept.
     """
-    labels = ["planner", "risk", "model", "scenario", "world"]
-    columns = ["condition", *labels, *_KEYS[1:], "outcome", "end_time_s", "code"]
-    failed = episodes.loc[~episodes["success"].astype(bool), columns].reset_index(drop=True)
+    columns = ["condition", "planner", "risk", "model", "scenario", "world", *_KEYS[1:], "outcome"]
+    failed = episodes.loc[~episodes["success"].astype(bool), [*columns, "end_time_s", "code"]].reset_index(
+        drop=True
+    )
     source = open_steps(folder)
     if source is None:
         return failed.assign(**dict.fromkeys(_ENDS, np.nan))
@@ -120,9 +121,8 @@ def collect_sheets(
         asked = record_failures is not None and not failures.empty
         why = "No sheet of failures: the run kept no steps of them." if asked else ""
         return Sheets(shown=(), predicted={}, left_out=why)
-    several = several_models(summary)
     shown, predicted, left_out = [], {}, []
-    if len(every := blocks(summary)) > _MOST_BLOCKS:
+    if len(every := blocks(with_names(summary))) > _MOST_BLOCKS:
         left_out.append(f"Sheets of failures are of the first {_MOST_BLOCKS} of {len(every)} blocks.")
     for title, rows in every[:_MOST_BLOCKS]:
         lines = []
@@ -136,7 +136,7 @@ def collect_sheets(
                 predicted[condition] = np.array([recording.predicted_at_end for recording in recordings])
                 lines.append(
                     FailedLine(
-                        name=condition_name(row, several),
+                        name=row["name"],
                         failures=chosen.reset_index(drop=True),
                         recordings=[recordings[place] for place in chosen.index],
                         among=int((failures["condition"] == condition).sum()),

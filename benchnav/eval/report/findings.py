@@ -6,14 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.report.words import (
-    FAILURE_COUNTS,
-    blocks,
-    condition_name,
-    p_in_words,
-    rate_in_words,
-    several_models,
-)
+from benchnav.eval.report.words import FAILURE_COUNTS, blocks, p_in_words, rate_in_words, with_names
 from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 
@@ -33,9 +26,8 @@ def findings(
     Returns:
         By the title of a block its sentences.
     """
-    several = several_models(summary)
-    named = summary.assign(name=[condition_name(row, several) for row in summary.to_dict("records")])
-    return {title: list(_sentences(block, failures, predicted)) for title, block in blocks(named)}
+    every = blocks(with_names(summary))
+    return {title: list(_sentences(block, failures, predicted)) for title, block in every}
 
 
 def _sentences(

@@ -49,6 +49,12 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
     return joined([planner_name(labels["planner"]), *beside, labels["risk"]])
 
 
+def with_names(summary: pd.DataFrame) -> pd.DataFrame:
+    """Rows of conditions with the `name` of each among them."""
+    several = several_models(summary)
+    return summary.assign(name=[condition_name(row, several) for row in summary.to_dict("records")])
+
+
 def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     """Names conditions by those of their labels that tell them apart; by their planner where nothing does.
 

@@ -322,11 +322,8 @@ def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
     Args:
         about: all of `run.json`.
     """
-    machine, codes = about["machine"], about["codes"].values()
-    lines = [
-        ("commit of benchnav", about["history"][-1]["commit"]),
-        ("version of benchnav", about["history"][-1]["benchnav"]),
-    ]
+    machine, codes, last = about["machine"], about["codes"].values(), about["history"][-1]
+    lines = [("commit of benchnav", last["commit"]), ("version of benchnav", last["benchnav"])]
     for environment in {json.dumps(code["environment"]): code["environment"] for code in codes}.values():
         lines += [(name, str(value)) for name, value in environment.items()]
     lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))

@@ -33,7 +33,7 @@ from benchnav.core.figures import (
 )
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
-from benchnav.eval.report.words import blocks, condition_name, outcome_in_words, p_in_words, several_models
+from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, with_names
 
 # From what the ground did to what the code did; success is light, each failure has a colour of its own.
 OUTCOME_COLOURS = {
@@ -72,7 +72,7 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     Returns:
         The figure; of each block its panel, and its rows of the summary with the `height` that each is drawn at.
     """
-    settings = summary[_SETTING].drop_duplicates()
+    settings = with_names(summary[_SETTING].drop_duplicates())
     # Planners are a little apart.
     planner = settings["planner"].factorize()[0]
     settings = settings.assign(gap=_GAP_ROWS * planner).sort_values("gap", kind="stable")
@@ -96,10 +96,8 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
         panel.set_axisbelow(True)
         if place >= len(every) - across:
             panel.set_xlabel(measures[place % columns])
-    several = several_models(summary)
-    names = [condition_name(row, several) for row in settings.to_dict("records")]
     first, _ = panels[0]
-    first.set_yticks(settings["height"].tolist(), names)
+    first.set_yticks(settings["height"].tolist(), settings["name"].tolist())
     first.set_ylim(settings["height"].max() + 0.7, settings["height"].min() - 0.7)
     return figure, panels
 

@@ -105,15 +105,15 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         heading = f"{condition_name(about, several)}, {about['scenario']} {about['map']}"
         moment = f"t = {now * recording.dt_s:g} s; outcome: {recording.outcome}"
         driven = _draw_terrain(above, recording)
-        _name_panel(above, letters, heading, moment)
-        _draw_predicted(below, recording, letters)
+        above.set_title(f"{heading}\n{moment}")
+        _draw_predicted(below, recording)
         for panel in (above, below):
             for name, style in STYLES.items():
                 if len(plan.lines.get(name, ())):
                     panel.add_collection(plan_layer(style, plan.lines[name]))
             _mark_places(panel, recording, recording.track[now])
         if recording.field is not None:
-            _draw_field(last[0], recording, recording.field, letters)
+            _draw_field(last[0], recording, recording.field)
         elif last:
             last.pop().remove()
         drawn = [above, below, *last]
@@ -121,6 +121,9 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         for panel in drawn:
             panel.tick_params(labelleft=place % across == 0)
             panel.set_ylabel("y [m]" if place % across == 0 else "")
+            # Broken where it is wider than the panel.
+            title = (textwrap.fill(line, letters) for line in panel.get_title().splitlines())
+            panel.set_title("\n".join(title), fontsize="small")
     legend_outside(figure, columns=1 if across == 1 else 4)
     shrink = min(1.0, 4 / figure.get_figheight())
     figure.colorbar(
@@ -133,11 +136,6 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         label="traversability λ",
     )
     return figure
-
-
-def _name_panel(panel: Axes, letters: int, *lines: str) -> None:
-    """Sets the title of a panel, broken where it is wider than so many letters."""
-    panel.set_title("\n".join(textwrap.fill(line, letters) for line in lines), fontsize="small")
 
 
 def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
@@ -155,7 +153,7 @@ def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
     return coloured
 
 
-def _draw_predicted(panel: Axes, recording: Recording, letters: int) -> None:
+def _draw_predicted(panel: Axes, recording: Recording) -> None:
     """Draws the λ̂ that the planner was given, and the path in black, since the map has the colours of λ."""
     show_map(panel, recording.predicted, recording.grid.extent_m, **_LAMBDA)
     if not recording.free.all():
@@ -163,13 +161,12 @@ def _draw_predicted(panel: Axes, recording: Recording, letters: int) -> None:
         show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([_CLOSED]))
         _name_ground(panel, "not free", color=_CLOSED)
     blind = recording.about["model"] == NOT_USED
-    words = "E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner"
-    _name_panel(panel, letters, words)
+    panel.set_title("E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner")
     words = "driven; above in the colour of the observed λ"
     draw_edged(panel, recording.track[: recording.now + 1], 1.4, label=words)
 
 
-def _draw_field(panel: Axes, recording: Recording, field: np.ndarray, letters: int) -> None:
+def _draw_field(panel: Axes, recording: Recording, field: np.ndarray) -> None:
     """Draws λ as it was, and the whole driven path over it."""
     show_map(panel, field_colours(field, recording.immobilising), recording.grid.extent_m)
     draw_edged(panel, recording.track, 1.4)
@@ -178,7 +175,7 @@ def _draw_field(panel: Axes, recording: Recording, field: np.ndarray, letters: i
         mark(panel, "end", recording.immobilised_at, label="immobilised")
     if recording.immobilising.any():
         _name_ground(panel, **_HOLDS)
-    _name_panel(panel, letters, f"driven to the end ({recording.end_s:g} s), on λ as it was")
+    panel.set_title(f"driven to the end ({recording.end_s:g} s), on λ as it was")
 
 
 def _mark_places(panel: Axes, recording: Recording, robot: np.ndarray) -> None:

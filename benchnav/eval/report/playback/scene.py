@@ -12,7 +12,6 @@ import numpy as np
 import rerun as rr
 
 from benchnav.core.figures import MARKS, bytes_of, hatching, outline
-from benchnav.core.grid import Grid
 from benchnav.eval.recording import Recording, drawing_interval, thinned
 from benchnav.eval.report.plan_layers import SOFT, STYLES, field_colours, shades
 
@@ -26,6 +25,7 @@ _PIECE = 10
 _CROSS = np.array([(-1, -1), (1, 1), (0, 0), (-1, 1), (1, -1)], dtype=np.float32)
 _CROSS_M = 1.0
 _MARK = (255, 255, 255)
+_TRANSLUCENT = 160  # of a plan, in [0, 255]
 _LIFT_M = 0.12
 _CLOSED = (240, 240, 240)
 
@@ -40,12 +40,12 @@ class Driver:
     Args:
         recording: its episode.
         name: unlike those of the others; empty where it is alone.
-        colour: as Matplotlib takes it.
+        colour: red, green, blue and opacity, in [0, 255].
     """
 
     recording: Recording
     name: str
-    colour: str
+    colour: tuple[int, ...]
 
     def entity(self, root: str, *leaf: str) -> str:
         """Path of what is the robot's own under a root."""
@@ -78,7 +78,7 @@ def log_ground(stream: Any, recording: Recording) -> None:
         _log_image(stream, "map/field", field_colours(recording.field, recording.immobilising))
     if recording.soft.any():
         for name, lines in (("outline", outline), ("hatching", hatching)):
-            flat = _on_map(grid, lines(recording.soft, grid.resolution_m))
+            flat = _on_map(recording, lines(recording.soft, grid.resolution_m))
             strips = rr.LineStrips2D(flat, colors=[bytes_of(SOFT)], radii=0.06)
             stream.log(f"map/soft/{name}", strips, static=True)
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m)):
@@ -98,7 +98,7 @@ def _log_predicted(stream: Any, driver: Driver) -> None:
     image = shades(recording.predicted)
     image[~recording.free] = 64
     _log_image(stream, driver.entity("map/risk"), image)
-    flat = _on_map(recording.grid, outline(~recording.free, recording.resolution_m))
+    flat = _on_map(recording, outline(~recording.free, recording.resolution_m))
     edge = rr.LineStrips2D(flat, colors=[_CLOSED], radii=0.08)
     stream.log(driver.entity("map/closed"), edge, static=True)
 
@@ -133,35 +133,35 @@ def _log_both(
         **looks: as both archetypes take them.
     """
     lifted = [_over_ground(recording, shape, lift_m) for shape in shapes]
-    flat = [_on_map(recording.grid, shape) for shape in shapes]
+    flat = [_on_map(recording, shape) for shape in shapes]
     for entity, kind, drawn, radius in zip(entities, kinds, (lifted, flat), radii, strict=True):
         stream.log(entity, kind(drawn, radii=radius, **looks), static=static)
 
 
 def _over_ground(recording: Recording, place: np.ndarray, lift_m: float = _LIFT_M) -> np.ndarray:
     """Puts positions (x, y) of shape [..., 2] over the ground; x and y stay as they are."""
-    height = recording.elevation_m[_cells_of(recording.grid, place)] + lift_m
+    height = recording.elevation_m[_cells_of(recording, place)] + lift_m
     return np.concatenate((place, height[..., None]), axis=-1).astype(np.float32)
 
 
-def _on_map(grid: Grid, place: np.ndarray) -> np.ndarray:
+def _on_map(recording: Recording, place: np.ndarray) -> np.ndarray:
     """Puts positions (x, y) of shape [..., 2] on the images."""
-    x, y = np.moveaxis(place, -1, 0) / grid.resolution_m
-    return np.stack((x, grid.height - y), axis=-1)
+    x, y = np.moveaxis(place, -1, 0) / recording.resolution_m
+    return np.stack((x, recording.grid.height - y), axis=-1)
 
 
-def _cells_of(grid: Grid, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _cells_of(recording: Recording, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of the cells that positions of shape [..., 2] lie in, or of the nearest ones."""
-    column, row = np.moveaxis(np.floor(place / grid.resolution_m).astype(int), -1, 0)
-    return row.clip(0, grid.height - 1), column.clip(0, grid.width - 1)
+    column, row = np.moveaxis(np.floor(place / recording.resolution_m).astype(int), -1, 0)
+    return row.clip(0, recording.grid.height - 1), column.clip(0, recording.grid.width - 1)
 
 
 def _log_robot(stream: Any, driver: Driver) -> None:
     """Logs where the robot is and where it heads, at every step."""
     recording = driver.recording
-    heading_rad, colours = recording.states[:, 2], [bytes_of(driver.colour)]
+    heading_rad, colours = recording.states[:, 2], [driver.colour]
     times = rr.TimeColumn(TIMELINE, duration=np.arange(len(heading_rad)) * recording.dt_s)
-    lifted, flat = _over_ground(recording, recording.track), _on_map(recording.grid, recording.track)
+    lifted, flat = _over_ground(recording, recording.track), _on_map(recording, recording.track)
     ahead = _HEADING_M * np.stack((np.cos(heading_rad), np.sin(heading_rad), 0 * heading_rad), axis=1)
     ahead_flat = ahead[:, :2] * (1, -1) / recording.resolution_m
     for root, dots, arrows, places, vectors, radius in (
@@ -185,7 +185,7 @@ def _log_series(stream: Any, driver: Driver) -> None:
         driver.entity("series/goal", "distance"): np.linalg.norm(place - recording.goal_m, axis=1),
     }
     if not driver.name:
-        lines["series/traversability/predicted"] = recording.predicted[_cells_of(recording.grid, place)]
+        lines["series/traversability/predicted"] = recording.predicted[_cells_of(recording, place)]
         lines["series/traversability/threshold"] = np.full(len(place), recording.free_above)
         for name, commanded in zip(recording.action_names, recording.actions.T, strict=True):
             lines[f"series/command/{rr.escape_entity_path_part(name)}"] = commanded
@@ -195,7 +195,7 @@ def _log_series(stream: Any, driver: Driver) -> None:
     for entity, values in lines.items():
         stream.send_columns(entity, [times], rr.Scalars.columns(scalars=values.astype(np.float64)))
         if driver.name:
-            style = rr.SeriesLines(colors=[bytes_of(driver.colour)], names=[driver.name])
+            style = rr.SeriesLines(colors=[driver.colour], names=[driver.name])
             stream.log(entity, style, static=True)
 
 
@@ -212,7 +212,7 @@ def _log_driven(stream: Any, driver: Driver) -> None:
             lines = [place[first : step + 1]]
             if not driver.name:
                 lines = [place[k : k + 2] for k in range(first, step)]
-            shown = [bytes_of(driver.colour)] if driver.name else colours[first:step]
+            shown = [driver.colour] if driver.name else colours[first:step]
             entities = driver.entities(f"driven/{piece:03}")
             _log_both(stream, recording, entities, _STRIPS, lines, (0.08, 0.25), colors=shown)
 
@@ -229,7 +229,7 @@ def _log_plans(stream: Any, driver: Driver) -> None:
             if (driver.name and name != "path") or known.get(name) == content:
                 continue
             known[name] = content
-            colours = [bytes_of(driver.colour, 0.628) if driver.name else bytes_of(style.colour)]
+            colours = [(*driver.colour[:3], _TRANSLUCENT) if driver.name else bytes_of(style.colour)]
             radii = (_RADIUS_M * style.width, _RADIUS_CELLS * style.width)
             entities = driver.entities(f"plan/{name}")
             _log_both(stream, driver.recording, entities, _STRIPS, lines, radii, colors=colours)
@@ -242,7 +242,7 @@ def _log_outcome(stream: Any, driver: Driver) -> None:
     stream.set_time(TIMELINE, duration=recording.end_s)
     _log_both(
         stream, recording, driver.entities("outcome"), _POINTS, [recording.track[-1]],
-        (0.05, 0.1), _LIFT_M + 0.6, labels=words, show_labels=True, colors=[bytes_of(driver.colour)],
+        (0.05, 0.1), _LIFT_M + 0.6, labels=words, show_labels=True, colors=[driver.colour],
     )  # fmt: skip
     if recording.immobilised_at is not None:
         cross = (recording.immobilised_at + _CROSS_M * _CROSS).astype(np.float32)

@@ -12,7 +12,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from benchnav.core.figures import condition_colours
+from benchnav.core.figures import bytes_of, condition_colours
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
@@ -64,11 +64,11 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
 def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     """Gives each robot a name and a colour; one that is alone needs no name."""
     if len(recordings) == 1:
-        return [Driver(recording=recordings[0], name="", colour=_ALONE)]
+        return [Driver(recording=recordings[0], name="", colour=bytes_of(_ALONE))]
     abouts = [recording.about for recording in recordings]
     colours = condition_colours([about["planner"] for about in abouts])
     return [
-        Driver(recording=recording, name=name, colour=colour)
+        Driver(recording=recording, name=name, colour=bytes_of(colour))
         for recording, name, colour in zip(recordings, contender_names(abouts), colours, strict=True)
     ]
 
