@@ -64,9 +64,8 @@ def _rank(best: Mapping[Any, Any], others: pd.DataFrame) -> Iterable[str]:
         yield "There is no other setting to compare it with."
         return
     alike, worse = others[others["best_alike"]], others[~others["best_alike"]]
-    settings = f"{len(others) + 1} settings"
     unit = "group" if best["n_groups"] < best["n_maps"] else "map"
-    test = f"max-T sign-flip test by {unit} over {settings}"
+    test = f"max-T sign-flip test by {unit} over {len(others) + 1} settings"
     if worse.empty:
         shown, p = others["best_shown"].max(), others["best_p"].min()
         maps = f"{int(best['best_maps'])} {unit}s"

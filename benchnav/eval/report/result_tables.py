@@ -188,12 +188,13 @@ def _results(row: Mapping[Any, Any]) -> dict[str, str]:
     # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the row.
     if 0 < row["traversability_n"] < row["n_episodes"]:
         met += f" (n = {row['traversability_n']})"
+    total = f"{row['total_time_mean_s']:.1f}"
+    if not np.isnan(row["total_time_low_s"]):
+        total += f" ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
     return {
         "Succ. [%]": rate_in_words(row),
         "95 % interval": success_interval_in_words(row),
-        "T_total [s]": _with_interval(
-            row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]
-        ),
+        "T_total [s]": total,
         "T if success [s]": mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
         "λ̄ [%]": met,
         ALONE: _times(*(row.get(f"latency_{name}", np.nan) for name in LATENCIES)),
@@ -214,25 +215,20 @@ def _times(middle: float, *others: float) -> str:
     return f"{first} ({', '.join(rest)})" if rest else first
 
 
-def _with_interval(mean: float, low: float, high: float) -> str:
-    return f"{mean:.1f}" if np.isnan(low) else f"{mean:.1f} ({low:.1f}–{high:.1f})"
-
-
 def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:
     """Raised numbers of each condition, and the notes that they refer to; equal texts share a number."""
-    numbers: dict[str, int] = {}
+    numbers: dict[str, str] = {}
     marks = []
     for condition in summary["condition"]:
         about = conditions[condition]
         follows = about["follows"]
         texts = [] if follows in _USERS_OWN else [f"minimises, in place of the task's J: {follows}"]
-        own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]
-        marks.append(",".join(_raised(number) for number in own))
-    return marks, [f"{_raised(number)} {text}" for text, number in numbers.items()]
-
-
-def _raised(number: int) -> str:
-    return str(number).translate(_SUPERSCRIPTS)
+        own = [
+            numbers.setdefault(text, str(len(numbers) + 1).translate(_SUPERSCRIPTS))
+            for text in (*texts, *about["remarks"])
+        ]
+        marks.append(",".join(own))
+    return marks, [f"{number} {text}" for text, number in numbers.items()]
 
 
 def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:

@@ -57,10 +57,10 @@ _MARGIN = "0.88"
 
 _SETTING = ["planner", "model", "risk"]
 
-Panels = list[tuple[Axes, pd.DataFrame]]
 
-
-def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0) -> tuple[Figure, Panels]:
+def lay_out(
+    summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0
+) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Makes the panels, with the names of settings at the left of each line of panels.
 
     Args:
@@ -77,11 +77,11 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     planner = settings["planner"].factorize()[0]
     settings = settings.assign(gap=_GAP_ROWS * planner).sort_values("gap", kind="stable")
     settings["height"] = np.arange(len(settings)) + settings.pop("gap")
-    columns = len(measures)
+    lowest, columns = settings["height"].max(), len(measures)
     known = blocks(summary.merge(settings, on=_SETTING, how="left"))
     every = [block for block in known for _ in measures]
     across = columns if columns > 1 else min(len(every), _PANELS_A_LINE)
-    tall = _ROW_IN * (settings["height"].max() + 1.4) + 0.5
+    tall = _ROW_IN * (lowest + 1.4) + 0.5
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     high = tall * -(-len(every) // across) + 0.2 + legend_in
     figure = Figure(figsize=(width, high), layout="constrained")
@@ -90,15 +90,14 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     panels = []
     for place, ((panel,), (title, rows)) in enumerate(zip(stacks, every, strict=True)):
         panels.append((panel, rows))
-        panel.set_title(title)
+        panel.set(title=title, axisbelow=True)
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="x", color="0.9")
-        panel.set_axisbelow(True)
         if place >= len(every) - across:
             panel.set_xlabel(measures[place % columns])
     first, _ = panels[0]
     first.set_yticks(settings["height"].tolist(), settings["name"].tolist())
-    first.set_ylim(settings["height"].max() + 0.7, settings["height"].min() - 0.7)
+    first.set_ylim(lowest + 0.7, -0.7)
     return figure, panels
 
 
@@ -245,9 +244,8 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color="0.93", zorder=0)
-    panel.set_axisbelow(True)
     unit = f" [{metric.unit}]" if metric.unit else ""
-    panel.set_xlabel(f"Δ {metric.name}{unit}")
+    panel.set(xlabel=f"Δ {metric.name}{unit}", axisbelow=True)
     # Which way is better, at the end of the axis where it lies.
     place, side, words = (1, "right", "better →") if metric.better == "higher" else (0, "left", "← better")
     panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side, color="0.35")

@@ -125,8 +125,7 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         views["λ as it was, dark red: immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
     for driver in drivers:
         name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
-        shown = driver.entity("/map/overlay", "**")
-        views[name] = [driver.entity("/map/risk"), shown, _PLACES]
+        views[name] = [driver.entity("/map/risk"), driver.entity("/map/overlay", "**"), _PLACES]
     return views
 
 
