@@ -48,7 +48,7 @@ def _sentences(
     yield from _rank(best, others)
     yield from _why(best, failures, predicted)
     count = int(rivals["n_episodes"].sum())
-    failed = count - round(float((rivals["success_rate"] * rivals["n_episodes"]).sum()))
+    failed = rivals[list(FAILURE_COUNTS)].to_numpy().sum()
     if failed and len(rivals) > 1:
         yield (
             f"All {len(rivals)} compared settings together failed in {failed} of {count} episodes: {_shares(rivals)}."

@@ -82,6 +82,13 @@ def shades(values: np.ndarray) -> np.ndarray:
     return np.round(255 * matplotlib.colormaps[TRAVERSABILITY_COLOURS](values)[..., :3]).astype(np.uint8)
 
 
+def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Colours λ̂, of shape [H, W], and in dark grey what is not free, bool of its shape; as `field_colours` does."""
+    colours = shades(predicted)
+    colours[~free] = 64
+    return colours
+
+
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:
     """Colours λ as it is, and cells that immobilise a robot in a colour of their own.
 

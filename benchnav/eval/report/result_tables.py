@@ -259,8 +259,8 @@ def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
 
 
 def _differences(row: Mapping[Any, Any]) -> tuple[str, ...]:
-    names = [f"time_{value}_share" for value in ("difference", "low", "high")]
-    late = [100 * row[name] if name in row else row[f"{name.removesuffix('share')}s"] for name in names]
+    scale, unit = (100, "share") if "time_difference_share" in row else (1, "s")
+    late, low, high = (scale * row[f"time_{value}_{unit}"] for value in ("difference", "low", "high"))
     return (
         f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
         signed(100 * row["success_difference"]),
@@ -268,8 +268,8 @@ def _differences(row: Mapping[Any, Any]) -> tuple[str, ...]:
         p_value(row["success_p_holm"]),
         "yes" if row["success_p_holm"] < ALPHA else "no",
         f"{100 * row['success_detectable']:.0f}" if row["success_detectable"] <= 1 else NOT_USED,
-        signed(late[0]),
-        signed_interval(*late[1:]),
+        signed(late),
+        signed_interval(low, high),
         p_value(row["time_p_holm"]),
         signed(row["arrival_time_difference_s"]),
         signed_interval(row["arrival_time_low_s"], row["arrival_time_high_s"]),

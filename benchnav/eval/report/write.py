@@ -225,12 +225,12 @@ def _figures(folder: Path, report: Report) -> Drawn:
             caption += " Below, the whole driven path on λ as it was."
         count = f"{len(chosen)} of {len(recorded)} recorded episodes."
         yield "trajectories", f"{caption} {count}", trajectory_figure(chosen)
-    yield from _driven(folder)
+    yield from _driven(folder, report.episodes)
 
 
-def _driven(folder: Path) -> Drawn:
+def _driven(folder: Path, episodes: pd.DataFrame) -> Drawn:
     """The figure of whole driven paths; none where no steps were kept."""
-    driven = read_driven(folder)
+    driven = read_driven(folder, episodes)
     if driven is None:
         return
     ground, rows, tracks = driven

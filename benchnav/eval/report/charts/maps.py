@@ -26,7 +26,6 @@ from benchnav.core.figures import (
     styled,
 )
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.folder.run_folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
 from benchnav.eval.report.failures import FailedLine
@@ -190,11 +189,12 @@ def _name_ground(panel: Axes, label: str, **look: Any) -> None:
     panel.fill([], [], label=label, **look)
 
 
-def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] | None:
+def read_driven(folder: Path, episodes: pd.DataFrame) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] | None:
     """Reads whole driven paths on the map that a run kept; nothing where it kept none, or no steps.
 
     Args:
         folder: a finished run.
+        episodes: its rows.
 
     Returns:
         The map; of each condition its episode there; and the driven positions of each, shape [N + 1, 2].
@@ -202,8 +202,8 @@ def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] |
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
-    ground, rows = Ground.load(path), read_table(folder, EPISODES)
-    rows = rows[(rows[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
+    ground = Ground.load(path)
+    rows = episodes[(episodes[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
     place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
     steps = read_steps(folder, condition=list(rows["condition"]), **place).groupby("condition")
     rows = rows[rows["condition"].isin(steps.groups)]

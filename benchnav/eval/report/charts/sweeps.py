@@ -71,7 +71,7 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
         Lines in the order of the run, by the name of their number with dots, such as `risk.options.level`;
         `severity` is that of scenarios.
     """
-    values = {name: dict(about["value"]) for name, about in conditions.items() if "split" in about["value"]}
+    values = {name: about["value"] for name, about in conditions.items() if "split" in about["value"]}
     flat = [pd.json_normalize(value).to_dict("records")[0] for value in values.values()]
     known = pd.DataFrame(flat, index=list(values), dtype=object)
     tables = [(number, known) for number in sorted(known)]

@@ -13,7 +13,7 @@ import rerun as rr
 
 from benchnav.core.figures import MARKS, bytes_of, hatching, outline
 from benchnav.eval.recording import Recording, drawing_interval, thinned
-from benchnav.eval.report.plan_layers import SOFT, STYLES, field_colours, shades
+from benchnav.eval.report.plan_layers import SOFT, STYLES, field_colours, predicted_colours, shades
 
 TIMELINE = "time"
 
@@ -95,9 +95,7 @@ def log_driver(stream: Any, driver: Driver) -> None:
 def _log_predicted(stream: Any, driver: Driver) -> None:
     """Logs the λ̂ that a planner was given, and the edge of ground that is not free."""
     recording = driver.recording
-    image = shades(recording.predicted)
-    image[~recording.free] = 64
-    _log_image(stream, driver.entity("map/risk"), image)
+    _log_image(stream, driver.entity("map/risk"), predicted_colours(recording.predicted, recording.free))
     flat = _on_map(recording, outline(~recording.free, recording.resolution_m))
     edge = rr.LineStrips2D(flat, colors=[_CLOSED], radii=0.08)
     stream.log(driver.entity("map/closed"), edge, static=True)

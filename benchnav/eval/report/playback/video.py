@@ -27,6 +27,7 @@ from benchnav.eval.report.plan_layers import (
     driven_path,
     field_colours,
     plan_layer,
+    predicted_colours,
 )
 from benchnav.eval.report.words import condition_name, contender_names
 
@@ -41,7 +42,6 @@ _DPI = 100
 _PANEL, _GAP, _HEAD, _FOOT = 440, 20, 92, 76  # pixels
 _TALLEST = 2.0  # of a map, over its width
 _ROBOT_M = np.array([(0.9, 0.0), (-0.6, 0.5), (-0.6, -0.5)])
-_CLOSED = 0.25
 _MARKS = 1.6  # over those of a printed figure
 
 
@@ -169,9 +169,7 @@ class _Column:
         if recording.field is not None:
             shown, title = field_colours(recording.field, recording.immobilising), "λ as it was"
         else:
-            shown = field_colours(recording.predicted, np.zeros_like(recording.free))
-            shown[~recording.free] = round(255 * _CLOSED)
-            title = "λ̂ given to the planner"
+            shown, title = predicted_colours(recording.predicted, recording.free), "λ̂ given to the planner"
         show_map(below, shown, extent_m)
         for panel, words in zip(panels, ("terrain and plan", title), strict=True):
             mark(panel, "start", recording.states[0, :2], _MARKS)
