@@ -132,12 +132,14 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
     about, driven = drivers[0].recording.about, [driver.recording for driver in drivers]
-    used = [name for name in NAMING if any(own.about.get(name, NOT_USED) != NOT_USED for own in driven)]
+    labels = {name: [own.about.get(name, NOT_USED) for own in driven] for name in NAMING}
     rows = {
-        **{name: [own.about.get(name, NOT_USED) for own in driven] for name in used},
+        **{name: cells for name, cells in labels.items() if set(cells) != {NOT_USED}},
         "outcome": [Bold(own.outcome) for own in driven],
         "time": [f"{own.end_s:.1f} s of {own.time_budget_s:g} s" for own in driven],
-        "observed λ": [_mean_observed(own) for own in driven],
+        "observed λ": [
+            f"{own.traversability.mean():.2f}" if len(own.traversability) else NOT_USED for own in driven
+        ],
         "free": [free_rule(own) for own in driven],
     }
     table = Table(
@@ -156,7 +158,3 @@ def free_rule(recording: Recording) -> str:
     """Which ground was free, in words."""
     by = "mean λ" if recording.free_by == "mean" else "λ̂"
     return f"{by} above {recording.free_above:g}"
-
-
-def _mean_observed(recording: Recording) -> str:
-    return f"{recording.traversability.mean():.2f}" if len(recording.traversability) else NOT_USED
