@@ -106,9 +106,9 @@ def condition_colours(planners: Sequence[str], palette: Sequence[str] = COLOURS)
     return [own[planner] if not alike or own[planner] == BLIND else next(turn) for planner in planners]
 
 
-def bytes_of(colour: Any, opacity: float | None = None) -> tuple[int, ...]:
-    """Red, green, blue and opacity of a colour, in [0, 255]; of another opacity in [0, 1] where that is given."""
-    return tuple(round(255 * value) for value in to_rgba(colour, opacity))
+def bytes_of(colour: Any) -> tuple[int, ...]:
+    """Red, green, blue and opacity of a colour, in [0, 255]."""
+    return tuple(round(255 * value) for value in to_rgba(colour))
 
 
 def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -> None:
@@ -119,16 +119,15 @@ def mark(panel: Axes, name: str, place: Any, scale: float = 1.0, **style: Any) -
         name: of `MARKS`.
         place: (x, y).
         scale: of the mark's size.
-        **style: what differs, as in `Axes.plot`.
+        **style: what differs, as in `Axes.plot`; a legend calls the mark by its name, unless a `label` is there.
     """
-    looks = MARKS[name]
-    panel.plot(*place, **{**looks, "ms": scale * looks["ms"], **style})
+    looks = MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]}
+    panel.plot(*place, **looks | style)
 
 
-def mark_handle(name: str, label: str = "", scale: float = 1.0) -> Line2D:
-    """The entry of a legend for a mark, under its own name where none is given."""
-    looks = MARKS[name]
-    return Line2D([], [], **{**looks, "ms": scale * looks["ms"]}, label=label or name)
+def mark_handle(name: str, scale: float = 1.0) -> Line2D:
+    """The entry of a legend for a mark."""
+    return Line2D([], [], **MARKS[name] | {"label": name, "ms": scale * MARKS[name]["ms"]})
 
 
 def draw_edged(panel: Axes, track: Any, width: float, colour: Any = "black", **style: Any) -> None:
@@ -170,9 +169,9 @@ def outline(region: np.ndarray, resolution_m: float) -> np.ndarray:
         Both ends (x, y) of each edge in metres, float32, shape [M, 2, 2].
     """
     framed = np.pad(region, 1)
-    rows, columns = np.nonzero(framed[1:, 1:-1] != framed[:-1, 1:-1])
+    rows, columns = np.nonzero(np.diff(framed[:, 1:-1], axis=0))
     along_x = np.stack((columns, rows, columns + 1, rows), axis=1)
-    rows, columns = np.nonzero(framed[1:-1, 1:] != framed[1:-1, :-1])
+    rows, columns = np.nonzero(np.diff(framed[1:-1], axis=1))
     along_y = np.stack((columns, rows, columns, rows + 1), axis=1)
     edges = np.concatenate((along_x, along_y)).reshape(-1, 2, 2)
     return (edges * resolution_m).astype(np.float32)

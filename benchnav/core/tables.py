@@ -9,7 +9,6 @@ import shutil
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 # Stands for a number or a name that there is not.
 NOTHING = "–"
@@ -18,7 +17,9 @@ NOTHING = "–"
 _UNBROKEN = 400
 _WIDEST_LINE = 56  # of a list in a cell, that is not broken
 
+# Words before the characters that they begin with.
 _LATEX = {
+    "λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$",
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
     ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "±": r"$\pm$", "–": "--", "λ": r"$\lambda$",
@@ -27,7 +28,7 @@ _LATEX = {
     "¶": r"\P{}",
 }  # fmt: skip
 _LATEX |= {raised: rf"\textsuperscript{{{digit}}}" for digit, raised in enumerate("⁰¹²³⁴⁵⁶⁷⁸⁹")}
-_LATEX_WORDS = {"λ̄": r"$\bar{\lambda}$", "λ̂": r"$\hat{\lambda}$", "T_total": r"$T_\mathrm{total}$"}
+_WRITTEN = re.compile("|".join(map(re.escape, _LATEX)))
 _MINUS = re.compile(r"(?<![\w-])-(?=\d)")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 
@@ -151,19 +152,12 @@ def _one_line(heading: str) -> str:
 
 def latex(text: str) -> str:
     """Escapes text for LaTeX; a hyphen before a number of its own is a minus."""
-    text = _MINUS.sub("−", text)
-    for word, written in _LATEX_WORDS.items():
-        before, found, after = text.partition(word)
-        if found:
-            return latex(before) + written + latex(after)
-    return "".join(_LATEX.get(character, character) for character in text)
+    return _WRITTEN.sub(lambda found: _LATEX[found[0]], _MINUS.sub("−", text))
 
 
 def markdown(text: str) -> str:
     """Escapes text for Markdown."""
-    for character in "\\|*<`":
-        text = text.replace(character, "\\" + character)
-    return text
+    return re.sub(r"[\\|*<`]", r"\\\g<0>", text)
 
 
 def to_terminal(table: Table, width: int | None = None, styled: bool = False) -> str:
@@ -174,8 +168,10 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
         width: columns of the terminal; not limited when not given.
         styled: set bold cells in bold and show colours; else a star stands behind bold cells.
     """
+    from rich import box
     from rich.console import Console
     from rich.markup import escape
+    from rich.table import Table as Drawn
 
     bold_note = [f"{'Bold' if styled else '*'}: {table.bold_note}"] if table.bold_note else []
     console = Console(
@@ -185,18 +181,6 @@ def to_terminal(table: Table, width: int | None = None, styled: bool = False) ->
         color_system="256" if styled else None,
         highlight=False,
     )
-    # Square brackets are markup.
-    title = [f"[bold]{escape(table.title)}[/bold]"] if table.title else []
-    console.print(*title, _drawn(table, styled), *map(escape, (*table.notes, *bold_note)), sep="\n")
-    return console.file.getvalue()  # type: ignore[attr-defined]
-
-
-def _drawn(table: Table, styled: bool) -> Any:
-    """The table as rich draws it."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table as Drawn
-
     drawn = Drawn(
         box=box.SIMPLE_HEAD,
         show_edge=False,
@@ -222,7 +206,10 @@ def _drawn(table: Table, styled: bool) -> Any:
 
     for row in table.rows:
         drawn.add_row(*map(drawn_cell, row))
-    return drawn
+    # Square brackets are markup.
+    title = [f"[bold]{escape(table.title)}[/bold]"] if table.title else []
+    console.print(*title, drawn, *map(escape, (*table.notes, *bold_note)), sep="\n")
+    return console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def print_table(table: Table) -> None:

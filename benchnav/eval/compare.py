@@ -18,7 +18,7 @@ from benchnav.eval.experiment.condition import LABELS, NOT_USED, label_words
 from benchnav.eval.experiment.unit import DRAW
 from benchnav.eval.folder.provenance import code_differences
 from benchnav.eval.folder.run_folder import EPISODES, Run, caveats, differences, open_run, read_table
-from benchnav.eval.report.comparison_table import comparison_table
+from benchnav.eval.report.result_tables import comparison_table
 from benchnav.eval.stats.comparison import compare
 from benchnav.eval.stats.pairs import (
     Compared,

@@ -8,7 +8,6 @@ import pandas as pd
 
 from benchnav.core.tables import Bold, Table
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.report.findings import Finding
 from benchnav.eval.report.words import count_range, p_in_words, p_value, signed
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import LEAST_MAPS
@@ -18,37 +17,35 @@ _TESTS = {
     "non-inferiority": "non-inferiority by one one-sided test at the margin",
     "equivalence": "equivalence by two one-sided tests at the margin (TOST)",
 }
-# The interval whose end decides a test at 5 %, before a correction.
-_INTERVALS = {"difference": ("", "95 %"), "non-inferiority": ("_90", "90 %"), "equivalence": ("_90", "90 %")}
+_OF_MARGINS = {"equivalence": "equivalent", "non-inferiority": "not inferior"}
 
 
-def hypothesis_finding(tests: pd.DataFrame, about: Mapping[str, Any], grouped: bool) -> Finding:
+def hypothesis_findings(tests: pd.DataFrame, about: Mapping[str, Any], unit: str) -> dict[str, list[str]]:
     """Says of each hypothesis how its test came out.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
         about: all of `run.json`.
-        grouped: the unit is a group of maps.
+        unit: of the statistics, from `words.unit_of_statistics`.
+
+    Returns:
+        Sentences by the title over them.
     """
-    unit = "group" if grouped else "map"
     said = [
         f"{number}. {_capital(row['claim'])}: {_verdict(row)} ({_numbers(row, unit)})."
         for number, row in enumerate(tests.to_dict("records"), start=1)
     ]
-    return Finding(
-        title=f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})",
-        sentences=(*said, *_extended(about)),
-    )
+    title = f"Hypotheses, fixed before the first unit was run (digest {about['hypotheses']['digest']})"
+    return {title: [*said, *_extended(about)]}
 
 
-def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> Table:
+def hypothesis_table(tests: pd.DataFrame, unit: str) -> Table:
     """Formats the tests, a row a hypothesis; bold where it is supported.
 
     Args:
         tests: from `hypotheses.test_hypotheses`.
-        grouped: the unit is a group of maps.
+        unit: of the statistics, from `words.unit_of_statistics`.
     """
-    unit = "group" if grouped else "map"
     headings = ("", "hypothesis", f"{unit}s", "values", "difference", "interval", "p", "result")
     rows = tuple(
         (
@@ -86,17 +83,12 @@ def hypothesis_table(tests: pd.DataFrame, grouped: bool) -> Table:
 
 
 def _verdict(row: Mapping[Any, Any]) -> str:
-    if row["kind"] == "difference":
-        if not row["supported"]:
-            return (
-                "no significant difference"
-                if not row["direction"]
-                else f"not significantly {row['direction']}"
-            )
-        return f"significantly {row['direction'] or 'different'}"
-    if not row["supported"]:
-        return f"{row['kind']} not shown"
-    return {"equivalence": "equivalent", "non-inferiority": "not inferior"}[row["kind"]]
+    kind, direction = row["kind"], row["direction"]
+    if kind in _OF_MARGINS:
+        return _OF_MARGINS[kind] if row["supported"] else f"{kind} not shown"
+    if row["supported"]:
+        return f"significantly {direction or 'different'}"
+    return f"not significantly {direction}" if direction else "no significant difference"
 
 
 def _numbers(row: Mapping[Any, Any], unit: str) -> str:
@@ -122,7 +114,8 @@ def _extended(about: Mapping[str, Any]) -> list[str]:
 
 
 def _interval(row: Mapping[Any, Any]) -> str:
-    suffix, words = _INTERVALS[row["kind"]]
+    # The interval whose end decides a test at 5 %, before a correction.
+    suffix, words = ("_90", "90 %") if row["kind"] in _OF_MARGINS else ("", "95 %")
     low, high = row[f"low{suffix}"], row[f"high{suffix}"]
     return NOT_USED if np.isnan(low) else f"{_signed(low)} to {_signed(high)} ({words})"
 

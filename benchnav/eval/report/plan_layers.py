@@ -3,11 +3,12 @@
 Letters in shapes: H×W cells, N positions.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of, hatching, outline
@@ -69,15 +70,23 @@ def draw_driven(path: LineCollection, track: np.ndarray, traversability: np.ndar
     path.set_array(traversability[: len(track) - 1])
 
 
-def soft_lines(soft: np.ndarray, resolution_m: float) -> Iterator[LineCollection]:
-    """Outline and hatching of soft ground, bool of shape [H, W]."""
+def draw_soft(panel: Axes, soft: np.ndarray, resolution_m: float) -> None:
+    """Draws outline and hatching of soft ground, bool of shape [H, W], on a map."""
     for lines in (outline, hatching):
-        yield LineCollection(list(lines(soft, resolution_m)), colors=[SOFT], linewidths=0.4)
+        drawn = LineCollection(list(lines(soft, resolution_m)), colors=[SOFT], linewidths=0.4)
+        panel.add_collection(drawn)
 
 
 def shades(values: np.ndarray) -> np.ndarray:
     """Colours of λ, uint8, from any shape to [..., 3]."""
     return np.round(255 * matplotlib.colormaps[TRAVERSABILITY_COLOURS](values)[..., :3]).astype(np.uint8)
+
+
+def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Colours λ̂, of shape [H, W], and in dark grey what is not free, bool of its shape; as `field_colours` does."""
+    colours = shades(predicted)
+    colours[~free] = 64
+    return colours
 
 
 def field_colours(field: np.ndarray, immobilising: np.ndarray) -> np.ndarray:

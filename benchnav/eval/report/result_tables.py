@@ -1,6 +1,6 @@
-"""The tables of a run: a row a condition, and, for a paper, settings down and scenarios across.
+"""The tables of a run: a row a condition, and, for a paper, settings down and scenarios across; and of a comparison.
 
-Source of both: Endo, Honda and Ishigami (2024), Table I.
+Source of the first two: Endo, Honda and Ishigami (2024), Table I.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,11 +19,16 @@ from benchnav.eval.report.words import (
     failures_in_words,
     maps_in_words,
     mean_and_std,
+    p_value,
     rate_in_words,
     several_models,
+    short,
+    signed,
+    signed_interval,
     success_interval_in_words,
+    unit_of_statistics,
 )
-from benchnav.eval.stats.best import BLOCK, PRIVILEGED, competing
+from benchnav.eval.stats.best import PRIVILEGED, competing
 from benchnav.eval.stats.comparison import ALPHA
 from benchnav.eval.stats.paired_difference import LEAST_MAPS
 
@@ -81,7 +86,7 @@ def result_table(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, An
     counts = [
         name
         for name in ("groups", "maps", "episodes")
-        if summary[f"n_{name}"].nunique() > 1 and (is_grouped(summary) or name != "groups")
+        if summary[f"n_{name}"].nunique() > 1 and (name != "groups" or unit_of_statistics(summary) == "group")
     ]
     times = [heading for heading, name in _TIMES.items() if name in summary and summary[name].notna().any()]
     headings = (*labels, *counts, *_RESULTS, *times, "failures")
@@ -165,24 +170,16 @@ def bold_note(summary: pd.DataFrame) -> str:
     """
     if not summary["best_marked"].any():
         return ""
-    by = "group" if is_grouped(summary) else "map"
     words = (
         "not significantly worse than the highest success rate of its block (max-T sign-flip test by "
-        f"{by} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is significantly worse none is "
-        "marked"
+        f"{unit_of_statistics(summary)} over the block, step by step, p ≥ {ALPHA}); in blocks where nothing is "
+        "significantly worse none is marked"
     )
-    left_out = pd.concat(
-        [rows[~competing(rows)] for _, rows in summary.groupby(list(BLOCK), sort=False, dropna=False)]
-    )
+    left_out = pd.concat([rows[~competing(rows)] for _, rows in blocks(summary)])
     models = dict.fromkeys(
         model for part in PRIVILEGED for model in left_out.loc[left_out["privileged"] == part, "model"]
     )
     return f"{words}; privileged models ({', '.join(models)}) do not compete." if models else f"{words}."
-
-
-def is_grouped(summary: pd.DataFrame) -> bool:
-    """Whether the unit of the statistics is a group of maps."""
-    return bool((summary["n_groups"] < summary["n_maps"]).any())
 
 
 def _results(row: Mapping[Any, Any]) -> dict[str, str]:
@@ -191,12 +188,13 @@ def _results(row: Mapping[Any, Any]) -> dict[str, str]:
     # An episode that ended at once met nothing: its λ̄ is of fewer episodes than the row.
     if 0 < row["traversability_n"] < row["n_episodes"]:
         met += f" (n = {row['traversability_n']})"
+    total = f"{row['total_time_mean_s']:.1f}"
+    if not np.isnan(row["total_time_low_s"]):
+        total += f" ({row['total_time_low_s']:.1f}–{row['total_time_high_s']:.1f})"
     return {
         "Succ. [%]": rate_in_words(row),
         "95 % interval": success_interval_in_words(row),
-        "T_total [s]": _with_interval(
-            row["total_time_mean_s"], row["total_time_low_s"], row["total_time_high_s"]
-        ),
+        "T_total [s]": total,
         "T if success [s]": mean_and_std(row["success_time_mean_s"], row["success_time_std_s"]),
         "λ̄ [%]": met,
         ALONE: _times(*(row.get(f"latency_{name}", np.nan) for name in LATENCIES)),
@@ -217,22 +215,85 @@ def _times(middle: float, *others: float) -> str:
     return f"{first} ({', '.join(rest)})" if rest else first
 
 
-def _with_interval(mean: float, low: float, high: float) -> str:
-    return f"{mean:.1f}" if np.isnan(low) else f"{mean:.1f} ({low:.1f}–{high:.1f})"
-
-
 def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:
     """Raised numbers of each condition, and the notes that they refer to; equal texts share a number."""
-    numbers: dict[str, int] = {}
+    numbers: dict[str, str] = {}
     marks = []
     for condition in summary["condition"]:
         about = conditions[condition]
         follows = about["follows"]
         texts = [] if follows in _USERS_OWN else [f"minimises, in place of the task's J: {follows}"]
-        own = [numbers.setdefault(text, len(numbers) + 1) for text in (*texts, *about["remarks"])]
-        marks.append(",".join(_raised(number) for number in own))
-    return marks, [f"{_raised(number)} {text}" for text, number in numbers.items()]
+        own = [
+            numbers.setdefault(text, str(len(numbers) + 1).translate(_SUPERSCRIPTS))
+            for text in (*texts, *about["remarks"])
+        ]
+        marks.append(",".join(own))
+    return marks, [f"{number} {text}" for text, number in numbers.items()]
 
 
-def _raised(number: int) -> str:
-    return str(number).translate(_SUPERSCRIPTS)
+def comparison_table(table: pd.DataFrame, difference: float, by: str) -> Table:
+    """Formats a comparison: success in percentage points, times in seconds, p after Holm's correction.
+
+    Args:
+        table: from `comparison.compare`.
+        difference: of success, that `maps_needed` is for.
+        by: in what the conditions of a pair differ.
+    """
+    shown = [name for name in (*LABELS, "run") if name in table and differ(table[name])]
+    counts = ["n_maps"] if table["n_maps"].nunique() > 1 else []
+    unit = "% of T" if "time_difference_share" in table else "s"
+    headings = (
+        *(*shown, by, "against"),
+        *("maps" for _ in counts),
+        *("Succ. [%]", "Δ [points]", "95 %", "p", "significant", "detectable"),
+        *(f"Δ T_total [{unit}]", "95 %", "p (ranks)"),
+        *("Δ T if both arrive [s]", "95 %", "on maps"),
+    )
+    rows = []
+    for row in table.to_dict("records"):
+        labels = [row[name] for name in (*shown, "one", "other")]
+        rows.append((*labels, *(str(row[name]) for name in counts), *_differences(row)))
+    return Table(
+        headings=headings, labels=len(shown) + 2, rows=tuple(rows), notes=_comparison_notes(table, difference)
+    )
+
+
+def _differences(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    scale, unit = (100, "share") if "time_difference_share" in row else (1, "s")
+    late, low, high = (scale * row[f"time_{value}_{unit}"] for value in ("difference", "low", "high"))
+    return (
+        f"{short(100 * row['success_one'])} : {short(100 * row['success_other'])}",
+        signed(100 * row["success_difference"]),
+        signed_interval(100 * row["success_low"], 100 * row["success_high"]),
+        p_value(row["success_p_holm"]),
+        "yes" if row["success_p_holm"] < ALPHA else "no",
+        f"{100 * row['success_detectable']:.0f}" if row["success_detectable"] <= 1 else NOT_USED,
+        signed(late),
+        signed_interval(low, high),
+        p_value(row["time_p_holm"]),
+        signed(row["arrival_time_difference_s"]),
+        signed_interval(row["arrival_time_low_s"], row["arrival_time_high_s"]),
+        str(row["arrival_time_n_maps"]),
+    )
+
+
+def _comparison_notes(table: pd.DataFrame, difference: float) -> tuple[str, ...]:
+    pairs = "1 pair" if len(table) == 1 else f"{len(table)} pairs"
+    share = (
+        " T differs between conditions, so that T_total and its difference are in shares of each condition's own T."
+        if "time_difference_share" in table
+        else ""
+    )
+    return (
+        f"Family: {pairs}. Holm's correction is over all of them, for success and for T_total apart.",
+        "Success: sign-flip test of the difference by map (McNemar's exact test where there is one episode a map), "
+        "interval of Bonett and Price. T_total: a failure counts as T; Δ and 95 % are of the mean, "
+        "from the intervals of success and of the time without failures." + share,
+        "p (ranks): Wilcoxon's signed-rank test of T_total. It compares the ranks of the maps' differences and not "
+        "their mean, so that it may disagree with the interval, which is of the mean.",
+        "95 %: of each pair alone, not corrected, so that it may leave 0 out where p is above 0.05; of times a dash "
+        f"where there are fewer than {LEAST_MAPS} maps.",
+        "detectable: minimum detectable difference of success [points], at a power of 80 %; "
+        "a dash where they are too few to show any. "
+        f"A difference of {100 * difference:g} points needs {count_range(table['maps_needed'])} maps.",
+    )

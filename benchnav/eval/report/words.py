@@ -11,6 +11,10 @@ from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.stats.best import BLOCK
 from benchnav.planning.world.outcome import FAILURES
 
+# Columns of the summary that count failures, by how these ended, and what sentences call them.
+FAILURE_COUNTS = {
+    f"{outcome.name.lower()}_count": outcome.name.lower().replace("_", " ") for outcome in FAILURES
+}
 # Labels that tell conditions of one map apart.
 NAMING = ("planner", "risk", "model", "robot", "objective", "world")
 
@@ -45,6 +49,12 @@ def condition_name(labels: Mapping[str, Any], several: Collection[str] = ()) -> 
     return joined([planner_name(labels["planner"]), *beside, labels["risk"]])
 
 
+def with_names(summary: pd.DataFrame) -> pd.DataFrame:
+    """Rows of conditions with the `name` of each among them."""
+    several = several_models(summary)
+    return summary.assign(name=[condition_name(row, several) for row in summary.to_dict("records")])
+
+
 def contender_names(labels: Sequence[Mapping[str, str]]) -> list[str]:
     """Names conditions by those of their labels that tell them apart; by their planner where nothing does.
 
@@ -64,6 +74,11 @@ def joined(labels: Iterable[str]) -> str:
     return ", ".join(label for label in labels if label != NOT_USED)
 
 
+def unit_of_statistics(summary: pd.DataFrame) -> str:
+    """A map, or a group of maps where the dataset has such."""
+    return "group" if (summary["n_groups"] < summary["n_maps"]).any() else "map"
+
+
 def maps_in_words(maps: int | str, groups: int | str) -> str:
     """Says how many maps there are, and in how many groups where they have such."""
     return f"{maps} maps" if groups == maps else f"{maps} maps in {groups} groups"
@@ -80,9 +95,8 @@ def failures_in_words(row: Mapping[Any, Any]) -> str:
     Args:
         row: of the summary.
     """
-    names = [outcome.name.lower() for outcome in FAILURES]
-    counts = {outcome_in_words(name): int(row[f"{name}_count"]) for name in names}
-    return ", ".join(f"{count} {name}" for name, count in counts.items() if count) or NOT_USED
+    words = (f"{row[column]} {name}" for column, name in FAILURE_COUNTS.items() if row[column])
+    return ", ".join(words) or NOT_USED
 
 
 def outcome_in_words(outcome: str) -> str:

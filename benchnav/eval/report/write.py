@@ -1,15 +1,18 @@
 """The report of a run: what it says, its table, where its rows come from, and its figures."""
 
-import itertools
+import base64
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
+import benchnav
 from benchnav.core.figures import save_twice
 from benchnav.core.store import write_text
 from benchnav.core.tables import Table, markdown, print_table, to_latex, to_markdown
@@ -30,37 +33,17 @@ from benchnav.eval.report.charts.maps import (
     trajectory_figure,
 )
 from benchnav.eval.report.charts.sweeps import curve_figure, find_sweeps, sweep_name
-from benchnav.eval.report.failure_choice import RecordFailures, Sheets, collect_sheets
-from benchnav.eval.report.failures import failures_table
-from benchnav.eval.report.findings import Finding, findings
-from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
-from benchnav.eval.report.page import write_page
-from benchnav.eval.report.result_tables import LATENCIES, is_grouped, paper_table, result_table
-from benchnav.eval.report.words import NOT_USED, joined, maps_in_words
+from benchnav.eval.report.failures import RecordFailures, Sheets, collect_sheets, failures_table
+from benchnav.eval.report.findings import findings
+from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
+from benchnav.eval.report.result_tables import LATENCIES, paper_table, result_table
+from benchnav.eval.report.words import NOT_USED, joined, maps_in_words, unit_of_statistics
 from benchnav.eval.stats.best import against_best, privileged_models
 from benchnav.eval.stats.hypotheses import test_hypotheses
 from benchnav.eval.stats.summary import summarise
 
 PAGE = "report.html"
 
-_SUCCESS = (
-    "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where "
-    "another is; grey: planners that are blind."
-)
-_HYPOTHESES = "Hypotheses that were fixed before the run, and their tests."
-_FOREST = (
-    "Paired differences of all hypotheses, which were fixed before the run; p after Holm's correction over them. "
-    "Filled: supported; thick and thin: 90 % and 95 % intervals of one difference alone."
-)
-_OUTCOMES = "How episodes ended."
-_DISTRIBUTIONS = "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ."
-_SWEEP = "Success and T_total over {}, with their 95 % intervals."
-_FAILURES = (
-    "Failures of the highest success rate and of the lowest, {}: what was predicted (colour), the path driven, "
-    "and where it ended. Of each outcome one is shown before any other twice; observed λ: mean of the last 2 s."
-)
-_TRAJECTORIES = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
-_TO_THE_END = "Below, the whole driven path on λ as it was."
 _MOST_PATHS = 16
 
 
@@ -69,8 +52,9 @@ class Report:
     """What is reported of a run.
 
     Args:
+        name: of the run.
         header: lines on where the rows come from.
-        findings: what the run says.
+        findings: what the run says, sentences by the title over them.
         table: a row a condition.
         warnings: lines on what went wrong, or could not be shown.
         summary: the numbers behind the table.
@@ -81,8 +65,9 @@ class Report:
         about: all of `run.json`.
     """
 
+    name: str
     header: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    findings: Mapping[str, Sequence[str]]
     table: Table
     warnings: tuple[str, ...]
     summary: pd.DataFrame
@@ -91,6 +76,11 @@ class Report:
     failures: pd.DataFrame
     sheets: Sheets
     about: Mapping[str, Any]
+
+    @property
+    def hypotheses(self) -> Table:
+        """The table of `tests`."""
+        return hypothesis_table(self.tests, unit_of_statistics(self.summary))
 
 
 def read_report(folder: Path, record_failures: RecordFailures | None = None) -> Report:
@@ -111,18 +101,30 @@ def read_report(folder: Path, record_failures: RecordFailures | None = None) -> 
     tests = (
         test_hypotheses(about["hypotheses"], episodes, worlds) if "hypotheses" in about else pd.DataFrame()
     )
-    grouped = is_grouped(summary)
     best = against_best(episodes, summary, privileged_models(about["conditions"]))
     summary = summary.merge(best, on="condition", how="left", validate="1:1")
-    summary = _with_latency(summary, about["conditions"])
+    # How long a step of one robot takes, where the run measured it.
+    known = [about["conditions"][condition].get("latency", {}) for condition in summary["condition"]]
+    summary = summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
     failures = failures_table(folder, episodes)
     sheets = collect_sheets(summary, failures, record_failures)
-    left_out = [sheets.left_out] if sheets.left_out else []
+    said = findings(summary, failures, sheets.predicted)
+    if not tests.empty:
+        # Beside hypotheses that were fixed before the run all else is exploratory.
+        explored = {f"Exploratory: {title}": sentences for title, sentences in said.items()}
+        said = hypothesis_findings(tests, about, unit_of_statistics(summary)) | explored
+    warnings = caveats(about)
+    if count := summary[["planner_error_count", "model_error_count"]].to_numpy().sum():
+        episodes_in_words = "1 episode" if count == 1 else f"{count} episodes"
+        warnings.append(f"In {episodes_in_words} a planner or model failed; tracebacks: {folder / ERRORS}")
+    if sheets.left_out:
+        warnings.append(sheets.left_out)
     return Report(
+        name=folder.resolve().name,
         header=(*_header(summary, about), *_rejected_draws(episodes, about["conditions"])),
-        findings=_findings(findings(summary, failures, sheets.predicted), tests, about, grouped),
+        findings=said,
         table=result_table(summary, about["conditions"]),
-        warnings=(*caveats(about), *_warnings(summary, folder), *left_out),
+        warnings=tuple(warnings),
         summary=summary,
         tests=tests,
         episodes=episodes,
@@ -147,26 +149,24 @@ def write_report(
         What was written of.
     """
     report, out = read_report(folder, record_failures), out or folder
-    name = folder.resolve().name
     write_text(out / "summary.csv", report.summary.to_csv(index=False, float_format="%.6g"))
     write_text(out / "failures.csv", report.failures.to_csv(index=False, float_format="%.4g"))
-    write_text(out / "summary.tex", _as_latex(report, name))
+    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
+    write_text(out / "summary.tex", comments + paper_table(report.summary, report.name))
     if not report.tests.empty:
         write_text(out / "hypotheses.csv", report.tests.to_csv(index=False, float_format="%.6g"))
-        shown = hypothesis_table(report.tests, is_grouped(report.summary))
-        write_text(out / "hypotheses.tex", to_latex([shown], _HYPOTHESES, f"{name}-hypotheses"))
+        caption = "Hypotheses that were fixed before the run, and their tests."
+        write_text(
+            out / "hypotheses.tex", to_latex([report.hypotheses], caption, f"{report.name}-hypotheses")
+        )
     figures = {}
-    charts, maps = _charts(report), (_trajectories(folder, report.summary), _driven(folder))
-    for figure_name, caption, figure in itertools.chain(charts, *maps):
-        path = out / "figures" / f"{figure_name}.png"
+    for name, caption, figure in _figures(folder, report):
+        path = out / "figures" / f"{name}.png"
         # These are as wide as their maps: white borders are cut away.
-        save_twice(figure, path, trim=figure_name in ("trajectories", "driven"))
+        save_twice(figure, path, trim=name in ("trajectories", "driven"))
         figures[path] = caption
-    write_text(out / "summary.md", _as_markdown(report, figures))
-    page = write_page(
-        name, report.header, report.warnings, report.findings, report.table, figures, report.about
-    )
-    write_text(out / PAGE, page)
+    for file in ("summary.md", PAGE):
+        write_text(out / file, render(file, report, figures))
     return report
 
 
@@ -174,56 +174,63 @@ def print_report(report: Report) -> None:
     """Prints what a run says and its table, as wide as the terminal, or unbroken where none is."""
     print("\n".join(report.header))
     print_table(report.table)
-    said = [line for finding in report.findings for line in (f"{finding.title}:", *finding.sentences)]
+    said = [line for title, lines in report.findings.items() for line in (f"{title}:", *lines)]
     print("\n".join([*report.warnings, *said]))
-
-
-def _findings(
-    explored: Sequence[Finding], tests: pd.DataFrame, about: Mapping[str, Any], grouped: bool
-) -> tuple[Finding, ...]:
-    """What a run says; beside hypotheses that were fixed before it all else is exploratory."""
-    if tests.empty:
-        return tuple(explored)
-    rest = (replace(finding, title=f"Exploratory: {finding.title}") for finding in explored)
-    return (hypothesis_finding(tests, about, grouped), *rest)
 
 
 Drawn = Iterator[tuple[str, str, Figure]]  # name, caption and figure
 
 
-def _charts(report: Report) -> Drawn:
-    """The figures at the width of a column or a page."""
-    summary = report.summary
-    marked = set(summary.loc[summary["best_marked"], "condition"])
+def _figures(folder: Path, report: Report) -> Drawn:
+    """All that is drawn of a run."""
+    summary, sheets = report.summary, report.sheets.shown
     if not report.tests.empty:
-        yield "forest", _FOREST, forest_figure(report.tests)
-    yield "success", _SUCCESS, success_figure(summary, marked)
+        yield (
+            "forest",
+            "Paired differences of all hypotheses, which were fixed before the run; p after Holm's correction over "
+            "them. Filled: supported; thick and thin: 90 % and 95 % intervals of one difference alone.",
+            forest_figure(report.tests),
+        )
+    yield (
+        "success",
+        "Success rates with their 95 % intervals; filled: not significantly worse than the best of its panel, where "
+        "another is; grey: planners that are blind.",
+        success_figure(summary),
+    )
     sweeps = find_sweeps(report.about["conditions"])
     names = Counter(map(sweep_name, sweeps))
     for number, lines in sweeps.items():
         short = sweep_name(number)
         name = short if names[short] == 1 else number.replace(".", "-")
-        yield f"over-{name}", _SWEEP.format(name), curve_figure(number, lines, summary)
-    yield "outcomes", _OUTCOMES, outcome_figure(summary)
-    yield "distributions", _DISTRIBUTIONS, distribution_figure(summary, report.episodes)
-    for place, (title, sheet) in enumerate(report.sheets.shown, start=1):
-        name = "failures" if len(report.sheets.shown) == 1 else f"failures-{place}"
-        yield name, _FAILURES.format(title), failure_figure(sheet)
-
-
-def _trajectories(folder: Path, summary: pd.DataFrame) -> Drawn:
-    """The figure of recorded episodes; none where nothing was recorded."""
+        caption = f"Success and T_total over {name}, with their 95 % intervals."
+        yield f"over-{name}", caption, curve_figure(number, lines, summary)
+    yield "outcomes", "How episodes ended.", outcome_figure(summary)
+    yield (
+        "distributions",
+        "A dot an episode. Left: T_total, a failure counted as T. Right: λ̄, the mean observed λ.",
+        distribution_figure(summary, report.episodes),
+    )
+    for place, (title, sheet) in enumerate(sheets, start=1):
+        yield (
+            "failures" if len(sheets) == 1 else f"failures-{place}",
+            f"Failures of the highest success rate and of the lowest, {title}: what was predicted (colour), the path "
+            "driven, and where it ended. Of each outcome one is shown before any other twice; observed λ: mean of "
+            "the last 2 s.",
+            failure_figure(sheet),
+        )
     recorded = read_recordings(folder)
-    chosen = choose_recordings(recorded, list(summary["condition"]))
-    if chosen:
-        whole = [_TO_THE_END] if any(recording.field is not None for recording in chosen) else []
+    if chosen := choose_recordings(recorded, list(summary["condition"])):
+        caption = "What was planned and driven, on the terrain and on the λ̂ that the planner was given."
+        if any(recording.field is not None for recording in chosen):
+            caption += " Below, the whole driven path on λ as it was."
         count = f"{len(chosen)} of {len(recorded)} recorded episodes."
-        yield "trajectories", " ".join([_TRAJECTORIES, *whole, count]), trajectory_figure(chosen)
+        yield "trajectories", f"{caption} {count}", trajectory_figure(chosen)
+    yield from _driven(folder, report.episodes)
 
 
-def _driven(folder: Path) -> Drawn:
+def _driven(folder: Path, episodes: pd.DataFrame) -> Drawn:
     """The figure of whole driven paths; none where no steps were kept."""
-    driven = read_driven(folder)
+    driven = read_driven(folder, episodes)
     if driven is None:
         return
     ground, rows, tracks = driven
@@ -233,19 +240,13 @@ def _driven(folder: Path) -> Drawn:
         if rows["success"].nunique() > 1
         else "on no map did outcomes differ."
     )
-    words = [
+    caption = (
         f"Whole driven paths on {about['scenario']} {about['map']}, seed {about['seed']}, realisation "
         f"{about['realisation']}: {why}"
-    ]
+    )
     if len(shown) < len(rows):
-        words.append(f"{len(shown)} of {len(rows)} conditions.")
-    yield "driven", " ".join(words), driven_figure(ground, shown, tracks[:_MOST_PATHS])
-
-
-def _with_latency(summary: pd.DataFrame, conditions: Mapping[str, Any]) -> pd.DataFrame:
-    """A summary with how long a step of one robot takes, where the run measured it."""
-    known = [conditions[condition].get("latency", {}) for condition in summary["condition"]]
-    return summary.join(pd.DataFrame(known, columns=LATENCIES, dtype=float).add_prefix("latency_"))
+        caption += f" {len(shown)} of {len(rows)} conditions."
+    yield "driven", caption, driven_figure(ground, shown, tracks[:_MOST_PATHS])
 
 
 def _header(summary: pd.DataFrame, about: Mapping[str, Any]) -> list[str]:
@@ -293,34 +294,47 @@ def _world(value: Mapping[str, Any]) -> str:
     return ", ".join([*words, f"free where the {free['by']} map is above {free['above']:g}"])
 
 
-def _warnings(summary: pd.DataFrame, folder: Path) -> list[str]:
-    count = int(summary["planner_error_count"].sum() + summary["model_error_count"].sum())
-    if not count:
-        return []
-    episodes = "1 episode" if count == 1 else f"{count} episodes"
-    return [f"In {episodes} a planner or model failed; tracebacks: {folder / ERRORS}"]
+def render(file: str, report: Report, figures: Mapping[Path, str]) -> str:
+    """Fills the template of a file; in HTML all text is escaped, and the page needs no other file and no network.
 
-
-def _as_markdown(report: Report, figures: Mapping[Path, str]) -> str:
-    lines = ["# Run summary", "", "## What the run says", ""]
-    for finding in report.findings:
-        lines += [f"**{markdown(finding.title)}**", "", *_items(finding.sentences)]
-    if not report.tests.empty:
-        shown = hypothesis_table(report.tests, is_grouped(report.summary))
-        lines += ["## Hypotheses", "", to_markdown(shown), ""]
-    lines += ["## Results", "", *_items(report.header), to_markdown(report.table)]
-    lines += _items(report.warnings) if report.warnings else []
-    for path, caption in figures.items():
-        lines += [f"![{path.stem}](figures/{path.name})", "", markdown(caption), ""]
-    return "\n".join(
-        [*lines, "Commands:", "", *(f"    {command}" for command in command_lines(report.about)), ""]
+    Args:
+        file: `report.html` or `summary.md`.
+        report: what is said.
+        figures: by the path of its PNG what each shows.
+    """
+    environment = Environment(
+        loader=PackageLoader("benchnav.eval.report", "templates"), autoescape=select_autoescape(),
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {"markdown": markdown, "table": to_markdown, "inline": _inline}
+    return environment.get_template(file).render(
+        report=report,
+        figures=figures,
+        provenance=provenance_lines(report.about),
+        commands=command_lines(report.about),
+        version=benchnav.__version__,
     )
 
 
-def _items(lines: Sequence[str]) -> list[str]:
-    return [*(f"- {markdown(line)}" for line in lines), ""]
+def provenance_lines(about: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Says where a run came from, (what, value).
+
+    Args:
+        about: all of `run.json`.
+    """
+    machine, codes, last = about["machine"], about["codes"].values(), about["history"][-1]
+    lines = [("commit of benchnav", last["commit"]), ("version of benchnav", last["benchnav"])]
+    for environment in {json.dumps(code["environment"]): code["environment"] for code in codes}.values():
+        lines += [(name, str(value)) for name, value in environment.items()]
+    lines.append(("machine", f"{machine['processor']}, {machine['cores']} cores"))
+    for data, known in about["datasets"].items():
+        maps = ", ".join(f"{split} {len(digests)}" for split, digests in known["maps"].items())
+        lines.append((f"dataset {data}", f"{known['id']}; maps: {maps}"))
+    lines += dict.fromkeys(part for code in codes for part in code["parts"].items())
+    seeds = dict.fromkeys(seed for condition in about["conditions"].values() for seed in condition["seeds"])
+    lines.append(("seeds", ", ".join(map(str, seeds))))
+    return [(name, value) for name, value in lines if value]
 
 
-def _as_latex(report: Report, name: str) -> str:
-    comments = "".join(f"% {line}\n" for line in (*report.header, *report.table.notes, *report.warnings))
-    return comments + paper_table(report.summary, name)
+def _inline(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()

@@ -1,7 +1,7 @@
 import numpy as np
 import pandas as pd
 
-from benchnav.eval.report.comparison_table import comparison_table
+from benchnav.eval.report.result_tables import comparison_table
 from benchnav.eval.stats.comparison import compare
 from tests.eval.stats.test_comparison import A, B, pair
 

@@ -8,8 +8,7 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.failure_choice import Sheets, collect_sheets
-from benchnav.eval.report.failures import failures_table
+from benchnav.eval.report.failures import Sheets, collect_sheets, failures_table
 from tests.eval.report import made
 
 RATES = {"mean": 2, "var": 5, "cvar": 8}

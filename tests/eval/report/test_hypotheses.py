@@ -7,7 +7,7 @@ import pytest
 
 from benchnav.eval.experiment.hypotheses import digest_of_tests
 from benchnav.eval.report.charts.conditions import forest_figure
-from benchnav.eval.report.hypotheses import hypothesis_finding, hypothesis_table
+from benchnav.eval.report.hypotheses import hypothesis_findings, hypothesis_table
 from benchnav.eval.report.write import write_report
 from tests.eval.report import made
 from tests.eval.report.test_write import run_folder
@@ -35,19 +35,23 @@ ABOUT = {
 
 
 def test_each_hypothesis_is_said_with_its_numbers() -> None:
-    finding = hypothesis_finding(pd.DataFrame([a_test(), a_test(**OTHER)]), ABOUT, False)
-    assert finding.title == "Hypotheses, fixed before the first unit was run (digest d1)"
-    assert finding.sentences == (
+    ((title, sentences),) = hypothesis_findings(
+        pd.DataFrame([a_test(), a_test(**OTHER)]), ABOUT, "map"
+    ).items()
+    assert title == "Hypotheses, fixed before the first unit was run (digest d1)"
+    assert sentences == [
         "1. T_total of cvar and of mean differs by less than 0.5 s: equivalent (difference +0.10 s, interval -0.20 to "
         "+0.40 (90 %), p = 0.02, 40 maps).",
         "2. Success of cvar differs from that of mean: no significant difference (difference -4.0 points, interval "
         "-14.0 to +6.0 (95 %), p = 0.6, 40 maps).",
-    )
+    ]
 
 
 def test_an_extension_after_the_hypotheses_is_told() -> None:
     conditions = {"a": {"draws": [[0, 0, 200]]}, "b": {"draws": [[0, 0, 80]]}}
-    said = hypothesis_finding(pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, True).sentences
+    (said,) = hypothesis_findings(
+        pd.DataFrame([a_test()]), ABOUT | {"conditions": conditions}, "group"
+    ).values()
     assert said[-1].startswith(
         "They were fixed for 80 episodes of a condition; the run was extended to 80 to 200 later"
     )
@@ -66,14 +70,14 @@ def test_an_extension_after_the_hypotheses_is_told() -> None:
     ],
 )
 def test_a_verdict_is_that_of_its_kind(changes: dict[str, Any], words: str) -> None:
-    table = hypothesis_table(pd.DataFrame([a_test(**changes)]), False)
+    table = hypothesis_table(pd.DataFrame([a_test(**changes)]), "map")
     assert table.rows[0][-1] == words
     assert bool(made.bold_cells(table)) == (changes.get("supported", True))
 
 
 def test_a_difference_of_time_says_that_its_interval_and_its_p_are_of_two_kinds() -> None:
     for test, said in ((a_test(kind="difference"), True), (a_test(), False), (a_test(**OTHER), False)):
-        notes = hypothesis_table(pd.DataFrame([test]), False).notes
+        notes = hypothesis_table(pd.DataFrame([test]), "map").notes
         assert any("where the interval holds 0" in note for note in notes) == said
 
 
@@ -114,7 +118,7 @@ def test_a_report_tests_them_first_and_heads_the_rest_exploratory(tmp_path: Path
     hypotheses = {"tests": [plain], "digest": digest_of_tests([plain]), "episodes": {one: 8, other: 8}}
     folder = run_folder(tmp_path / "run", rows, hypotheses=hypotheses)
     report = write_report(folder)
-    assert [finding.title.split(",")[0] for finding in report.findings] == ["Hypotheses", "Exploratory: std"]
+    assert [title.split(",")[0] for title in report.findings] == ["Hypotheses", "Exploratory: std"]
     assert report.tests["difference"].tolist() == [0]
     text = (folder / "summary.md").read_text()
     assert text.index("forest.png") < text.index("success.png")

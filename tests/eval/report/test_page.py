@@ -3,11 +3,12 @@ from pathlib import Path
 
 import matplotlib.image
 import numpy as np
+import pandas as pd
 import pytest
 
 from benchnav.core.tables import Bold, Table
-from benchnav.eval.report.findings import Finding
-from benchnav.eval.report.page import provenance_lines, write_page
+from benchnav.eval.report.failures import Sheets
+from benchnav.eval.report.write import Report, provenance_lines, render
 from tests.eval.forged import code_with
 
 EVIL = "<script>alert(1)</script> & \"quoted\" 'too'"
@@ -49,11 +50,13 @@ def page(tmp_path: Path) -> Page:
         "datasets": {}, "conditions": {}, "codes": {"a": code_with(parts={EVIL: EVIL})},
         "machine": {"processor": "", "cores": 2}, "history": [{"command": EVIL, "commit": "", "benchnav": "1"}],
     }  # fmt: skip
-    text = write_page(
-        EVIL, [EVIL], [EVIL], [Finding(title=EVIL, sentences=(EVIL,))], table, {picture: EVIL},
-        about,
+    nothing = pd.DataFrame()
+    report = Report(
+        name=EVIL, header=(EVIL,), warnings=(EVIL,), findings={EVIL: [EVIL]},
+        table=table, about=about, summary=nothing, tests=nothing, episodes=nothing, failures=nothing,
+        sheets=Sheets(shown=(), predicted={}, left_out=""),
     )  # fmt: skip
-    return Page(text)
+    return Page(render("report.html", report, {picture: EVIL}))
 
 
 def test_text_of_users_is_text(page: Page) -> None:

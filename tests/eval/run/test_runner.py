@@ -697,7 +697,8 @@ def test_hypotheses_are_fixed_before_the_first_unit_and_stay(dataset_path: Path,
     report = write_report(folder)
     assert report.tests["n_episodes"].tolist() == [4]
     assert (
-        "fixed for 2 episodes of a condition; the run was extended to 4" in report.findings[0].sentences[-1]
+        "fixed for 2 episodes of a condition; the run was extended to 4"
+        in next(iter(report.findings.values()))[-1]
     )
     other = (given | {"metric": "score"},)
     with pytest.raises(ConfigError, match=f"digest {fixed['digest']}.*got others"):

@@ -4,7 +4,7 @@ All but the last have a panel a block and a row a setting. Any number of planner
 since their names stand on the left.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from benchnav.core.figures import (
 )
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.experiment.hypotheses import METRICS
-from benchnav.eval.report.words import blocks, condition_name, outcome_in_words, p_in_words, several_models
+from benchnav.eval.report.words import blocks, outcome_in_words, p_in_words, with_names
 
 # From what the ground did to what the code did; success is light, each failure has a colour of its own.
 OUTCOME_COLOURS = {
@@ -57,10 +57,10 @@ _MARGIN = "0.88"
 
 _SETTING = ["planner", "model", "risk"]
 
-Panels = list[tuple[Axes, pd.DataFrame]]
 
-
-def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0) -> tuple[Figure, Panels]:
+def lay_out(
+    summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0.0
+) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """Makes the panels, with the names of settings at the left of each line of panels.
 
     Args:
@@ -72,46 +72,43 @@ def lay_out(summary: pd.DataFrame, measures: Sequence[str], legend_in: float = 0
     Returns:
         The figure; of each block its panel, and its rows of the summary with the `height` that each is drawn at.
     """
-    settings = summary[_SETTING].drop_duplicates()
+    settings = with_names(summary[_SETTING].drop_duplicates())
     # Planners are a little apart.
     planner = settings["planner"].factorize()[0]
     settings = settings.assign(gap=_GAP_ROWS * planner).sort_values("gap", kind="stable")
     settings["height"] = np.arange(len(settings)) + settings.pop("gap")
-    columns = len(measures)
+    lowest, columns = settings["height"].max(), len(measures)
     known = blocks(summary.merge(settings, on=_SETTING, how="left"))
     every = [block for block in known for _ in measures]
     across = columns if columns > 1 else min(len(every), _PANELS_A_LINE)
-    tall = _ROW_IN * (settings["height"].max() + 1.4) + 0.5
+    tall = _ROW_IN * (lowest + 1.4) + 0.5
     width = ONE_COLUMN_IN if across == 1 else TWO_COLUMNS_IN
     high = tall * -(-len(every) // across) + 0.2 + legend_in
     figure = Figure(figsize=(width, high), layout="constrained")
     shared = "all" if columns == 1 else "col"
     stacks = stack_panels(figure, len(every), across, sharex=shared, sharey=True)
-    panels = [(panel, rows) for (panel,), (_, rows) in zip(stacks, every, strict=True)]
-    for place, (panel, (title, _)) in enumerate(zip(figure.axes, every, strict=True)):
-        panel.set_title(title)
+    panels = []
+    for place, ((panel,), (title, rows)) in enumerate(zip(stacks, every, strict=True)):
+        panels.append((panel, rows))
+        panel.set(title=title, axisbelow=True)
         panel.tick_params(axis="y", length=0)
         panel.grid(axis="x", color="0.9")
-        panel.set_axisbelow(True)
         if place >= len(every) - across:
             panel.set_xlabel(measures[place % columns])
-    several = several_models(summary)
-    names = [condition_name(row, several) for row in settings.to_dict("records")]
-    first = figure.axes[0]
-    first.set_yticks(settings["height"].tolist(), names)
-    first.set_ylim(settings["height"].max() + 0.7, settings["height"].min() - 0.7)
+    first, _ = panels[0]
+    first.set_yticks(settings["height"].tolist(), settings["name"].tolist())
+    first.set_ylim(lowest + 0.7, -0.7)
     return figure, panels
 
 
 @styled()
-def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figure:
+def success_figure(summary: pd.DataFrame) -> Figure:
     """Draws the success rate of every condition with its 95 % interval, a panel a block of the run.
 
     A planner that is blind is drawn as a line through its panel, the baseline that others are seen against.
 
     Args:
-        summary: from `summary.summarise`.
-        marked: conditions whose points are filled, as `best_marked` of `best.against_best` has them.
+        summary: from `summary.summarise`, joined with `best.against_best`, whose `best_marked` fills points.
     """
     (figure, panels), colours = lay_out(summary, ["success [%]"]), planner_colours(list(summary["planner"]))
     for panel, rows in panels:
@@ -119,7 +116,7 @@ def success_figure(summary: pd.DataFrame, marked: Collection[str] = ()) -> Figur
             # The clairvoyant has a model, and no risk.
             blind = row["model"] == NOT_USED
             colour = BLIND if blind else colours[row["planner"]]
-            face = colour if row["condition"] in marked else "white"
+            face = colour if row.get("best_marked") else "white"
             rate, low, high = (100 * row[f"success_{name}"] for name in ("rate", "low", "high"))
             panel.plot([low, high], [row["height"]] * 2, color=colour, lw=1.2, solid_capstyle="butt")
             panel.plot(rate, row["height"], "o", color=colour, ms=4, mfc=face)
@@ -247,9 +244,8 @@ def _draw_tests(panel: Axes, rows: pd.DataFrame) -> None:
     panel.set_yticks(range(len(rows)), names)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color="0.93", zorder=0)
-    panel.set_axisbelow(True)
     unit = f" [{metric.unit}]" if metric.unit else ""
-    panel.set_xlabel(f"Δ {metric.name}{unit}")
+    panel.set(xlabel=f"Δ {metric.name}{unit}", axisbelow=True)
     # Which way is better, at the end of the axis where it lies.
     place, side, words = (1, "right", "better →") if metric.better == "higher" else (0, "left", "← better")
     panel.annotate(words, (place, 1), xycoords="axes fraction", va="bottom", ha=side, color="0.35")

@@ -26,19 +26,18 @@ from benchnav.core.figures import (
     styled,
 )
 from benchnav.eval.experiment.condition import NOT_USED
-from benchnav.eval.folder.run_folder import EPISODES, read_table
 from benchnav.eval.folder.steps import STEPS, read_steps
 from benchnav.eval.recording import GROUND, Ground, Recording
-from benchnav.eval.report.failure_choice import FailedLine
+from benchnav.eval.report.failures import FailedLine
 from benchnav.eval.report.plan_layers import (
     IMMOBILISING,
     SOFT,
     STYLES,
     draw_driven,
+    draw_soft,
     driven_path,
     field_colours,
     plan_layer,
-    soft_lines,
 )
 from benchnav.eval.report.words import NAMING, condition_name, contender_names, differ, outcome_in_words
 
@@ -66,18 +65,17 @@ def choose_recordings(recordings: Sequence[Recording], conditions: Sequence[str]
     table = pd.DataFrame(
         [recording.about for recording in recordings], columns=["condition", "outcome", *_SAME_MAP]
     )
-    table["order"] = table["condition"].map({condition: place for place, condition in enumerate(conditions)})
-    table["number"] = table["map"].astype(int)
-    table = table.dropna(subset="order").sort_values(["order", "number"], kind="stable")
+    table = table.astype({"condition": pd.CategoricalDtype(conditions), "map": int})
+    table = table.dropna(subset="condition").sort_values(["condition", "map"], kind="stable")
     if table.empty:
         return []
     maps = table.groupby(_SAME_MAP)
     table["differing"] = maps["outcome"].transform("nunique") > 1
     table["failed"] = maps["outcome"].transform(lambda outcomes: set(outcomes) != {"success"})
-    firsts = table[table["order"] == table["order"].min()]
+    firsts = table[table["condition"] == table["condition"].iloc[0]]
     shown = firsts.sort_values(["differing", "failed"], ascending=False, kind="stable").iloc[0]
     table["other"] = (table[_SAME_MAP] != shown[_SAME_MAP]).any(axis=1)
-    chosen = table.sort_values(["order", "other"], kind="stable").drop_duplicates("condition")
+    chosen = table.sort_values(["condition", "other"], kind="stable").drop_duplicates("condition")
     return [recordings[place] for place in chosen.index[:MOST_PANELS]]
 
 
@@ -106,15 +104,15 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         heading = f"{condition_name(about, several)}, {about['scenario']} {about['map']}"
         moment = f"t = {now * recording.dt_s:g} s; outcome: {recording.outcome}"
         driven = _draw_terrain(above, recording)
-        _name_panel(above, letters, heading, moment)
-        _draw_predicted(below, recording, letters)
+        above.set_title(f"{heading}\n{moment}")
+        _draw_predicted(below, recording)
         for panel in (above, below):
             for name, style in STYLES.items():
                 if len(plan.lines.get(name, ())):
                     panel.add_collection(plan_layer(style, plan.lines[name]))
             _mark_places(panel, recording, recording.track[now])
         if recording.field is not None:
-            _draw_field(last[0], recording, recording.field, letters)
+            _draw_field(last[0], recording, recording.field)
         elif last:
             last.pop().remove()
         drawn = [above, below, *last]
@@ -122,6 +120,9 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
         for panel in drawn:
             panel.tick_params(labelleft=place % across == 0)
             panel.set_ylabel("y [m]" if place % across == 0 else "")
+            # Broken where it is wider than the panel.
+            title = (textwrap.fill(line, letters) for line in panel.get_title().splitlines())
+            panel.set_title("\n".join(title), fontsize="small")
     legend_outside(figure, columns=1 if across == 1 else 4)
     shrink = min(1.0, 4 / figure.get_figheight())
     figure.colorbar(
@@ -136,17 +137,11 @@ def trajectory_figure(recordings: Sequence[Recording]) -> Figure:
     return figure
 
 
-def _name_panel(panel: Axes, letters: int, *lines: str) -> None:
-    """Sets the title of a panel, broken where it is wider than so many letters."""
-    panel.set_title("\n".join(textwrap.fill(line, letters) for line in lines), fontsize="small")
-
-
 def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
     """Draws the terrain, and the path driven by that moment, coloured by the observed λ."""
     show_map(panel, np.moveaxis(recording.rgb, 0, -1), recording.grid.extent_m)
     if recording.field is not None and recording.soft.any():
-        for lines in soft_lines(recording.soft, recording.resolution_m):
-            panel.add_collection(lines)
+        draw_soft(panel, recording.soft, recording.resolution_m)
         _name_ground(panel, "soft ground, which does not show", fc="0.45", ec=SOFT, hatch="////")
     driven = recording.track[: recording.now + 1]
     coloured = driven_path(2)
@@ -157,7 +152,7 @@ def _draw_terrain(panel: Axes, recording: Recording) -> LineCollection:
     return coloured
 
 
-def _draw_predicted(panel: Axes, recording: Recording, letters: int) -> None:
+def _draw_predicted(panel: Axes, recording: Recording) -> None:
     """Draws the λ̂ that the planner was given, and the path in black, since the map has the colours of λ."""
     show_map(panel, recording.predicted, recording.grid.extent_m, **_LAMBDA)
     if not recording.free.all():
@@ -165,13 +160,12 @@ def _draw_predicted(panel: Axes, recording: Recording, letters: int) -> None:
         show_map(panel, closed, recording.grid.extent_m, cmap=ListedColormap([_CLOSED]))
         _name_ground(panel, "not free", color=_CLOSED)
     blind = recording.about["model"] == NOT_USED
-    words = "E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner"
-    _name_panel(panel, letters, words)
+    panel.set_title("E[λ] in truth; the planner is given nothing" if blind else "λ̂ given to the planner")
     words = "driven; above in the colour of the observed λ"
     draw_edged(panel, recording.track[: recording.now + 1], 1.4, label=words)
 
 
-def _draw_field(panel: Axes, recording: Recording, field: np.ndarray, letters: int) -> None:
+def _draw_field(panel: Axes, recording: Recording, field: np.ndarray) -> None:
     """Draws λ as it was, and the whole driven path over it."""
     show_map(panel, field_colours(field, recording.immobilising), recording.grid.extent_m)
     draw_edged(panel, recording.track, 1.4)
@@ -180,13 +174,13 @@ def _draw_field(panel: Axes, recording: Recording, field: np.ndarray, letters: i
         mark(panel, "end", recording.immobilised_at, label="immobilised")
     if recording.immobilising.any():
         _name_ground(panel, **_HOLDS)
-    _name_panel(panel, letters, f"driven to the end ({recording.end_s:g} s), on λ as it was")
+    panel.set_title(f"driven to the end ({recording.end_s:g} s), on λ as it was")
 
 
 def _mark_places(panel: Axes, recording: Recording, robot: np.ndarray) -> None:
     """Marks start, goal and robot."""
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m), ("robot", robot)):
-        mark(panel, name, place, label=name)
+        mark(panel, name, place)
     frame_map(panel)
 
 
@@ -195,11 +189,12 @@ def _name_ground(panel: Axes, label: str, **look: Any) -> None:
     panel.fill([], [], label=label, **look)
 
 
-def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] | None:
+def read_driven(folder: Path, episodes: pd.DataFrame) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] | None:
     """Reads whole driven paths on the map that a run kept; nothing where it kept none, or no steps.
 
     Args:
         folder: a finished run.
+        episodes: its rows.
 
     Returns:
         The map; of each condition its episode there; and the driven positions of each, shape [N + 1, 2].
@@ -207,8 +202,8 @@ def read_driven(folder: Path) -> tuple[Ground, pd.DataFrame, list[np.ndarray]] |
     path = folder / GROUND
     if not path.exists() or not (folder / STEPS).is_dir():
         return None
-    ground, rows = Ground.load(path), read_table(folder, EPISODES)
-    rows = rows[(rows[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
+    ground = Ground.load(path)
+    rows = episodes[(episodes[list(ground.about)] == pd.Series(ground.about)).all(axis=1)]
     place = {name: ground.about[name] for name in ("seed", "realisation", "map")}
     steps = read_steps(folder, condition=list(rows["condition"]), **place).groupby("condition")
     rows = rows[rows["condition"].isin(steps.groups)]
@@ -241,8 +236,8 @@ def driven_figure(ground: Ground, rows: pd.DataFrame, tracks: Sequence[np.ndarra
         if not row["success"]:
             words = "end of a failure, in the colour of its path"
             mark(panel, "end", track[-1], 0.6 + smaller, color=colours[place], label=words)
-    mark(panel, "start", tracks[0][0], label="start")
-    mark(panel, "goal", ground.goal_m, label="goal")
+    mark(panel, "start", tracks[0][0])
+    mark(panel, "goal", ground.goal_m)
     if ground.immobilising.any():
         _name_ground(panel, **_HOLDS)
     title = "terrain, faded" if ground.field is None else "λ as it was: the lighter the faster"
@@ -304,6 +299,6 @@ def _draw_failure(panel: Axes, recording: Recording) -> None:
     track = recording.track
     draw_edged(panel, track, 1.1, label="driven")
     for name, position in (("start", track[0]), ("goal", recording.goal_m), ("end", track[-1])):
-        mark(panel, name, position, 0.9, label=name)
+        mark(panel, name, position, 0.9)
     panel.spines[:].set_visible(False)
     panel.set(xticks=[], yticks=[])

@@ -71,7 +71,7 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
         Lines in the order of the run, by the name of their number with dots, such as `risk.options.level`;
         `severity` is that of scenarios.
     """
-    values = {name: dict(about["value"]) for name, about in conditions.items() if "split" in about["value"]}
+    values = {name: about["value"] for name, about in conditions.items() if "split" in about["value"]}
     flat = [pd.json_normalize(value).to_dict("records")[0] for value in values.values()]
     known = pd.DataFrame(flat, index=list(values), dtype=object)
     tables = [(number, known) for number in sorted(known)]
@@ -96,7 +96,7 @@ def find_sweeps(conditions: Mapping[str, Mapping[str, Any]]) -> dict[str, list[L
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and pd.notna(value)
+    return type(value) in (int, float) and pd.notna(value)
 
 
 def sweep_name(number: str) -> str:
@@ -132,17 +132,19 @@ def curve_figure(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> F
     values = sorted({value for line in lines for value in line.values})
     swept = [condition for line in lines for condition in line.conditions]
     others = rows.drop(swept).to_dict("records") if number.startswith("risk.") else []
-    references: dict[str, str] = {}
+    references: dict[str, dict[str, Any]] = {}
     for place, ((above, below), (title, shown)) in enumerate(zip(stacks, groups, strict=True)):
         for panel, (measure, (*names, scale)) in zip((above, below), _MEASURES.items(), strict=True):
-            for line, name in zip([lines[i] for i in shown], labels["name"][shown], strict=True):
+            for line_place in shown:
+                line, name = lines[line_place], labels["name"][line_place]
                 own = rows.loc[list(line.conditions)]
                 for label, row in _references(own.iloc[0], others):
                     blind = row["model"] == NOT_USED
-                    references.setdefault(label, BLIND if blind else "0.2")
-                    style = _style(list(references).index(label))
+                    # A pattern of dashes for each setting, with more and more dots between.
+                    dashes = (0, (6, 2, *(1, 1.5) * len(references)))
+                    look = references.setdefault(label, {"color": BLIND if blind else "0.2", "ls": dashes})
                     colour = BLIND if blind else colours[name]
-                    panel.axhline(scale * row[names[0]], color=colour, ls=style, lw=1, zorder=1)
+                    panel.axhline(scale * row[names[0]], color=colour, ls=look["ls"], lw=1, zorder=1)
                 rate, low, high = (scale * own[column] for column in names)
                 marker = MARKERS[list(colours).index(name) // len(LINE_COLOURS) % len(MARKERS)]
                 places = _places(number, line.values)
@@ -155,11 +157,7 @@ def curve_figure(number: str, lines: Sequence[Line], summary: pd.DataFrame) -> F
         below.tick_params(labelbottom=True)
         below.set_xlabel(_NAMES.get(number, sweep_name(number)))
         below.set_xticks(_places(number, values), [f"{value:g}" for value in values])
-    # Matplotlib names every pattern of dashes "--", so that a style cannot be read back from a line.
-    handles = [
-        Line2D([], [], color=colour, lw=1, ls=_style(place), label=label)
-        for place, (label, colour) in enumerate(references.items())
-    ]
+    handles = [Line2D([], [], lw=1, label=label, **look) for label, look in references.items()]
     legend_outside(figure, handles, 2 if across == 1 else 4)
     return figure
 
@@ -224,8 +222,3 @@ def _places(number: str, values: Sequence[float]) -> np.ndarray:
     """Where values stand: levels by the logarithm of the tail's share, since they crowd toward 1."""
     numbers = np.asarray(values)
     return -np.log(1 - numbers) if number == _LEVEL and numbers.max() < 1 else numbers
-
-
-def _style(place: int) -> Any:
-    """A pattern of dashes for each setting, with more and more dots between."""
-    return (0, (6, 2, *(1, 1.5) * place))

@@ -12,21 +12,12 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from benchnav.core.figures import condition_colours
+from benchnav.core.figures import bytes_of, condition_colours
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.robot import (
-    TIMELINE,
-    Driver,
-    log_driven,
-    log_outcome,
-    log_plans,
-    log_robot,
-    log_series,
-)
-from benchnav.eval.report.playback.scene import log_maps, log_predicted, log_terrain
+from benchnav.eval.report.playback.scene import TIMELINE, Driver, log_driver, log_ground
 from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
@@ -54,7 +45,6 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         path: file to write; its name is what the viewer calls it.
     """
     drivers = drivers_of(recordings)
-    first = recordings[0]
     # One chunk an entity, however slow the machine is: each has a header of more than a kilobyte.
     batches = rr.ChunkBatcherConfig.NEVER()
     stream = rr.RecordingStream(APPLICATION, recording_id=path.stem, batcher_config=batches)
@@ -63,13 +53,9 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
         try:
             stream.send_recording_name(_title(drivers))
             stream.log("about", rr.TextDocument(describe(drivers), media_type="text/markdown"), static=True)
-            log_terrain(stream, first)
-            log_maps(stream, first)
+            log_ground(stream, recordings[0])
             for driver in drivers:
-                risk, closed = driver.entity("map/risk"), driver.entity("map/closed")
-                log_predicted(stream, driver.recording, risk, closed)
-                for log in (log_robot, log_series, log_driven, log_plans, log_outcome):
-                    log(stream, driver)
+                log_driver(stream, driver)
             stream.flush()
         finally:
             stream.disconnect()
@@ -78,11 +64,11 @@ def write_rerun(recordings: Sequence[Recording], path: Path) -> None:
 def drivers_of(recordings: Sequence[Recording]) -> list[Driver]:
     """Gives each robot a name and a colour; one that is alone needs no name."""
     if len(recordings) == 1:
-        return [Driver(recording=recordings[0], name="", colour=_ALONE)]
+        return [Driver(recording=recordings[0], name="", colour=bytes_of(_ALONE))]
     abouts = [recording.about for recording in recordings]
     colours = condition_colours([about["planner"] for about in abouts])
     return [
-        Driver(recording=recording, name=name, colour=colour)
+        Driver(recording=recording, name=name, colour=bytes_of(colour))
         for recording, name, colour in zip(recordings, contender_names(abouts), colours, strict=True)
     ]
 
@@ -129,8 +115,7 @@ def arrange(drivers: Sequence[Driver]) -> Any:
 def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
     """What each view of a map shows, by its name."""
     recording = drivers[0].recording
-    edges = [driver.entity("/map/closed") for driver in drivers]
-    own = edges if len(drivers) == 1 else []
+    own = ["/map/closed"] if len(drivers) == 1 else []
     colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
     views = {
         colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
@@ -140,20 +125,21 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         views["λ as it was, dark red: immobilises a robot"] = ["/map/field", *own, _ALL, _PLACES]
     for driver in drivers:
         name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
-        shown = driver.entity("/map/overlay", "**")
-        views[name] = [driver.entity("/map/risk"), shown, _PLACES]
+        views[name] = [driver.entity("/map/risk"), driver.entity("/map/overlay", "**"), _PLACES]
     return views
 
 
 def describe(drivers: Sequence[Driver]) -> str:
     """Says in Markdown what is shown, how each episode ended, and which ground was free."""
     about, driven = drivers[0].recording.about, [driver.recording for driver in drivers]
-    used = [name for name in NAMING if any(own.about.get(name, NOT_USED) != NOT_USED for own in driven)]
+    labels = {name: [own.about.get(name, NOT_USED) for own in driven] for name in NAMING}
     rows = {
-        **{name: [own.about.get(name, NOT_USED) for own in driven] for name in used},
+        **{name: cells for name, cells in labels.items() if set(cells) != {NOT_USED}},
         "outcome": [Bold(own.outcome) for own in driven],
         "time": [f"{own.end_s:.1f} s of {own.time_budget_s:g} s" for own in driven],
-        "observed λ": [_mean_observed(own) for own in driven],
+        "observed λ": [
+            f"{own.traversability.mean():.2f}" if len(own.traversability) else NOT_USED for own in driven
+        ],
         "free": [free_rule(own) for own in driven],
     }
     table = Table(
@@ -172,7 +158,3 @@ def free_rule(recording: Recording) -> str:
     """Which ground was free, in words."""
     by = "mean λ" if recording.free_by == "mean" else "λ̂"
     return f"{by} above {recording.free_above:g}"
-
-
-def _mean_observed(recording: Recording) -> str:
-    return f"{recording.traversability.mean():.2f}" if len(recording.traversability) else NOT_USED

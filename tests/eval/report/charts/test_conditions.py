@@ -128,7 +128,8 @@ def test_points_are_filled_where_they_are_marked() -> None:
     summary = made.summarised(
         made.rows(shares(made.condition(risk="a"), 9), shares(made.condition(risk="b"), 2))
     )
-    (panel,) = panels(success_figure(summary, {summary["condition"][0]}))
+    first = summary["condition"] == summary["condition"][0]
+    (panel,) = panels(success_figure(summary.assign(best_marked=first)))
     marked = [line for line in panel.lines if line.get_marker() == "o"]
     assert [to_rgb(line.get_markerfacecolor()) == (1, 1, 1) for line in marked] == [False, True]
 

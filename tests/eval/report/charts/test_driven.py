@@ -124,14 +124,14 @@ def with_steps(folder: Path, rows: pd.DataFrame) -> None:
 def test_the_figure_is_of_the_stored_steps_of_its_map(tmp_path: Path) -> None:
     rows = episodes({0: [True] * 3, 1: [True, False, True]})
     folder = run_folder(tmp_path / "run", rows)
-    assert read_driven(folder) is None
+    assert read_driven(folder, rows) is None
     with_steps(folder, rows)
-    assert read_driven(folder) is None
+    assert read_driven(folder, rows) is None
     ground().save(folder / GROUND)
-    ((name, caption, figure),) = write._driven(folder)
+    ((name, caption, figure),) = write._driven(folder, rows)
     assert name == "driven"
     assert "std 1, seed 0, realisation 0: of all maps" in caption
-    _, own, tracks = read_driven(folder) or ((), (), ())
+    _, own, tracks = read_driven(folder, rows) or ((), (), ())
     assert own["map"].tolist() == [1, 1, 1]
     for place, positions in enumerate(tracks):
         np.testing.assert_allclose(positions, track(place) + 1)
@@ -148,9 +148,9 @@ def test_the_paths_are_those_of_the_maps_own_noise(seed: int, realisation: int, 
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground(about={**ground().about, "seed": seed, "realisation": realisation}).save(folder / GROUND)
-    ((_, caption, _),) = write._driven(folder)
+    ((_, caption, _),) = write._driven(folder, rows)
     assert f"std 1, seed {seed}, realisation {realisation}:" in caption
-    _, own, tracks = read_driven(folder) or ((), (), ())
+    _, own, tracks = read_driven(folder, rows) or ((), (), ())
     assert own["risk"].tolist() == list(RISKS)
     assert set(zip(own["seed"], own["realisation"], own["map"], strict=True)) == {(seed, realisation, 1)}
     for place, positions in enumerate(tracks):
@@ -167,7 +167,7 @@ def test_more_conditions_than_can_be_distinguished_are_left_out_and_counted(tmp_
     folder = run_folder(tmp_path / "run", rows)
     with_steps(folder, rows)
     ground().save(folder / GROUND)
-    ((_, caption, figure),) = write._driven(folder)
+    ((_, caption, figure),) = write._driven(folder, rows)
     assert f"on no map did outcomes differ. {most} of {most + 2} conditions." in caption
     assert len(figure.axes[0].lines) >= most
 

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from benchnav.eval.report.charts.maps import failure_figure
-from benchnav.eval.report.failure_choice import FailedLine, choose_failures
+from benchnav.eval.report.failures import FailedLine, choose_failures
 from tests.eval.report import made
 
 GENERATOR = np.random.default_rng(0)

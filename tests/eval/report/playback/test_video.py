@@ -10,8 +10,15 @@ import pytest
 from benchnav.core.errors import ConfigError
 from benchnav.core.figures import bytes_of
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.frames import ROBOT, Frames
-from benchnav.eval.report.playback.video import FRAMES_A_SECOND, HOLD_S, SPEED, frame_times, write_video
+from benchnav.eval.report.playback.video import (
+    FRAMES_A_SECOND,
+    HOLD_S,
+    ROBOT,
+    SPEED,
+    Frames,
+    frame_times,
+    write_video,
+)
 from tests.eval.report import made
 
 
