@@ -203,16 +203,12 @@ def _results(row: Mapping[Any, Any]) -> dict[str, str]:
     }
 
 
-def _times(middle: float, *others: float) -> str:
-    """Milliseconds by two digits that count; earlier versions did not measure the others."""
-    if np.isnan(middle):
+def _times(*values: float) -> str:
+    """Milliseconds by two digits that count, all but the first in brackets."""
+    if np.isnan(values[0]):
         return NOT_USED
-    first, *rest = (
-        np.format_float_positional(value, 2, fractional=False, trim="-")
-        for value in (middle, *others)
-        if not np.isnan(value)
-    )
-    return f"{first} ({', '.join(rest)})" if rest else first
+    first, *rest = (np.format_float_positional(value, 2, fractional=False, trim="-") for value in values)
+    return f"{first} ({', '.join(rest)})"
 
 
 def _notes(summary: pd.DataFrame, conditions: Mapping[str, Mapping[str, Any]]) -> tuple[list[str], list[str]]:
