@@ -20,23 +20,19 @@ from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem, Task, pose_problem
-from benchnav.testing.breaches import NOTHING, Breaches, same
-
-SHAPES = ((24, 24), (20, 33))
-TOLERANCE = 1e-3
+from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
 _RESOLUTION_M = 0.5
 _STEPS = 3
-_SEED = 20240229
 
 
 def check_planner(
     planner: Any,
     robots: Sequence[Any] | None = None,
     objective: Any = None,
-    shapes: Sequence[tuple[int, int]] = SHAPES,
+    shapes: Sequence[tuple[int, int]] = ((24, 24), (20, 33)),
     device: torch.device | str = "cpu",
-    tolerance: float = TOLERANCE,
+    tolerance: float = 1e-3,
 ) -> None:
     """Tries whether a planner keeps the contract, by letting it plan a few steps on four maps.
 
@@ -77,8 +73,8 @@ def check_planner(
             continue
         steered += 1
         name = given if isinstance(given, str) else type(robot).__name__
-        made_for = {"robot": robot, "goal_radius_m": rules.goal_radius_m}
-        goal = registry.take("objective", objective or GoalDistance(), **made_for)
+        goal = objective or GoalDistance()
+        goal = registry.take("objective", goal, robot=robot, goal_radius_m=rules.goal_radius_m)
         for height, width in shapes:
             breaches.place = f"{name} on {height}×{width}"
             task = Task(robot=robot, objective=goal, rules=rules)
@@ -148,7 +144,7 @@ class _Trial:
             self.expect_action(breach, *tried[0], self.begin(other), other)
 
     def begin(self, problem: Problem) -> Any:
-        generator = torch.Generator().manual_seed(_SEED)
+        generator = torch.Generator().manual_seed(SEED)
         return self.breaches.watch("init", lambda: self.planner.init(problem, generator), problem=problem)
 
     def ask(self, step: Step, plan_state: Any, problem: Problem) -> Any:
@@ -232,15 +228,13 @@ def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
 
 def _make_problem(task: Task, height: int, width: int, device: torch.device) -> Problem:
     """Poses four problems: free ground, a closed wall, a start on ground predicted 0, a wall with a gap."""
-    rows = torch.arange(height, device=device)[:, None]
-    columns = torch.arange(width, device=device)[None, :]
+    rows, columns = torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
     # Waves, so that no two cells are quite alike.
     ground = (0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)).repeat(4, 1, 1)
-    wall = (rows == height // 2) | (rows == height // 2 + 1)
-    gap = (columns >= width - 7) & (columns <= width - 4)
-    ground[1].masked_fill_(wall, 0.1)
+    wall = slice(height // 2, height // 2 + 2)
+    ground[1, wall] = 0.1
     ground[2, :5, :5] = 0
-    ground[3].masked_fill_(wall & ~gap, 0)
+    ground[3, wall, : width - 7] = ground[3, wall, width - 3 :] = 0
     elevation = (0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)).repeat(4, 1, 1)
     rgb = (255 * ground).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
     means = torch.stack((ground - 0.05, ground + 0.05), dim=1)

@@ -71,7 +71,6 @@ class Fused(Generic[R]):
         try:
             result = self._call(args, signature)
         except (torch._dynamo.exc.TorchDynamoException, torch._dynamo.exc.FailOnRecompileLimitHit) as error:
-            self._seen.discard(signature)
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
             print(f"benchnav: running uncompiled, several times slower: {reason}", file=sys.stderr)
@@ -89,7 +88,9 @@ class Fused(Generic[R]):
             except torch._dynamo.exc.FailOnRecompileLimitHit:
                 pass  # what it was compiled for has changed in what the signature does not tell
         with _compiling(checked=not all(_is_ours(arg) for arg in args)):
-            self._mark(args)
+            for place in self._batched:
+                if len(args[place]) > 1:  # the number of episodes may be any, but one
+                    torch._dynamo.maybe_mark_dynamic(args[place], 0)
             return self._fused(*args)
 
     def _signature(self, args: tuple[object, ...]) -> tuple[object, ...]:
@@ -106,12 +107,6 @@ class Fused(Generic[R]):
             else:
                 found.append(_key(arg))
         return tuple(found)
-
-    def _mark(self, args: tuple[Any, ...]) -> None:
-        """Lets the number of episodes be any, but one."""
-        for place in self._batched:
-            if len(args[place]) > 1:
-                torch._dynamo.maybe_mark_dynamic(args[place], 0)
 
 
 @contextmanager

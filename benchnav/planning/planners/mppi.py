@@ -26,7 +26,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
@@ -75,25 +76,23 @@ class MPPIConfig:
         """Refuses settings that sample nothing."""
         above = "horizon_s", "samples", "noise_share", "temperature_share", "temperature"
         check_finite("MPPI", self, above, ("control_cost",))
-        if self.noise is not None and not (self.noise and all(0 < scale < math.inf for scale in self.noise)):
-            raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
+        fits = self.noise is None or (self.noise and all(0 < scale < math.inf for scale in self.noise))
+        expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
 
 
 @dataclass(frozen=True)
-class MPPIState:
+class MPPIState(Batch):
     """What MPPI carries from step to step.
 
     Args:
         problem: what is being solved.
         mean: mean action sequence, shape [B, T, A].
-        scale: standard deviation of each action's noise, shape [A].
-        noise: of all steps.
+        noise: of all steps, the same for each episode.
         step: steps planned so far.
     """
 
     problem: Problem
     mean: Tensor
-    scale: Tensor
     noise: NoiseBank
     step: int
 
@@ -127,17 +126,16 @@ class MPPI(LocalPlanner[MPPIState]):
             ConfigError: the robot has another number of actions than there are noise scales.
         """
         names, config = problem.robot.action_names, self.config
-        if config.noise is not None and len(names) != len(config.noise):
-            raise ConfigError(
-                f"Expected option `noise` of MPPI with {len(names)} values, for {', '.join(names)}, "
-                f"got {config.noise}."
-            )
+        expect(
+            config.noise is None or len(names) == len(config.noise),
+            f"option `noise` of MPPI with {len(names)} values, for {', '.join(names)}, got {config.noise}.",
+        )
         seed = int(torch.randint(2**62, (), generator=generator))
         low, high = problem.action_bounds
         horizon = steps_in(config.horizon_s, problem.dt_s)
         mean = problem.start.new_zeros(len(problem), horizon, len(names))
         scale = config.noise_share * (high - low) if config.noise is None else low.new_tensor(config.noise)
-        return MPPIState(problem, mean, scale, draw_bank(seed, horizon, config.samples, scale), 0)
+        return MPPIState(problem, mean, draw_bank(seed, horizon, config.samples, scale), 0)
 
     def plan_toward(
         self, step: Step, plan_state: MPPIState, target_m: Tensor
@@ -147,7 +145,7 @@ class MPPI(LocalPlanner[MPPIState]):
         noise = plan_state.noise.at(plan_state.step)
         states, cost = roll_out(problem, step.state, mean, noise, target_m, self._advance)
         if config.control_cost:
-            cost = cost + config.control_cost * control_cost(mean, noise, plan_state.scale)
+            cost = cost + config.control_cost * control_cost(mean, noise, plan_state.noise.scale)
         weights, updated = self._weigh(
             states, cost, mean, noise, *problem.action_bounds, problem.padded_ground,
             target_m[:, None].contiguous(), problem.grid, problem.objective,
@@ -157,10 +155,6 @@ class MPPI(LocalPlanner[MPPIState]):
         layers = _drawn(problem, step.state, updated, mean, noise, weights) if step.draw else {}
         plan = Plan.empty(len(problem), step.state.device, **layers)
         return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
-
-    def select(self, plan_state: MPPIState, members: Tensor) -> MPPIState:
-        """Keeps some episodes; see `Planner`."""
-        return replace(plan_state, problem=plan_state.problem.select(members), mean=plan_state.mean[members])
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:

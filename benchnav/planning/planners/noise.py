@@ -24,12 +24,14 @@ class NoiseBank:
     """Normal numbers, and where each step reads them.
 
     Args:
-        values: scaled for each action, shape [A, T, N].
+        scale: standard deviation of each action's noise, shape [A].
+        values: so scaled, shape [A, T, N].
         place: where the runs of step 0 begin in their parts, int64, shape [T, A].
         stride: how far they move on from step to step, int64, shape [T, A].
         samples: K, the length of a run.
     """
 
+    scale: Tensor
     values: Tensor
     place: Tensor
     stride: Tensor
@@ -63,4 +65,4 @@ def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank
     values = torch.randn((actions, horizon, numbers), generator=generator, dtype=scale.dtype).to(scale.device)
     places, shape = numbers - samples + 1, (horizon, actions)
     place, stride = (torch.randint(places, shape, generator=generator).to(scale.device) for _ in range(2))
-    return NoiseBank(values=values * scale[:, None, None], place=place, stride=stride, samples=samples)
+    return NoiseBank(scale, values * scale[:, None, None], place, stride, samples)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import map_tensors
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop, draw_references, drive
@@ -22,7 +23,6 @@ from benchnav.planning.planners.cl_rrt.tree import (
     stand,
 )
 from benchnav.planning.planners.planner import PlanStatus
-from benchnav.planning.problem import map_tensors
 from tests.planning.planners.cl_rrt.maps import known, make_loop, open_map, walled_map
 
 GAP = slice(24, 28)
@@ -57,7 +57,7 @@ def tensors(value: object) -> list[Tensor]:
         found.append(tensor)
         return tensor
 
-    map_tensors(keep, value)
+    map_tensors(value, keep)
     return found
 
 
