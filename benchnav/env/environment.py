@@ -218,7 +218,10 @@ class EnvBatch:
         rules = Rules(goal_radius_m=goal_radius_m)
         self._task = Task(robot=made, objective=self._objective or GoalDistance(), rules=rules)
         dataset = TerrainDataset(find_dataset(data))
-        split = split or _default_split(dataset)
+        if not split:
+            split = "train" if "train" in dataset.splits else next(iter(dataset.splits))
+            if split != "train":
+                gymnasium.logger.warn(f"{dataset.path} has no split 'train'; its split {split!r} is taken.")
         self._maps = dataset.terrain(split)
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
@@ -248,7 +251,20 @@ class EnvBatch:
             drawn = generators[i].integers(len(self._maps))
             self._map[i] = drawn if map_index is None else map_index
             self._noise_seed[i] = generators[i].integers(2**48)
-        fresh, start = self._begin(members)
+        maps = torch.from_numpy(self._map[members])
+        # What is made under inference mode could not be changed in place outside of it.
+        with torch.inference_mode(False):
+            places = self._places.select(maps)
+            fresh = Simulation(
+                self._maps.select(maps),
+                self._task,
+                self._world,
+                places,
+                rng.stream_key(0, "environment"),
+                self._noise_seed[members].tolist(),
+            )
+            pose = heading_to(places.start_m, places.goal_m)
+            start = fresh.init(self._task.robot.initial_state(pose))
         if self._simulation is None or self._now is None or len(members) == len(chosen):
             self._simulation, self._now = fresh, start
             return
@@ -309,23 +325,6 @@ class EnvBatch:
         }
         return seen, info
 
-    def _begin(self, members: np.ndarray) -> tuple[Simulation, SimulationState]:
-        """A simulation of some sub-environments alone, and its start."""
-        maps = torch.from_numpy(self._map[members])
-        # What is made under inference mode could not be changed in place outside of it.
-        with torch.inference_mode(False):
-            places = self._places.select(maps)
-            simulation = Simulation(
-                self._maps.select(maps),
-                self._task,
-                self._world,
-                places,
-                rng.stream_key(0, "environment"),
-                self._noise_seed[members].tolist(),
-            )
-            pose = heading_to(places.start_m, places.goal_m)
-            return simulation, simulation.init(self._task.robot.initial_state(pose))
-
     def _reward(self, before: SimulationState, now: SimulationState, action: Tensor, met: Tensor) -> Tensor:
         """Progress less time, and a prize or fine at the end; or minus J's stage cost; shape [B]."""
         simulation, _ = self._current()
@@ -366,11 +365,3 @@ class EnvBatch:
 def _lost(outcome: Tensor) -> Tensor:
     """Off the map, or held by the ground for good: no later step could mend it."""
     return (outcome == Outcome.OUT_OF_BOUNDS) | (outcome == Outcome.IMMOBILISED)
-
-
-def _default_split(dataset: TerrainDataset) -> str:
-    if "train" in dataset.splits:
-        return "train"
-    first = next(iter(dataset.splits))
-    gymnasium.logger.warn(f"{dataset.path} has no split 'train'; its split {first!r} is taken.")
-    return first

@@ -79,11 +79,14 @@ class Breaches:
         answer = self.watch(what, lambda: act(**given), **given)
         if answer is NOTHING or not is_of_use(answer):
             return NOTHING
-        again = f"Expected the same from `{what}` when asked again, got another."
-        self.expect(same(act(**given), answer), again)
+        self.expect(
+            same(act(**given), answer), f"Expected the same from `{what}` when asked again, got another."
+        )
         alone = self.watch(what, lambda: act(**{name: _last(value) for name, value in given.items()}))
-        breach = f"Expected the same from `{what}` for one alone and in a batch, got another."
-        self.expect(same(alone, _last(answer), tolerance), breach)
+        self.expect(
+            same(alone, _last(answer), tolerance),
+            f"Expected the same from `{what}` for one alone and in a batch, got another.",
+        )
         return answer
 
     def watch(self, what: str, act: Callable[[], Any], **given: Any) -> Any:

@@ -42,12 +42,14 @@ def check_robot(robot: Any, device: torch.device | str = "cpu", stands_at_zero: 
         breaches.expect(0 < value < math.inf, f"Expected `{name}` > 0 and finite, got {value}.")
     low, high, rates, count = made.action_low, made.action_high, made.action_rates, len(made.action_names)
     ordered = all(-math.inf < least < most < math.inf for least, most in zip(low, high, strict=False))
-    bounded = ordered and len(low) == len(high) == count
     breaches.expect(
-        bounded, f"Expected finite bounds, low under high, of {count} actions, got {low} and {high}."
+        ordered and len(low) == len(high) == count,
+        f"Expected finite bounds, low under high, of {count} actions, got {low} and {high}.",
     )
-    limited = rates is None or (len(rates) == count and min(rates) > 0)
-    breaches.expect(limited, f"Expected `action_rates` > 0 of {count} actions, got {rates}.")
+    breaches.expect(
+        rates is None or (len(rates) == count and min(rates) > 0),
+        f"Expected `action_rates` > 0 of {count} actions, got {rates}.",
+    )
     breaches.refuse()
     for draws in breaches.batches(device):
         _drive(made, draws, stands_at_zero, breaches)
@@ -58,9 +60,10 @@ def _drive(robot: Robot, draws: Draws, stands_at_zero: bool, breaches: Breaches)
     expect = breaches.expect
     pose = draws.uniform((0, 0, -3), (9, 9, 3)).reshape(-1, 3)
     state = breaches.watch("initial_state", lambda: robot.initial_state(pose), pose=pose)
-    begins = isinstance(state, Tensor) and same(state[..., :3], pose)
-    breach = f"Expected initial states in {pose.dtype} that begin with the pose (x, y, θ), got others."
-    if not expect(begins, breach):
+    if not expect(
+        isinstance(state, Tensor) and same(state[..., :3], pose),
+        f"Expected initial states in {pose.dtype} that begin with the pose (x, y, θ), got others.",
+    ):
         return
     state = state.reshape(*draws.leading, -1)
     for _ in range(3):

@@ -79,19 +79,25 @@ def _is_sound(
     expect = breaches.expect
     values = {"weights": mixture.weights, "means": mixture.means, "stds": mixture.stds}
     for value in values.values():
-        breach = f"Expected parameters on the observation's device {device}, got {value.device}."
-        if not expect(value.device == device, breach):
+        if not expect(
+            value.device == device,
+            f"Expected parameters on the observation's device {device}, got {value.device}.",
+        ):
             return False
     dtypes = sorted({str(value.dtype) for value in values.values()})
-    is_float = len(dtypes) == 1 and mixture.weights.is_floating_point()
-    expect(is_float, f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.")
+    expect(
+        len(dtypes) == 1 and mixture.weights.is_floating_point(),
+        f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.",
+    )
     for name, value in values.items():
         expect(bool(value.isfinite().all()), f"Expected finite `{name}`, got some that are not.")
         below = name != "means" and bool((value < 0).any())
         expect(not below, f"Expected `{name}` ≥ 0, got some below.")
     sums = mixture.weights.double().sum(1)
-    is_whole = same(sums, torch.ones_like(sums), tolerance)
-    expect(is_whole, "Expected `weights` that sum to 1 over the components, got other sums.")
+    expect(
+        same(sums, torch.ones_like(sums), tolerance),
+        "Expected `weights` that sum to 1 over the components, got other sums.",
+    )
     return True
 
 

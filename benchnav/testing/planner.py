@@ -119,29 +119,30 @@ class _Trial:
             moved = problem.robot(step.state, action.clamp(*problem.action_bounds), observed)
             step = replace(step, state=moved, traversability=observed)
         again = "Expected the same action from a generator of the same seed, got another."
-        following = self.expect_action(again, *tried[0], self.begin(problem), problem)
-        alone, plan_state = problem.select(last), self.begin(problem.select(last))
-        for step, action in tried[:_STEPS]:
-            breach = "Expected for an episode alone the action that it got in a batch, got another."
-            plan_state = self.expect_action(breach, step.select(last), action[last], plan_state, alone, False)
+        following = self.expect_action(again, tried[0], self.begin(problem), problem)
+        plan_state = self.begin(problem.select(last))
+        for answered in tried[:_STEPS]:
+            alone = "Expected for an episode alone the action that it got in a batch, got another."
+            plan_state = self.expect_action(alone, answered, plan_state, problem, last)
         act = partial(self.planner.select, following, two)
         kept = NOTHING if following is NOTHING else self.breaches.watch("select", act, plan_state=following)
         if kept is not NotImplemented:
-            breach = (
+            among = (
                 "Expected of episodes that `select` keeps the actions that they got among all, got others."
             )
-            step, action = tried[1]
-            self.expect_action(breach, step.select(two), action[two], kept, problem.select(two), False)
+            self.expect_action(among, tried[1], kept, problem, two)
         self.begin(_with_other_prediction(problem.select(two)))
         self.expect_action(
             "Expected the first step's action to be the same after other steps and problems, got another. "
             "Keep what evolves in the plan state, not on the planner.",
-            *(*tried[0], first, problem),
+            tried[0],
+            first,
+            problem,
         )
         if self.planner.blind:
-            breach = "Expected of a `blind` planner the same action whatever is predicted, got another."
+            blind = "Expected of a `blind` planner the same action whatever is predicted, got another."
             other = _with_other_prediction(problem)
-            self.expect_action(breach, *tried[0], self.begin(other), other)
+            self.expect_action(blind, tried[0], self.begin(other), other)
 
     def begin(self, problem: Problem) -> Any:
         generator = torch.Generator().manual_seed(SEED)
@@ -157,16 +158,25 @@ class _Trial:
         return answer if self.breaches.expect(not fault, fault) else NOTHING
 
     def expect_action(
-        self, breach: str, step: Step, action: Tensor, plan_state: Any, problem: Problem, exact: bool = True
+        self,
+        breach: str,
+        answered: tuple[Step, Tensor],
+        plan_state: Any,
+        problem: Problem,
+        members: Tensor | None = None,
     ) -> Any:
-        """Expects an action, exactly or nearly; gives the next plan state, if any."""
+        """Expects an action at a step, exactly, or nearly of some members; gives the next plan state, if any."""
+        step, action = answered
+        if members is not None:
+            step, action, problem = step.select(members), action[members], problem.select(members)
         answer = self.ask(step, plan_state, problem)
         if answer is NOTHING:
             self.breaches.expect(plan_state is NOTHING, breach)
             return NOTHING
         low, high = problem.action_bounds
         near = (answer[0] - action).abs() <= self.tolerance * (high - low)
-        self.breaches.expect(same(answer[0], action) or (not exact and bool(near.all())), breach)
+        is_kept = same(answer[0], action) or (members is not None and bool(near.all()))
+        self.breaches.expect(is_kept, breach)
         return answer[1]
 
     def ask_again(self, step: Step, plan_state: Any, action: Tensor) -> None:
@@ -187,10 +197,14 @@ class _Trial:
         watch, expect, task = self.breaches.watch, self.breaches.expect, self.problem.task
         follows = watch("follows", lambda: self.planner.follows(task))
         remarks = watch("remarks", lambda: self.planner.remarks(task))
-        is_line = follows is NOTHING or _are_lines((follows,))
-        expect(is_line, "Expected `follows` to give a single line, got something else.")
-        are_lines = remarks is NOTHING or _are_lines(remarks)
-        expect(are_lines, "Expected `remarks` to give a tuple of single lines, got something else.")
+        expect(
+            follows is NOTHING or _are_lines((follows,)),
+            "Expected `follows` to give a single line, got something else.",
+        )
+        expect(
+            remarks is NOTHING or _are_lines(remarks),
+            "Expected `remarks` to give a tuple of single lines, got something else.",
+        )
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:
         """Tells what is wrong with an answer of the right form; ended episodes may get any action."""

@@ -59,14 +59,12 @@ class Fused(Generic[R]):
 
     def __call__(self, *args: Any) -> R:
         """Calls the function."""
-        if self.compiled is None:
-            worth = worth_compiling(self._rollouts, self._least, args[0].device)
-            if torch._dynamo.config.disable or not worth:
-                self.compiled = False
+        if self.compiled is None and (
+            torch._dynamo.config.disable or not worth_compiling(self._rollouts, self._least, args[0].device)
+        ):
+            self.compiled = False
         if self.compiled is False:
             return self._function(*args)
-        if self._fused is None:
-            self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
         signature = self._signature(args)
         try:
             result = self._call(args, signature)
@@ -81,7 +79,8 @@ class Fused(Generic[R]):
 
     def _call(self, args: tuple[Any, ...], signature: tuple[object, ...]) -> R:
         """Runs what is compiled, for a new signature under the settings of compiling."""
-        assert self._fused is not None
+        if self._fused is None:
+            self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
         if signature in self._seen:
             try:
                 return self._fused(*args)

@@ -152,7 +152,7 @@ def draw_frozen(
     Raises:
         ConfigError: the correlation is too long for the maps, or no field of some episode joins its start and goal.
     """
-    grid = terrain.grid
+    grid, cells = terrain.grid, world.correlation_m / terrain.grid.resolution_m
     longest = LONGEST_CORRELATION * min(grid.extent_m)
     expect(
         world.correlation_m <= longest,
@@ -163,10 +163,11 @@ def draw_frozen(
     attempts = torch.zeros(len(terrain), dtype=torch.int64, device=field.device)
     pending = torch.arange(len(terrain), device=field.device)
     for attempt in range(MOST_ATTEMPTS):
-        keys = [rng.stream_key(key, int(maps[i]), "field", attempt) for i in pending.tolist()]
-        cells = world.correlation_m / grid.resolution_m
-        normal = np.concatenate([correlated_normal(one, _FIRST, grid.shape, cells) for one in keys])
-        drawn = terrain.truth.select(pending).from_normal(torch.from_numpy(normal).to(field))
+        normals = [
+            correlated_normal(rng.stream_key(key, int(maps[i]), "field", attempt), _FIRST, grid.shape, cells)
+            for i in pending.tolist()
+        ]
+        drawn = terrain.truth.select(pending).from_normal(torch.from_numpy(np.concatenate(normals)).to(field))
         field[pending] = drawn
         attempts[pending] += 1
         if world.immobile is None:

@@ -74,8 +74,7 @@ class Simulation:
         self.time_budget_s = world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
         self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
         self._grid, self._goal_m, self._goal_radius_m = terrain.grid, places.goal_m, task.rules.goal_radius_m
-        most = int(self.steps.max())
-        self._realisation = Realisation(terrain, world, places, most, noise_key, maps)
+        self._realisation = Realisation(terrain, world, places, int(self.steps.max()), noise_key, maps)
         # Which `exchange_` changes in place.
         self.field, self.attempts = self._realisation.field, self._realisation.attempts
         self._immobile = world.immobile

@@ -8,8 +8,7 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.planners import mppi
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
-from benchnav.planning.planners.noise import NoiseBank
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, NoiseBank
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle

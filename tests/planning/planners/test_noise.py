@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from benchnav.planning.planners.noise import NoiseBank, draw_bank
+from benchnav.planning.planners.mppi import NoiseBank, draw_bank
 
 SCALE = torch.tensor([0.2, 0.7])
 

@@ -81,8 +81,7 @@ class Tree(Choice, Edges):
     @property
     def best(self) -> tuple[Tensor, Tensor]:
         """What the best way to the goal costs, inf where none is known, and its node, each of shape [B]."""
-        cost, node = torch.where(self.arrived, self.cost, math.inf).min(dim=1)
-        return cost, node
+        return torch.where(self.arrived, self.cost, math.inf).min(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -150,7 +150,7 @@ def test_a_way_costs_its_time_and_the_penalty_of_metres_that_are_not_free() -> N
     )
     torch.testing.assert_close(tree.blocked_m[0], torch.tensor([0.0, 0.0, 1.0, 1.0]), rtol=0, atol=0.1)
     torch.testing.assert_close(tree.cost, tree.time_s + PENALTY * tree.blocked_m)
-    torch.testing.assert_close(tree.best_cost, tree.cost[:, 3])
+    torch.testing.assert_close(tree.best[0], tree.cost[:, 3])
 
 
 def test_cheapest_way_is_taken_and_one_that_crosses_is_partial() -> None:
