@@ -14,7 +14,7 @@ from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import Robot, Unicycle
-from benchnav.planning.world.places import Places
+from benchnav.planning.world.world import Places
 
 GRID = Grid(16, 16, 0.5)
 

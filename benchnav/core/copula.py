@@ -12,7 +12,6 @@ import numpy as np
 from numpy import ndarray
 
 from benchnav.core import rng
-from benchnav.core.errors import expect
 
 LONGEST_CORRELATION = 1 / 4  # of a map's shorter side, so that the torus it is made on does not show
 
@@ -27,20 +26,12 @@ def correlated_normal(
         indices: elements of the stream, shape [B].
         shape: (H, W).
         correlation_cells: ℓ in cells: two cells at distance d have the correlation exp(−d²/2ℓ²); at 0
-            every cell is for itself.
+            every cell is for itself, and callers keep it to `LONGEST_CORRELATION`.
 
     Returns:
         Float64, shape [B, H, W].
-
-    Raises:
-        ConfigError: ℓ is out of range.
     """
     height, width = shape
-    expect(
-        0 <= correlation_cells <= LONGEST_CORRELATION * min(shape),
-        "a correlation length of at most a quarter of the map's shorter side, "
-        f"{LONGEST_CORRELATION * min(shape):g} cells, got {correlation_cells:g} cells.",
-    )
     white = rng.normal(key, indices, (2 * height, 2 * width))
     if correlation_cells == 0:
         return white[:, :height, :width].copy()

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from benchnav.core.errors import BenchnavError, ConfigError
+from benchnav.core.errors import BenchnavError, expect
 
 CPU = torch.device("cpu")
 
@@ -35,11 +35,11 @@ def find_device(name: str) -> torch.device:
     Raises:
         ConfigError: there is no such device here.
     """
-    if name not in ("auto", "cpu", "cuda"):
-        raise ConfigError(f"Expected `device` among auto, cpu, cuda, got {name!r}.")
+    expect(name in ("auto", "cpu", "cuda"), f"`device` among auto, cpu, cuda, got {name!r}.")
     has_gpu = torch.cuda.is_available()
-    if name == "cuda" and not has_gpu:
-        raise ConfigError("Expected a GPU for `device` cuda, got none that PyTorch can use. Use cpu or auto.")
+    expect(
+        has_gpu or name != "cuda", "a GPU for `device` cuda, got none that PyTorch can use. Use cpu or auto."
+    )
     return torch.device("cuda" if has_gpu and name != "cpu" else "cpu")
 
 
@@ -52,8 +52,10 @@ def device_of_run(about: Mapping[str, Any]) -> torch.device:
     Raises:
         ConfigError: there is no such device here.
     """
-    if about["device"] == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("Expected a GPU, on which this run was computed, got none that PyTorch can use.")
+    expect(
+        about["device"] != "cuda" or torch.cuda.is_available(),
+        "a GPU, on which this run was computed, got none that PyTorch can use.",
+    )
     return find_device(about["device"])
 
 

@@ -68,15 +68,15 @@ class Grid:
         """Frames maps with one cell of the value that holds off the map, for `lookup`.
 
         Args:
-            maps: shape [B, H, W].
+            maps: shape [*B, H, W].
             outside: the value off the map.
 
         Returns:
-            Shape [B, (H + 2)·(W + 2)].
+            Shape [*B, (H + 2)·(W + 2)].
         """
         import torch
 
-        return torch.nn.functional.pad(maps, (1, 1, 1, 1), value=outside).flatten(1)
+        return torch.nn.functional.pad(maps, (1, 1, 1, 1), value=outside).flatten(-2)
 
     def lookup(self, padded: "Tensor", x_m: "Tensor", y_m: "Tensor") -> "Tensor":
         """Reads each member's map at positions; one that is not a number reads as off the map.

@@ -50,11 +50,8 @@ def cost_to_go(edge_costs: ndarray, goals: ndarray, shape: tuple[int, int]) -> t
     # Searching backward from the goals, so the edges are turned round: rows are their targets.
     source, target, _ = neighbour_pairs(*shape)
     offset = cells * np.arange(batch)[:, None]
-    ends = np.cumsum(np.bincount(target, minlength=cells))
-    rows = np.concatenate([[0], (len(source) * np.arange(batch)[:, None] + ends).ravel()])
-    graph = csr_array(
-        (edge_costs.ravel(), (source + offset).ravel(), rows), shape=(batch * cells, batch * cells)
-    )
+    ends = (target + offset).ravel(), (source + offset).ravel()
+    graph = csr_array((edge_costs.ravel(), ends), shape=(batch * cells, batch * cells))
     # The finite limit keeps infinite edges from being taken.
     limit = np.finfo(np.float64).max
     cost, previous, _ = dijkstra(graph, indices=starts, min_only=True, return_predecessors=True, limit=limit)

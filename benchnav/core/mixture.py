@@ -17,17 +17,15 @@ dimensions.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.cvar import Cells, added, conditional_value_at_risk, mean, value_at_risk
 from benchnav.core.errors import ConfigError
-
-Value = TypeVar("Value", bound=Any)
 
 _SMALLEST_STD = 1e-9
 _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
@@ -40,7 +38,7 @@ _NUMBERS_ON_A_GPU = 2**24  # where few large pieces are quicker than many small 
 
 
 @dataclass(frozen=True)
-class TraversabilityMixture:
+class TraversabilityMixture(Batch):
     """A Gaussian mixture clipped to [0, 1] in each cell of a map.
 
     Args:
@@ -156,10 +154,6 @@ class TraversabilityMixture:
             return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
         return self._in_pieces(value_at_risk, _probability(normal.double()))
 
-    def select(self, members: Tensor) -> "TraversabilityMixture":
-        """Keeps some maps of the first dimension, by index, shape [M]."""
-        return map_tensors(self, lambda values: values[members])
-
     def at(self, cells: Tensor) -> "TraversabilityMixture":
         """Keeps some cells as a map of one row, [K, 1, N].
 
@@ -167,10 +161,6 @@ class TraversabilityMixture:
             cells: which of them, bool, shape [B, H, W].
         """
         return map_tensors(self, lambda values: values.movedim(1, 0)[:, cells].unsqueeze(1))
-
-    def to(self, device: torch.device | str) -> "TraversabilityMixture":
-        """The mixture on a device."""
-        return map_tensors(self, lambda values: values.to(device))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1); log probability mass at 0 and at 1; −∞ elsewhere.
@@ -281,17 +271,6 @@ def component_log_prob(
     density = -0.5 * z**2 - stds.log() - 0.5 * math.log(2 * math.pi)
     mass = log_ndtr(torch.where(value <= 0, -means, means - 1) / stds)
     return torch.where((value <= 0) | (value >= 1), mass, density)
-
-
-def map_tensors(item: Value, change: Callable[[Tensor], Tensor]) -> Value:
-    """Gives a dataclass in which each tensor is changed, also those of dataclasses in it."""
-    changed: dict[str, Any] = {}
-    for name, value in vars(item).items():
-        if isinstance(value, Tensor):
-            changed[name] = change(value)
-        elif is_dataclass(value):
-            changed[name] = map_tensors(value, change)
-    return replace(item, **changed)
 
 
 def _harmonic_mean(cells: Cells, floor: float) -> Tensor:

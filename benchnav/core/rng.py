@@ -75,12 +75,12 @@ def permutation(key: int, indices: ndarray, n: int) -> ndarray:
     return np.argsort(uniform(key, indices, (n,)), axis=1, kind="stable")
 
 
-def generator(key: int, device: "torch.device | str" = "cpu") -> "torch.Generator":
-    """Makes a PyTorch generator for the stream `key` on `device`, for bulk draws of planners.
+def generator(key: int) -> "torch.Generator":
+    """Makes a PyTorch generator for the stream `key` on the CPU, for bulk draws of planners.
 
     PyTorch's generator on the CPU keeps the low 32 bits of a seed: hash a key for every draw, as
     `stream_key` does, rather than count on from one.
     """
     import torch
 
-    return torch.Generator(device=device).manual_seed(key % 2**63)
+    return torch.Generator().manual_seed(key % 2**63)

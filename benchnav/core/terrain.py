@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture, map_tensors
+from benchnav.core.mixture import TraversabilityMixture
 
 
 @dataclass(frozen=True)
-class Observation:
+class Observation(Batch):
     """The paper's o: all that a traversability model may see.
 
     Args:
@@ -42,7 +43,7 @@ class Observation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Terrain:
+class Terrain(Batch):
     """The ground as it is. Only the simulation and the `oracle` model are given this.
 
     Args:
@@ -84,14 +85,6 @@ class Terrain:
     def __len__(self) -> int:
         """Number of maps B."""
         return self.rgb.shape[0]
-
-    def select(self, members: Tensor) -> "Terrain":
-        """Keeps some maps, by index, shape [M]; a map may be taken more than once."""
-        return map_tensors(self, lambda layer: layer[members])
-
-    def to(self, device: torch.device | str) -> "Terrain":
-        """The maps on a device."""
-        return map_tensors(self, lambda layer: layer.to(device))
 
     def observe(self) -> Observation:
         """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 
@@ -35,10 +35,8 @@ class FreeSpace:
 
     def __post_init__(self) -> None:
         """Refuses rules that mean nothing."""
-        if self.by not in ("risk", "mean"):
-            raise ConfigError(f"Expected `free_space.by` 'risk' or 'mean', got {self.by!r}.")
-        if not 0 <= self.above < 1:
-            raise ConfigError(f"Expected `free_space.above` in [0, 1), got {self.above}.")
+        expect(self.by in ("risk", "mean"), f"`free_space.by` 'risk' or 'mean', got {self.by!r}.")
+        expect(0 <= self.above < 1, f"`free_space.above` in [0, 1), got {self.above}.")
 
     def mask(self, risk_map: Tensor, mixture: TraversabilityMixture) -> Tensor:
         """Tells which cells are free, bool [B, H, W], from λ̂ [B, H, W] and the prediction."""
@@ -61,10 +59,14 @@ class Rules:
 
     def __post_init__(self) -> None:
         """Refuses rules under which nothing moves or arrives."""
-        if not 0 < self.min_traversability <= 1:
-            raise ConfigError(f"Expected `min_traversability` in (0, 1], got {self.min_traversability}.")
-        if not 0 < self.goal_radius_m < float("inf"):
-            raise ConfigError(f"Expected `goal_radius_m` > 0 and finite, got {self.goal_radius_m}.")
+        expect(
+            0 < self.min_traversability <= 1,
+            f"`min_traversability` in (0, 1], got {self.min_traversability}.",
+        )
+        expect(
+            0 < self.goal_radius_m < float("inf"),
+            f"`goal_radius_m` > 0 and finite, got {self.goal_radius_m}.",
+        )
 
 
 def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
@@ -75,4 +77,4 @@ def cells_at_goal(grid: Grid, goal_m: Tensor, radius_m: float) -> Tensor:
     half = grid.resolution_m / 2
     beside_x = ((x - goal_m[:, :1]).abs() - half).clamp(min=0)
     beside_y = ((y - goal_m[:, 1:]).abs() - half).clamp(min=0)
-    return torch.hypot(*torch.broadcast_tensors(beside_x[:, None, :], beside_y[:, :, None])) < radius_m
+    return torch.hypot(beside_x[:, None, :], beside_y[:, :, None]) < radius_m

@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.planning.robots import Robot
 
 _WAYPOINT_M = 0.2  # a robot this near to a way-point has reached it
@@ -91,8 +91,7 @@ class TravelTime(Objective):
 
     def __post_init__(self) -> None:
         """Refuses a distance at which nothing arrives."""
-        if not self.goal_radius_m > 0:
-            raise ConfigError(f"Expected `goal_radius_m` > 0, got {self.goal_radius_m}.")
+        expect(self.goal_radius_m > 0, f"`goal_radius_m` > 0, got {self.goal_radius_m}.")
 
     def stage(self, state: Tensor, action: Tensor, traversability: Tensor, target: Tensor) -> Tensor:
         """Cost of one step; see `Objective`."""

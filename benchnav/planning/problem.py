@@ -4,23 +4,20 @@ It holds what is *predicted* alone: the truth stays with the simulation. Letters
 cells, K components, S state and A action dimensions, *K any further dimensions.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self, TypeVar
 
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import PENALTY, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
 from benchnav.planning.robots import Robot
-
-T = TypeVar("T")
 
 # Stands for a λ̂ of 0 in maps for lookups, where the sign tells whether ground is free and 0 is off the map.
 _ZERO = 1e-30
@@ -39,22 +36,6 @@ class Task:
     robot: Robot
     objective: Objective
     rules: Rules = field(default_factory=Rules)
-
-
-class Batch:
-    """The base of dataclasses whose tensors have the episodes as their first dimension."""
-
-    def select(self, members: Tensor) -> Self:
-        """Keeps some episodes, by index, int64, shape [M]."""
-        return map_tensors(lambda value: value[members], self)
-
-    def clone(self) -> Self:
-        """A copy that shares no tensor."""
-        return map_tensors(torch.clone, self)
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same on a device."""
-        return map_tensors(lambda value: value.to(device), self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +73,7 @@ class Problem(Batch):
         }
         for name, shape in expected.items():
             value = getattr(self, name)
-            if value.shape != shape:
-                raise ConfigError(f"Expected `{name}` of shape {list(shape)}, got {list(value.shape)}.")
+            expect(value.shape == shape, f"`{name}` of shape {list(shape)}, got {list(value.shape)}.")
 
     def __len__(self) -> int:
         """Number of episodes B."""
@@ -255,18 +235,3 @@ def heading_to(position_m: Tensor, goal_m: Tensor) -> Tensor:
     """Poses (x, y, θ) that look at the goal, shape [B, 3], from positions [B, 2]."""
     offset = goal_m - position_m
     return torch.cat((position_m, torch.atan2(offset[:, 1], offset[:, 0])[:, None]), dim=1)
-
-
-def map_tensors(change: Callable[..., Tensor], *values: T) -> T:
-    """Applies a function to the tensors that have one place in dataclasses of a kind, but for those of a task.
-
-    What is no tensor is the first one's.
-    """
-    changed: dict[str, Any] = {}
-    for each in fields(values[0]):  # type: ignore[arg-type]
-        items = [getattr(value, each.name) for value in values]
-        if isinstance(items[0], Tensor):
-            changed[each.name] = change(*items)
-        elif is_dataclass(items[0]) and not isinstance(items[0], Task | Grid):
-            changed[each.name] = map_tensors(change, *items)
-    return replace(values[0], **changed)  # type: ignore[type-var]

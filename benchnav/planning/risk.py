@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.core.mixture import TraversabilityMixture
 
 RiskMeasure = Callable[[TraversabilityMixture], Tensor]
@@ -63,8 +63,7 @@ def chance(mixture: TraversabilityMixture, bound: float = 0.1) -> Tensor:
         mixture: distribution a cell.
         bound: traversability in [0, 1].
     """
-    if not 0 <= bound <= 1:
-        raise ConfigError(f"Expected `bound` in [0, 1], got {bound}.")
+    expect(0 <= bound <= 1, f"`bound` in [0, 1], got {bound}.")
     return mixture.chance(bound)
 
 
@@ -93,13 +92,14 @@ def apply(measure: RiskMeasure, mixture: TraversabilityMixture) -> Tensor:
     """
     risk_map = measure(mixture)
     shape = mixture.weights.select(-3, 0).shape
-    if not isinstance(risk_map, Tensor) or risk_map.shape != shape:
-        got = list(risk_map.shape) if isinstance(risk_map, Tensor) else type(risk_map).__name__
-        raise ConfigError(f"Expected a risk measure to give λ̂ of shape {list(shape)}, got {got}.")
-    if not risk_map.is_floating_point():
-        raise ConfigError(
-            f"Expected a risk measure to give λ̂ as floating-point numbers, got {risk_map.dtype}."
-        )
-    if not bool(((risk_map >= 0) & (risk_map <= 1)).all()):
-        raise ConfigError("Expected a risk measure to give λ̂ in [0, 1], got values outside or not a number.")
+    got = list(risk_map.shape) if isinstance(risk_map, Tensor) else type(risk_map).__name__
+    expect(got == list(shape), f"a risk measure to give λ̂ of shape {list(shape)}, got {got}.")
+    expect(
+        risk_map.is_floating_point(),
+        f"a risk measure to give λ̂ as floating-point numbers, got {risk_map.dtype}.",
+    )
+    expect(
+        ((risk_map >= 0) & (risk_map <= 1)).all(),
+        "a risk measure to give λ̂ in [0, 1], got values outside or not a number.",
+    )
     return risk_map.to(mixture.weights.dtype)

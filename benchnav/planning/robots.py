@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 
 # How planners know what an action is.
 SPEED, TURN_RATE, STEERING = "speed_mps", "turn_rate_radps", "steering_rad"
@@ -86,8 +86,7 @@ class _Vehicle(Robot):
 
     def __post_init__(self) -> None:
         """Refuses a time step or a speed that allows no motion."""
-        if not self.dt_s > 0:
-            raise ConfigError(f"Expected `dt_s` > 0, got {self.dt_s}.")
+        expect(self.dt_s > 0, f"`dt_s` > 0, got {self.dt_s}.")
         _check_bounds("speed_mps", self.speed_mps)
 
     @property
@@ -112,17 +111,13 @@ class Unicycle(_Vehicle):
         turn_rate_radps: least and greatest angular velocity ω.
     """
 
+    action_names = SPEED, TURN_RATE
     turn_rate_radps: tuple[float, float] = (-1.0, 1.0)
 
     def __post_init__(self) -> None:
         """Refuses a time step or bounds that allow no motion."""
         super().__post_init__()
         _check_bounds("turn_rate_radps", self.turn_rate_radps)
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """(v, ω)."""
-        return SPEED, TURN_RATE
 
     @property
     def action_low(self) -> tuple[float, ...]:
@@ -160,11 +155,11 @@ class DifferentialDrive(Unicycle):
     def __post_init__(self) -> None:
         """Refuses a robot that cannot move."""
         super().__post_init__()
-        if not self.acceleration_mps2 > 0 or not self.turn_acceleration_radps2 > 0:
-            raise ConfigError(
-                "Expected `acceleration_mps2` and `turn_acceleration_radps2` > 0, "
-                f"got {self.acceleration_mps2} and {self.turn_acceleration_radps2}."
-            )
+        expect(
+            self.acceleration_mps2 > 0 and self.turn_acceleration_radps2 > 0,
+            "`acceleration_mps2` and `turn_acceleration_radps2` > 0, "
+            f"got {self.acceleration_mps2} and {self.turn_acceleration_radps2}.",
+        )
 
     @property
     def action_rates(self) -> tuple[float, ...]:
@@ -197,22 +192,18 @@ class Bicycle(_Vehicle):
         wheelbase_m: distance of the axles.
     """
 
+    action_names = SPEED, STEERING
     steering_rad: float = 0.6
     wheelbase_m: float = 0.5
 
     def __post_init__(self) -> None:
         """Refuses a robot that cannot move or turn."""
         super().__post_init__()
-        if not 0 < self.steering_rad < math.pi / 2 or not self.wheelbase_m > 0:
-            raise ConfigError(
-                "Expected `steering_rad` in (0, π/2) and `wheelbase_m` > 0, "
-                f"got {self.steering_rad} and {self.wheelbase_m}."
-            )
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """(v, δ)."""
-        return SPEED, STEERING
+        expect(
+            0 < self.steering_rad < math.pi / 2 and self.wheelbase_m > 0,
+            "`steering_rad` in (0, π/2) and `wheelbase_m` > 0, "
+            f"got {self.steering_rad} and {self.wheelbase_m}.",
+        )
 
     @property
     def action_low(self) -> tuple[float, ...]:
@@ -253,5 +244,4 @@ def _stack(parts: tuple[Tensor, ...]) -> Tensor:
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
-    if not bounds[0] < bounds[1]:
-        raise ConfigError(f"Expected `{name}` as (least, greatest), got {bounds}.")
+    expect(bounds[0] < bounds[1], f"`{name}` as (least, greatest), got {bounds}.")

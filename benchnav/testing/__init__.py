@@ -5,10 +5,8 @@ from benchnav.core.public_names import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "benchnav.testing.functions": ("check_objective", "check_risk", "check_robot"),
         "benchnav.testing.model": ("check_model",),
-        "benchnav.testing.objective": ("check_objective",),
         "benchnav.testing.planner": ("check_planner",),
-        "benchnav.testing.risk": ("check_risk",),
-        "benchnav.testing.robot": ("check_robot",),
     },
 )

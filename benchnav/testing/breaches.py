@@ -14,7 +14,6 @@ from benchnav.core.errors import BenchnavError, ConfigError
 from benchnav.planning.planners.boundary import find_tensor_fault
 
 SEED = 20240229
-TOLERANCE = 1e-5  # between an answer for one alone and in a batch
 NOTHING = object()  # what a call that raised has answered
 
 
@@ -39,11 +38,15 @@ class Breaches:
                 places.append(self.place)
         return kept
 
-    def expect_tensor(self, what: str, values: Any, like: Tensor, shape: tuple[int, ...]) -> bool:
-        """Expects finite numbers of a shape, in the dtype and on the device of another tensor."""
-        fault = find_tensor_fault(what, values, like.dtype, shape, like.device)
-        fits = self.expect(not fault, fault)
-        return fits and self.expect(bool(values.isfinite().all()), f"Expected finite {what}, got others.")
+    def is_tensor(self, what: str, like: Tensor, shape: tuple[int, ...]) -> Callable[[Any], bool]:
+        """Gives what expects finite numbers of a shape, in the dtype and on the device of another tensor."""
+
+        def fits(values: Any) -> bool:
+            fault = find_tensor_fault(what, values, like.dtype, shape, like.device)
+            is_finite = f"Expected finite {what}, got others."
+            return self.expect(not fault, fault) and self.expect(bool(values.isfinite().all()), is_finite)
+
+        return fits
 
     def batches(self, device: torch.device | str) -> Iterator["Draws"]:
         """Goes through the dtypes and leading dimensions to be tried, each of which is a place."""
@@ -59,7 +62,7 @@ class Breaches:
         act: Callable[..., Any],
         given: Mapping[str, Any],
         is_of_use: Callable[[Any], bool],
-        tolerance: float = TOLERANCE,
+        tolerance: float = 1e-5,
     ) -> Any:
         """Tries a pure function of a batch: twice, and for the last of the batch alone.
 
@@ -76,11 +79,14 @@ class Breaches:
         answer = self.watch(what, lambda: act(**given), **given)
         if answer is NOTHING or not is_of_use(answer):
             return NOTHING
-        again = f"Expected the same from `{what}` when asked again, got another."
-        self.expect(same(act(**given), answer), again)
+        self.expect(
+            same(act(**given), answer), f"Expected the same from `{what}` when asked again, got another."
+        )
         alone = self.watch(what, lambda: act(**{name: _last(value) for name, value in given.items()}))
-        breach = f"Expected the same from `{what}` for one alone and in a batch, got another."
-        self.expect(same(alone, _last(answer), tolerance), breach)
+        self.expect(
+            same(alone, _last(answer), tolerance),
+            f"Expected the same from `{what}` for one alone and in a batch, got another.",
+        )
         return answer
 
     def watch(self, what: str, act: Callable[[], Any], **given: Any) -> Any:
@@ -185,12 +191,10 @@ def _leaves(value: Any, name: str = "", seen: set[int] | None = None) -> Iterato
     seen.add(id(value))
     if isinstance(value, Tensor):
         yield name, value.detach().clone()
-    elif isinstance(value, np.ndarray):
-        yield name, value.tobytes()
     elif isinstance(value, torch.Generator):
         yield name, value.get_state()
-    elif isinstance(value, np.random.Generator):
-        yield name, str(value.bit_generator.state)
+    elif isinstance(value, np.ndarray | np.random.Generator):
+        yield name, pickle.dumps(value)
     else:
         parts: Mapping[Any, Any] = getattr(value, "__dict__", {})
         if isinstance(value, Mapping):

@@ -23,18 +23,15 @@ from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.predictor import load_model
 from benchnav.testing.breaches import NOTHING, Breaches, same
 
-SHAPES = ((32, 32), (20, 37))
-TOLERANCE = 1e-4
-
 _MAPS = 3
 
 
 def check_model(
     model: TraversabilityModel | str | Path | Mapping[str, Any],
-    shapes: Sequence[tuple[int, int]] = SHAPES,
+    shapes: Sequence[tuple[int, int]] = ((32, 32), (20, 37)),
     recipe: str = "tiny-v1",
     device: torch.device | str = "cpu",
-    tolerance: float = TOLERANCE,
+    tolerance: float = 1e-4,
 ) -> None:
     """Tries whether a model keeps the contract, by letting it predict one map and three.
 
@@ -61,18 +58,18 @@ def check_model(
     breaches = Breaches("model", type(made).__name__)
     for height, width in shapes:
         breaches.place = f"{height}×{width}"
-        _try(made, _make_terrain(recipe, height, width, torch.device(device)), tolerance, breaches)
+        terrain = _make_terrain(recipe, height, width, torch.device(device))
+        is_sound = partial(_is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches)
+        mixture = breaches.try_function(
+            "predict",
+            lambda observation: predict(made, observation),
+            {"observation": terrain},
+            is_sound,
+            tolerance,
+        )
+        if mixture is not NOTHING:
+            _check_classes(made, terrain, mixture, tolerance, breaches)
     breaches.refuse()
-
-
-def _try(model: TraversabilityModel, terrain: Terrain, tolerance: float, breaches: Breaches) -> None:
-    is_sound = partial(_is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches)
-    given = {"observation": terrain}
-    mixture = breaches.try_function(
-        "predict", lambda observation: predict(model, observation), given, is_sound, tolerance
-    )
-    if mixture is not NOTHING:
-        _check_classes(model, terrain, mixture, tolerance, breaches)
 
 
 def _is_sound(
@@ -82,19 +79,25 @@ def _is_sound(
     expect = breaches.expect
     values = {"weights": mixture.weights, "means": mixture.means, "stds": mixture.stds}
     for value in values.values():
-        breach = f"Expected parameters on the observation's device {device}, got {value.device}."
-        if not expect(value.device == device, breach):
+        if not expect(
+            value.device == device,
+            f"Expected parameters on the observation's device {device}, got {value.device}.",
+        ):
             return False
     dtypes = sorted({str(value.dtype) for value in values.values()})
-    is_float = len(dtypes) == 1 and mixture.weights.is_floating_point()
-    expect(is_float, f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.")
+    expect(
+        len(dtypes) == 1 and mixture.weights.is_floating_point(),
+        f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.",
+    )
     for name, value in values.items():
         expect(bool(value.isfinite().all()), f"Expected finite `{name}`, got some that are not.")
         below = name != "means" and bool((value < 0).any())
         expect(not below, f"Expected `{name}` ≥ 0, got some below.")
     sums = mixture.weights.double().sum(1)
-    is_whole = same(sums, torch.ones_like(sums), tolerance)
-    expect(is_whole, "Expected `weights` that sum to 1 over the components, got other sums.")
+    expect(
+        same(sums, torch.ones_like(sums), tolerance),
+        "Expected `weights` that sum to 1 over the components, got other sums.",
+    )
     return True
 
 
@@ -116,8 +119,10 @@ def _check_classes(
         breach = f"Expected classes in `group` under {names}, the number of `class_names`, got {max(group)}."
     if not expect(fits, breach):
         return
-    act = partial(model.member_probabilities, terrain.observe())
-    members = breaches.watch("member_probabilities", act, observation=terrain.observe())
+    seen = terrain.observe()
+    members = breaches.watch(
+        "member_probabilities", lambda: model.member_probabilities(seen), observation=seen
+    )
     if members is None or members is NOTHING:
         return
     expect(names > 0, "Expected `class_names` beside `member_probabilities`, got none.")

@@ -20,23 +20,19 @@ from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
 from benchnav.planning.problem import Problem, Task, pose_problem
-from benchnav.testing.breaches import NOTHING, Breaches, same
-
-SHAPES = ((24, 24), (20, 33))
-TOLERANCE = 1e-3
+from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
 _RESOLUTION_M = 0.5
 _STEPS = 3
-_SEED = 20240229
 
 
 def check_planner(
     planner: Any,
     robots: Sequence[Any] | None = None,
     objective: Any = None,
-    shapes: Sequence[tuple[int, int]] = SHAPES,
+    shapes: Sequence[tuple[int, int]] = ((24, 24), (20, 33)),
     device: torch.device | str = "cpu",
-    tolerance: float = TOLERANCE,
+    tolerance: float = 1e-3,
 ) -> None:
     """Tries whether a planner keeps the contract, by letting it plan a few steps on four maps.
 
@@ -77,8 +73,8 @@ def check_planner(
             continue
         steered += 1
         name = given if isinstance(given, str) else type(robot).__name__
-        made_for = {"robot": robot, "goal_radius_m": rules.goal_radius_m}
-        goal = registry.take("objective", objective or GoalDistance(), **made_for)
+        goal = objective or GoalDistance()
+        goal = registry.take("objective", goal, robot=robot, goal_radius_m=rules.goal_radius_m)
         for height, width in shapes:
             breaches.place = f"{name} on {height}×{width}"
             task = Task(robot=robot, objective=goal, rules=rules)
@@ -123,32 +119,33 @@ class _Trial:
             moved = problem.robot(step.state, action.clamp(*problem.action_bounds), observed)
             step = replace(step, state=moved, traversability=observed)
         again = "Expected the same action from a generator of the same seed, got another."
-        following = self.expect_action(again, *tried[0], self.begin(problem), problem)
-        alone, plan_state = problem.select(last), self.begin(problem.select(last))
-        for step, action in tried[:_STEPS]:
-            breach = "Expected for an episode alone the action that it got in a batch, got another."
-            plan_state = self.expect_action(breach, step.select(last), action[last], plan_state, alone, False)
+        following = self.expect_action(again, tried[0], self.begin(problem), problem)
+        plan_state = self.begin(problem.select(last))
+        for answered in tried[:_STEPS]:
+            alone = "Expected for an episode alone the action that it got in a batch, got another."
+            plan_state = self.expect_action(alone, answered, plan_state, problem, last)
         act = partial(self.planner.select, following, two)
         kept = NOTHING if following is NOTHING else self.breaches.watch("select", act, plan_state=following)
         if kept is not NotImplemented:
-            breach = (
+            among = (
                 "Expected of episodes that `select` keeps the actions that they got among all, got others."
             )
-            step, action = tried[1]
-            self.expect_action(breach, step.select(two), action[two], kept, problem.select(two), False)
+            self.expect_action(among, tried[1], kept, problem, two)
         self.begin(_with_other_prediction(problem.select(two)))
         self.expect_action(
             "Expected the first step's action to be the same after other steps and problems, got another. "
             "Keep what evolves in the plan state, not on the planner.",
-            *(*tried[0], first, problem),
+            tried[0],
+            first,
+            problem,
         )
         if self.planner.blind:
-            breach = "Expected of a `blind` planner the same action whatever is predicted, got another."
+            blind = "Expected of a `blind` planner the same action whatever is predicted, got another."
             other = _with_other_prediction(problem)
-            self.expect_action(breach, *tried[0], self.begin(other), other)
+            self.expect_action(blind, tried[0], self.begin(other), other)
 
     def begin(self, problem: Problem) -> Any:
-        generator = torch.Generator().manual_seed(_SEED)
+        generator = torch.Generator().manual_seed(SEED)
         return self.breaches.watch("init", lambda: self.planner.init(problem, generator), problem=problem)
 
     def ask(self, step: Step, plan_state: Any, problem: Problem) -> Any:
@@ -161,16 +158,25 @@ class _Trial:
         return answer if self.breaches.expect(not fault, fault) else NOTHING
 
     def expect_action(
-        self, breach: str, step: Step, action: Tensor, plan_state: Any, problem: Problem, exact: bool = True
+        self,
+        breach: str,
+        answered: tuple[Step, Tensor],
+        plan_state: Any,
+        problem: Problem,
+        members: Tensor | None = None,
     ) -> Any:
-        """Expects an action, exactly or nearly; gives the next plan state, if any."""
+        """Expects an action at a step, exactly, or nearly of some members; gives the next plan state, if any."""
+        step, action = answered
+        if members is not None:
+            step, action, problem = step.select(members), action[members], problem.select(members)
         answer = self.ask(step, plan_state, problem)
         if answer is NOTHING:
             self.breaches.expect(plan_state is NOTHING, breach)
             return NOTHING
         low, high = problem.action_bounds
         near = (answer[0] - action).abs() <= self.tolerance * (high - low)
-        self.breaches.expect(same(answer[0], action) or (not exact and bool(near.all())), breach)
+        is_kept = same(answer[0], action) or (members is not None and bool(near.all()))
+        self.breaches.expect(is_kept, breach)
         return answer[1]
 
     def ask_again(self, step: Step, plan_state: Any, action: Tensor) -> None:
@@ -191,10 +197,14 @@ class _Trial:
         watch, expect, task = self.breaches.watch, self.breaches.expect, self.problem.task
         follows = watch("follows", lambda: self.planner.follows(task))
         remarks = watch("remarks", lambda: self.planner.remarks(task))
-        is_line = follows is NOTHING or _are_lines((follows,))
-        expect(is_line, "Expected `follows` to give a single line, got something else.")
-        are_lines = remarks is NOTHING or _are_lines(remarks)
-        expect(are_lines, "Expected `remarks` to give a tuple of single lines, got something else.")
+        expect(
+            follows is NOTHING or _are_lines((follows,)),
+            "Expected `follows` to give a single line, got something else.",
+        )
+        expect(
+            remarks is NOTHING or _are_lines(remarks),
+            "Expected `remarks` to give a tuple of single lines, got something else.",
+        )
 
     def check_answer(self, action: Tensor, plan: Plan) -> None:
         """Tells what is wrong with an answer of the right form; ended episodes may get any action."""
@@ -232,15 +242,13 @@ def _step(problem: Problem, step: Step, ended: Tensor, number: int) -> Step:
 
 def _make_problem(task: Task, height: int, width: int, device: torch.device) -> Problem:
     """Poses four problems: free ground, a closed wall, a start on ground predicted 0, a wall with a gap."""
-    rows = torch.arange(height, device=device)[:, None]
-    columns = torch.arange(width, device=device)[None, :]
+    rows, columns = torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
     # Waves, so that no two cells are quite alike.
     ground = (0.8 + 0.1 * torch.sin(0.7 * rows + 1.3 * columns)).repeat(4, 1, 1)
-    wall = (rows == height // 2) | (rows == height // 2 + 1)
-    gap = (columns >= width - 7) & (columns <= width - 4)
-    ground[1].masked_fill_(wall, 0.1)
+    wall = slice(height // 2, height // 2 + 2)
+    ground[1, wall] = 0.1
     ground[2, :5, :5] = 0
-    ground[3].masked_fill_(wall & ~gap, 0)
+    ground[3, wall, : width - 7] = ground[3, wall, width - 3 :] = 0
     elevation = (0.2 * torch.sin(0.4 * rows) * torch.cos(0.3 * columns)).repeat(4, 1, 1)
     rgb = (255 * ground).to(torch.uint8)[:, None].repeat(1, 3, 1, 1)
     means = torch.stack((ground - 0.05, ground + 0.05), dim=1)

@@ -346,7 +346,7 @@ def test_maps_without_the_reference_times_that_stakes_need_are_one_line_with_the
     split = replace(recipe.splits["train"], solvable=False)
     path = factories.tiny_dataset(tmp_path / "d.h5", replace(recipe, splits={"train": split}))
     with pytest.raises(
-        ConfigError, match=r"none on 8 of 8.*create RECIPE id=NAME splits\.train\.solvable=true"
+        ConfigError, match=r"none on 8 of 8.*create RECIPE id=NAME splits\.SPLIT\.solvable=true"
     ) as told:
         make(path, world="stakes")
     assert "\n" not in str(told.value)

@@ -38,8 +38,8 @@ from benchnav.planning import risk
 from benchnav.planning.planners.planner import Plan, Planner, Step
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.places import Places
 from benchnav.planning.world.simulation import Simulation
+from benchnav.planning.world.world import Places
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,8 +29,8 @@ from pandas.api.types import is_numeric_dtype
 from torch import Tensor
 
 from benchnav.core import rng
+from benchnav.core.batch import map_tensors
 from benchnav.core.errors import ConfigError, DatasetError
-from benchnav.core.mixture import map_tensors
 from benchnav.core.settings import hint
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset

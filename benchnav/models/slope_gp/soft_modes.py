@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from benchnav.core.mixture import map_tensors
+from benchnav.core.batch import map_tensors
 from benchnav.models.slope_gp.cells import INSIDE_BINS, SlopeSums, levels
 from benchnav.models.slope_gp.table import SoftModes
 

@@ -59,19 +59,16 @@ class Fused(Generic[R]):
 
     def __call__(self, *args: Any) -> R:
         """Calls the function."""
-        if self.compiled is None:
-            worth = worth_compiling(self._rollouts, self._least, args[0].device)
-            if torch._dynamo.config.disable or not worth:
-                self.compiled = False
+        if self.compiled is None and (
+            torch._dynamo.config.disable or not worth_compiling(self._rollouts, self._least, args[0].device)
+        ):
+            self.compiled = False
         if self.compiled is False:
             return self._function(*args)
-        if self._fused is None:
-            self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
         signature = self._signature(args)
         try:
             result = self._call(args, signature)
         except (torch._dynamo.exc.TorchDynamoException, torch._dynamo.exc.FailOnRecompileLimitHit) as error:
-            self._seen.discard(signature)
             self.compiled = False
             reason = str(error).strip().splitlines()[0]
             print(f"benchnav: running uncompiled, several times slower: {reason}", file=sys.stderr)
@@ -82,14 +79,17 @@ class Fused(Generic[R]):
 
     def _call(self, args: tuple[Any, ...], signature: tuple[object, ...]) -> R:
         """Runs what is compiled, for a new signature under the settings of compiling."""
-        assert self._fused is not None
+        if self._fused is None:
+            self._fused = torch.compile(self._function, dynamic=False, fullgraph=True)
         if signature in self._seen:
             try:
                 return self._fused(*args)
             except torch._dynamo.exc.FailOnRecompileLimitHit:
                 pass  # what it was compiled for has changed in what the signature does not tell
         with _compiling(checked=not all(_is_ours(arg) for arg in args)):
-            self._mark(args)
+            for place in self._batched:
+                if len(args[place]) > 1:  # the number of episodes may be any, but one
+                    torch._dynamo.maybe_mark_dynamic(args[place], 0)
             return self._fused(*args)
 
     def _signature(self, args: tuple[object, ...]) -> tuple[object, ...]:
@@ -106,12 +106,6 @@ class Fused(Generic[R]):
             else:
                 found.append(_key(arg))
         return tuple(found)
-
-    def _mark(self, args: tuple[Any, ...]) -> None:
-        """Lets the number of episodes be any, but one."""
-        for place in self._batched:
-            if len(args[place]) > 1:
-                torch._dynamo.maybe_mark_dynamic(args[place], 0)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ that it cannot wind up beyond the bounds, where no sample would reach back.
 
 What differs: noise and temperature are relative by default, so that one setting serves robots and objectives of
 any unit. The control cost is off by default. The mean is not smoothed. Noise is read anew from one bank, a pure
-function of seed and step (`noise`); the episodes of a batch share it, so an episode has the same noise alone as
+function of seed and step (`NoiseBank`); the episodes of a batch share it, so an episode has the same noise alone as
 in any batch.
 """
 
@@ -26,12 +26,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core import rng
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.noise import NoiseBank, draw_bank
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite, rollout_path
 from benchnav.planning.problem import Problem, motion_traversability, stage_cost, terminal_cost
 from benchnav.planning.robots import Robot, component_wise, steps_in
@@ -41,6 +42,7 @@ _CHUNK_STEPS = 10
 _WORTH_COMPILING = 2000  # samples
 OF_EPISODES = (0, 1, 2, 6, 7)  # arguments of what is compiled: states, cost, mean, padded_ground, target
 _DRAWN_SAMPLES = 40
+_RUNS = 4  # length N of a part of the noise bank, in runs of K numbers
 _LEAST_SPREAD = 1e-30  # where all samples cost alike, all weigh alike
 
 
@@ -75,25 +77,61 @@ class MPPIConfig:
         """Refuses settings that sample nothing."""
         above = "horizon_s", "samples", "noise_share", "temperature_share", "temperature"
         check_finite("MPPI", self, above, ("control_cost",))
-        if self.noise is not None and not (self.noise and all(0 < scale < math.inf for scale in self.noise)):
-            raise ConfigError(f"Expected `noise` > 0 for each action of MPPI, got {self.noise}.")
+        fits = self.noise is None or (self.noise and all(0 < scale < math.inf for scale in self.noise))
+        expect(fits, f"`noise` > 0 for each action of MPPI, got {self.noise}.")
 
 
 @dataclass(frozen=True)
-class MPPIState:
+class NoiseBank:
+    """Normal numbers, and where each step reads them.
+
+    Drawing normals costs more than rolling out what they perturb. So a bank of them is drawn when a planner begins, a
+    few times as many as a step needs, and each step reads it from other places: the bank has a part for each time step
+    of the horizon, and of it every action gets a run that begins at a place of its own. From step to step the parts
+    change hands and the places move, by strides that are drawn too. Within a step all numbers are independent, as no
+    two of them lie at one place of the bank; from step to step numbers occur again, in other company. All is a pure
+    function of seed and step, on any device. A part has N numbers.
+
+    Args:
+        scale: standard deviation of each action's noise, shape [A].
+        values: so scaled, shape [A, T, N].
+        place: where the runs of step 0 begin in their parts, int64, shape [T, A].
+        stride: how far they move on from step to step, int64, shape [T, A].
+        samples: K, the length of a run.
+    """
+
+    scale: Tensor
+    values: Tensor
+    place: Tensor
+    stride: Tensor
+    samples: int
+
+    def at(self, step: int) -> Tensor:
+        """The noise of a step, shape [T, A, K]."""
+        actions, horizon, numbers = self.values.shape
+        within = (self.place + step * self.stride) % (numbers - self.samples + 1)
+        # Parts move backward: forward, with the plan, a moment of it would meet the same part at every step.
+        part = (torch.arange(horizon, device=within.device) - step) % horizon
+        action = torch.arange(actions, device=within.device)
+        begin = (action * horizon + part[:, None]) * numbers + within
+        # Row i of the windows is the run that begins at number i; nothing is copied before the selection.
+        windows = self.values.as_strided((self.values.numel() - self.samples + 1, self.samples), (1, 1))
+        return windows.index_select(0, begin.flatten()).view(horizon, actions, self.samples)
+
+
+@dataclass(frozen=True)
+class MPPIState(Batch):
     """What MPPI carries from step to step.
 
     Args:
         problem: what is being solved.
         mean: mean action sequence, shape [B, T, A].
-        scale: standard deviation of each action's noise, shape [A].
-        noise: of all steps.
+        noise: of all steps, the same for each episode.
         step: steps planned so far.
     """
 
     problem: Problem
     mean: Tensor
-    scale: Tensor
     noise: NoiseBank
     step: int
 
@@ -127,17 +165,16 @@ class MPPI(LocalPlanner[MPPIState]):
             ConfigError: the robot has another number of actions than there are noise scales.
         """
         names, config = problem.robot.action_names, self.config
-        if config.noise is not None and len(names) != len(config.noise):
-            raise ConfigError(
-                f"Expected option `noise` of MPPI with {len(names)} values, for {', '.join(names)}, "
-                f"got {config.noise}."
-            )
+        expect(
+            config.noise is None or len(names) == len(config.noise),
+            f"option `noise` of MPPI with {len(names)} values, for {', '.join(names)}, got {config.noise}.",
+        )
         seed = int(torch.randint(2**62, (), generator=generator))
         low, high = problem.action_bounds
         horizon = steps_in(config.horizon_s, problem.dt_s)
         mean = problem.start.new_zeros(len(problem), horizon, len(names))
         scale = config.noise_share * (high - low) if config.noise is None else low.new_tensor(config.noise)
-        return MPPIState(problem, mean, scale, draw_bank(seed, horizon, config.samples, scale), 0)
+        return MPPIState(problem, mean, draw_bank(seed, horizon, config.samples, scale), 0)
 
     def plan_toward(
         self, step: Step, plan_state: MPPIState, target_m: Tensor
@@ -147,7 +184,7 @@ class MPPI(LocalPlanner[MPPIState]):
         noise = plan_state.noise.at(plan_state.step)
         states, cost = roll_out(problem, step.state, mean, noise, target_m, self._advance)
         if config.control_cost:
-            cost = cost + config.control_cost * control_cost(mean, noise, plan_state.scale)
+            cost = cost + config.control_cost * control_cost(mean, noise, plan_state.noise.scale)
         weights, updated = self._weigh(
             states, cost, mean, noise, *problem.action_bounds, problem.padded_ground,
             target_m[:, None].contiguous(), problem.grid, problem.objective,
@@ -158,9 +195,23 @@ class MPPI(LocalPlanner[MPPIState]):
         plan = Plan.empty(len(problem), step.state.device, **layers)
         return updated[:, 0], replace(plan_state, mean=shifted, step=plan_state.step + 1), plan
 
-    def select(self, plan_state: MPPIState, members: Tensor) -> MPPIState:
-        """Keeps some episodes; see `Planner`."""
-        return replace(plan_state, problem=plan_state.problem.select(members), mean=plan_state.mean[members])
+
+def draw_bank(seed: int, horizon: int, samples: int, scale: Tensor) -> NoiseBank:
+    """Draws a bank on the CPU, the same for every device.
+
+    Args:
+        seed: root of the noise.
+        horizon: T.
+        samples: K.
+        scale: standard deviation of each action's noise, shape [A].
+    """
+    # PyTorch's generator looks at 32 bits of a seed alone: the key is a hash of all of them.
+    generator = rng.generator(rng.stream_key(seed, "noise"))
+    actions, numbers = len(scale), _RUNS * samples
+    values = torch.randn((actions, horizon, numbers), generator=generator, dtype=scale.dtype).to(scale.device)
+    places, shape = numbers - samples + 1, (horizon, actions)
+    place, stride = (torch.randint(places, shape, generator=generator).to(scale.device) for _ in range(2))
+    return NoiseBank(scale, values * scale[:, None, None], place, stride, samples)
 
 
 def control_cost(mean: Tensor, noise: Tensor, scale: Tensor) -> Tensor:

@@ -14,8 +14,9 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
-from benchnav.planning.problem import Batch, Problem, Task
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Robot
 
 # What a `Plan` draws, with the dimensions of each layer between that of the episodes and (x, y).
@@ -151,7 +152,7 @@ class Planner(ABC, Generic[State]):
 class LocalPlanner(Planner[State]):
     """The base class of local planners: planners that are told where to go at each step.
 
-    Its plan states have a `problem`; by itself it plans toward the goal.
+    Its plan states are a `Batch` with a `problem`; by itself it plans toward the goal.
     """
 
     name: str
@@ -169,9 +170,9 @@ class LocalPlanner(Planner[State]):
         """Notes the actions that are taken, which may be others than it chose, shape [B, A]."""
         return plan_state
 
-    @abstractmethod
-    def select(self, plan_state: State, members: Tensor) -> State:
+    def select(self, plan_state: Any, members: Tensor) -> State:
         """Keeps some episodes; see `Planner`."""
+        return plan_state.select(members)
 
 
 def check_finite(owner: str, settings: Any, above: tuple[str, ...], least: tuple[str, ...] = ()) -> None:
@@ -188,8 +189,8 @@ def check_finite(owner: str, settings: Any, above: tuple[str, ...], least: tuple
     """
     for name in (*above, *least):
         value, sign = getattr(settings, name), ">" if name in above else "≥"
-        if value is not None and not (0 <= value < math.inf and (value or sign == "≥")):
-            raise ConfigError(f"Expected `{name}` {sign} 0 and finite for {owner}, got {value}.")
+        fits = value is None or (0 <= value < math.inf and (value or sign == "≥"))
+        expect(fits, f"`{name}` {sign} 0 and finite for {owner}, got {value}.")
 
 
 def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
@@ -203,12 +204,14 @@ def check_steers(planner: Planner[Any], robot: Robot, name: str) -> None:
     Raises:
         ConfigError: the names of the robot's actions are none that the planner knows.
     """
-    if planner.steers is not None and tuple(robot.action_names) not in planner.steers:
-        actions = " or ".join(f"({', '.join(names)})" for names in planner.steers)
-        raise ConfigError(
-            f"Expected a robot with actions {actions} for planner {name!r}, got {type(robot).__name__} with "
-            f"({', '.join(robot.action_names)}). Take a planner that samples actions, such as mppi."
-        )
+    names = tuple(robot.action_names)
+    known = (names,) if planner.steers is None else planner.steers
+    actions = " or ".join(f"({', '.join(each)})" for each in known)
+    expect(
+        names in known,
+        f"a robot with actions {actions} for planner {name!r}, got {type(robot).__name__} with "
+        f"({', '.join(names)}). Take a planner that samples actions, such as mppi.",
+    )
 
 
 def rollout_path(problem: Problem, state: Tensor, actions: Tensor) -> Tensor:

@@ -1,23 +1,32 @@
 """The λ that robots meet: a value for each episode, step and place.
 
 Noise is keyed by (root key, map, step), or by (root key, map) where λ stays what it is, so every
-planner and setting meets the same, whatever the batch or the order. Letters in shapes: B episodes, N steps,
-H×W cells, K components.
+planner and setting meets the same, whatever the batch or the order.
+
+Frozen λ is drawn once an episode as a correlated field, each cell with its own distribution: a field of correlated
+standard normals goes through each cell's quantile function (`benchnav.core.copula`). Where ground can immobilise a
+robot, a field that cuts the start off from the goal is drawn again: what is asked is which way to take, and there has
+to be one. Letters in shapes: B episodes, N steps, H×W cells, K components.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy.ndimage import generate_binary_structure, label
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.copula import LONGEST_CORRELATION, correlated_normal
+from benchnav.core.errors import ConfigError, expect
+from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.world.frozen_field import draw_frozen
-from benchnav.planning.world.places import Places
-from benchnav.planning.world.world import World
+from benchnav.planning.world.world import Places, World
+
+MOST_ATTEMPTS = 100
+
+_FIRST = np.zeros(1, dtype=np.int64)  # of each map's stream, the one element that is drawn
 
 
 class Realisation:
@@ -51,7 +60,7 @@ class Realisation:
             ConfigError: λ of some cells is not known.
         """
         check_known(terrain, world)
-        self._grid = terrain.grid
+        self._grid, truth = terrain.grid, terrain.truth
         self.attempts = torch.ones(len(terrain), dtype=torch.int64, device=terrain.traversability.device)
         self.field: Tensor | None = None
         if world.noise == "stored":
@@ -59,16 +68,14 @@ class Realisation:
         elif world.noise == "frozen":
             self.field, self.attempts = draw_frozen(terrain, world, places, key, maps)
         if self.field is not None:
-            self._ground = terrain.grid.pad(self.field, outside=0.0)[:, None]
-            return
-        truth, grid = terrain.truth, terrain.grid
-        parameters = torch.cat((truth.weights, truth.means, truth.stds), dim=1)
-        # Framed for lookups, shape [B, 3·K, N].
-        self._ground = torch.stack([grid.pad(layer, outside=0.0) for layer in parameters.unbind(1)], dim=1)
-        # A stream each, so that another time budget leaves the noise of the first steps as it is.
-        first = np.zeros(1, dtype=np.int64)
-        noise = [rng.normal(rng.stream_key(key, int(i)), first, (steps,)) for i in maps]
-        self._noise = torch.from_numpy(np.concatenate(noise)).to(self._ground)
+            layers = self.field[:, None]
+        else:
+            layers = torch.cat((truth.weights, truth.means, truth.stds), dim=1)
+            # A stream each, so that another time budget leaves the noise of the first steps as it is.
+            noise = [rng.normal(rng.stream_key(key, int(i)), _FIRST, (steps,)) for i in maps]
+            self._noise = torch.from_numpy(np.concatenate(noise)).to(layers)
+        # Framed for lookups, shape [B, 1 or 3·K, N].
+        self._ground = self._grid.pad(layers, outside=0.0)
 
     def at(self, state: Tensor, step: Tensor) -> Tensor:
         """λ that robots meet at their next step.
@@ -116,13 +123,80 @@ def check_known(terrain: Terrain, world: World) -> None:
     Raises:
         ConfigError: they have such cells.
     """
-    if bool(terrain.truth.means.isnan().any()):
-        raise ConfigError(
-            "Expected maps with a class in every cell to drive on, got some without: their λ is not known. "
-            "Maps with unlabelled cells are there to train and measure models on."
-        )
-    if world.noise == "stored" and bool(terrain.traversability.isnan().any()):
-        raise ConfigError(
-            "Expected maps with λ in every cell for `noise` 'stored', got some that were not observed. "
-            "Take `noise` 'resampled'."
-        )
+    expect(
+        not terrain.truth.means.isnan().any(),
+        "maps with a class in every cell to drive on, got some without: their λ is not known. Maps with unlabelled "
+        "cells are there to train and measure models on.",
+    )
+    expect(
+        world.noise != "stored" or not terrain.traversability.isnan().any(),
+        "maps with λ in every cell for `noise` 'stored', got some that were not observed. Take `noise` 'resampled'.",
+    )
+
+
+def draw_frozen(
+    terrain: Terrain, world: World, places: Places, key: int, maps: Sequence[int]
+) -> tuple[Tensor, Tensor]:
+    """Draws the λ of B episodes.
+
+    Args:
+        terrain: the true maps.
+        world: correlation length, and what immobilises a robot.
+        places: starts and goals.
+        key: root key of the noise.
+        maps: names each episode's stream under that root, B of them.
+
+    Returns:
+        λ in [0, 1], shape [B, H, W]; and how many fields of each episode were drawn, int64, shape [B].
+
+    Raises:
+        ConfigError: the correlation is too long for the maps, or no field of some episode joins its start and goal.
+    """
+    grid, cells = terrain.grid, world.correlation_m / terrain.grid.resolution_m
+    longest = LONGEST_CORRELATION * min(grid.extent_m)
+    expect(
+        world.correlation_m <= longest,
+        f"`world.correlation_m` of at most {longest:g} m, a quarter of the maps' shorter side, got "
+        f"{world.correlation_m:g} m.",
+    )
+    field = torch.zeros_like(terrain.traversability)
+    attempts = torch.zeros(len(terrain), dtype=torch.int64, device=field.device)
+    pending = torch.arange(len(terrain), device=field.device)
+    for attempt in range(MOST_ATTEMPTS):
+        normals = [
+            correlated_normal(rng.stream_key(key, int(maps[i]), "field", attempt), _FIRST, grid.shape, cells)
+            for i in pending.tolist()
+        ]
+        drawn = terrain.truth.select(pending).from_normal(torch.from_numpy(np.concatenate(normals)).to(field))
+        field[pending] = drawn
+        attempts[pending] += 1
+        if world.immobile is None:
+            return field, attempts
+        pending = pending[~joined(drawn >= world.immobile.below, grid, places.select(pending))]
+        if len(pending) == 0:
+            return field, attempts
+    raise ConfigError(
+        f"Expected ground that joins start and goal, but {MOST_ATTEMPTS} draws of λ gave none for example "
+        f"{maps[int(pending[0])]}. Lower `immobile.below`, or take easier maps."
+    )
+
+
+def joined(ground: Tensor, grid: Grid, places: Places) -> Tensor:
+    """Tells in which episodes ground joins start and goal, from cell to cell over shared edges.
+
+    Cells that touch at a corner alone are no way for a robot.
+
+    Args:
+        ground: where a robot can go, bool, shape [B, H, W].
+        grid: size and resolution.
+        places: starts and goals.
+
+    Returns:
+        bool, shape [B].
+    """
+    within = np.zeros((3, 3, 3))  # a map's cells are joined to its own alone
+    within[1] = generate_binary_structure(2, 1)
+    parts = torch.from_numpy(label(ground.cpu().numpy(), within)[0])
+    member = torch.arange(len(parts))
+    start, goal = (parts[member, *grid.cell_of(*place.cpu().T)] for place in (places.start_m, places.goal_m))
+    return ((start > 0) & (start == goal)).to(ground.device)

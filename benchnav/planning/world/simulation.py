@@ -15,9 +15,8 @@ from benchnav.planning.objective import distance
 from benchnav.planning.problem import Task
 from benchnav.planning.robots import steps_in
 from benchnav.planning.world.outcome import Outcome
-from benchnav.planning.world.places import Places
 from benchnav.planning.world.realisation import Realisation
-from benchnav.planning.world.world import World
+from benchnav.planning.world.world import Places, World
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,7 @@ class Simulation:
         self.time_budget_s = world.budget_s(places.reference_time_s, task.robot.top_speed_mps)
         self.steps = world.steps(self.time_budget_s, task.robot.dt_s)
         self._grid, self._goal_m, self._goal_radius_m = terrain.grid, places.goal_m, task.rules.goal_radius_m
-        most = int(self.steps.max())
-        self._realisation = Realisation(terrain, world, places, most, noise_key, maps)
+        self._realisation = Realisation(terrain, world, places, int(self.steps.max()), noise_key, maps)
         # Which `exchange_` changes in place.
         self.field, self.attempts = self._realisation.field, self._realisation.attempts
         self._immobile = world.immobile
@@ -87,8 +85,7 @@ class Simulation:
     def immobilising(self) -> Tensor:
         """Cells that immobilise a robot, bool, shape [B, H, W]; none where λ is resampled or nothing holds."""
         if self.field is None or self._immobile is None:
-            size = (len(self._goal_m), *self._grid.shape)
-            return torch.zeros(size, dtype=torch.bool, device=self._goal_m.device)
+            return self._goal_m.new_zeros(len(self._goal_m), *self._grid.shape).bool()
         return self.field < self._immobile.below
 
     def init(self, start: Tensor) -> SimulationState:
@@ -126,8 +123,8 @@ class Simulation:
 
     def unhindered(self, now: SimulationState, action: Tensor) -> Tensor:
         """Where an action would take the robots on ground of λ = 1, shape [B, S]; what was commanded."""
-        action = action.clamp(self._low, self._high)
-        return self.robot(now.state.clone(), action, torch.ones_like(now.state[:, 0]))
+        ones = torch.ones_like(now.state[:, 0])
+        return self.robot(now.state.clone(), action.clamp(self._low, self._high), ones)
 
     def exchange_(self, members: Tensor, others: "Simulation") -> None:
         """Gives some episodes the maps, goals and noise of another simulation, in place; the rest keep theirs.

@@ -1,4 +1,7 @@
-"""World: what traversability does to a robot, as a value; and the presets of world and rules."""
+"""World: what traversability does to a robot, as a value; the presets of world and rules; and places.
+
+Letters in shapes: B episodes.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -7,13 +10,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
-from benchnav.core.settings import hint, plain, read
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
+from benchnav.core.settings import check_known, plain, read
 from benchnav.planning.free_space import FreeSpace, Rules
 
 NOISES = ("resampled", "stored", "frozen")
 
 _BUDGETS = ("time_budget_s", "time_budget_ratio")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Places(Batch):
+    """Where episodes begin and end.
+
+    Args:
+        start_m: (x, y), shape [B, 2].
+        goal_m: (x, y), shape [B, 2].
+        reference_time_s: grid reference times at 1 m/s, NaN where there is none, shape [B].
+    """
+
+    start_m: Tensor
+    goal_m: Tensor
+    reference_time_s: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,10 +49,8 @@ class Immobile:
 
     def __post_init__(self) -> None:
         """Refuses rules that hold always or never."""
-        if not 0 < self.below <= 1:
-            raise ConfigError(f"Expected `immobile.below` in (0, 1], got {self.below}.")
-        if not 0 < self.for_s < float("inf"):
-            raise ConfigError(f"Expected `immobile.for_s` > 0 and finite, got {self.for_s}.")
+        expect(0 < self.below <= 1, f"`immobile.below` in (0, 1], got {self.below}.")
+        expect(0 < self.for_s < float("inf"), f"`immobile.for_s` > 0 and finite, got {self.for_s}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,21 +76,22 @@ class World:
 
     def __post_init__(self) -> None:
         """Refuses worlds in which no episode can run."""
-        if self.noise not in NOISES:
-            raise ConfigError(
-                f"Expected `noise` {', '.join(map(repr, NOISES[:-1]))} or {NOISES[-1]!r}, got {self.noise!r}."
-            )
-        if not 0 <= self.correlation_m < float("inf"):
-            raise ConfigError(f"Expected `correlation_m` ≥ 0 and finite, got {self.correlation_m}.")
-        if (self.time_budget_s is None) == (self.time_budget_ratio is None):
-            raise ConfigError(
-                "Expected either `time_budget_s` or `time_budget_ratio`, got "
-                f"{self.time_budget_s} and {self.time_budget_ratio}."
-            )
-        for name in _BUDGETS:
-            value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
-                raise ConfigError(f"Expected `{name}` > 0 and finite, got {value}.")
+        expect(
+            self.noise in NOISES,
+            f"`noise` {', '.join(map(repr, NOISES[:-1]))} or {NOISES[-1]!r}, got {self.noise!r}.",
+        )
+        expect(
+            0 <= self.correlation_m < float("inf"),
+            f"`correlation_m` ≥ 0 and finite, got {self.correlation_m}.",
+        )
+        budgets = {name: getattr(self, name) for name in _BUDGETS if getattr(self, name) is not None}
+        expect(
+            len(budgets) == 1,
+            "either `time_budget_s` or `time_budget_ratio`, got "
+            f"{self.time_budget_s} and {self.time_budget_ratio}.",
+        )
+        for name, value in budgets.items():
+            expect(0 < value < float("inf"), f"`{name}` > 0 and finite, got {value}.")
 
     def budget_s(self, reference_time_s: Tensor, top_speed_mps: float) -> Tensor:
         """T of each episode.
@@ -89,14 +107,16 @@ class World:
             ConfigError: T is a multiple of a reference time that is not there.
         """
         reference_time_s = reference_time_s.double()
-        if self.time_budget_s is not None:
-            return torch.full_like(reference_time_s, self.time_budget_s)
-        assert self.time_budget_ratio is not None
-        if bool(reference_time_s.isnan().any()):
-            raise ConfigError(
-                "Expected maps with a reference time for `time_budget_ratio`, got some that were not asked to "
-                "be solvable. Give `time_budget_s`, or make the maps with `solvable: true`."
-            )
+        if self.time_budget_ratio is None:
+            return torch.full_like(reference_time_s, self.time_budget_s)  # type: ignore[arg-type]
+        lacking = int(reference_time_s.isnan().sum())
+        expect(
+            not lacking,
+            "a reference time on each map, of which the time budget is a multiple (`time_budget_ratio`), got none on "
+            f"{lacking} of {len(reference_time_s)} maps, which were not asked to be solvable. Make such maps: "
+            "benchnav-datagen create RECIPE id=NAME splits.SPLIT.solvable=true; or give `time_budget_s`, as in "
+            "world={'preset': 'stakes', 'time_budget_s': 60}.",
+        )
         return self.time_budget_ratio * reference_time_s / top_speed_mps
 
     def steps(self, budget_s: Tensor, dt_s: float) -> Tensor:
@@ -106,10 +126,10 @@ class World:
             ConfigError: there is none.
         """
         steps = (budget_s / dt_s).round().long()
-        if bool((steps < 1).any()):
-            raise ConfigError(
-                f"Expected a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s."
-            )
+        expect(
+            (steps >= 1).all(),
+            f"a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s.",
+        )
         return steps
 
     def to_dict(self) -> dict[str, Any]:
@@ -161,23 +181,19 @@ def read_world(world: Any, task: Any = None) -> tuple[World, Rules, str]:
     Raises:
         ConfigError: there is no such preset or field, or a value is of the wrong kind.
     """
-    if not isinstance(world, Mapping | str):
-        raise ConfigError(f"Expected `world` as a mapping of settings, got {world!r}.")
+    expect(isinstance(world, Mapping | str), f"`world` as a mapping of settings, got {world!r}.")
     given = {"preset": world} if isinstance(world, str) else dict(world)
     name = given.pop("preset", "paper")
-    if name not in PRESETS:
-        raise ConfigError(
-            f"Expected a world among {', '.join(PRESETS)}, got {name!r}.{hint(str(name), PRESETS)}"
-        )
+    check_known("a world", name, PRESETS)
     preset = PRESETS[name]
     budgets = [key for key in _BUDGETS if given.get(key) is not None]
     if len(budgets) == 1:  # of the two ways to give a time budget one takes the other's place
         given |= dict.fromkeys(set(_BUDGETS) - set(budgets))
     changed_world = read(World, given, "`{}`".format, "world", preset.world)
-    if "correlation_m" in given and changed_world.noise != "frozen":
-        raise ConfigError(
-            f"Expected `world.correlation_m` with `world.noise` frozen, got it with {changed_world.noise!r}."
-        )
+    expect(
+        "correlation_m" not in given or changed_world.noise == "frozen",
+        f"`world.correlation_m` with `world.noise` frozen, got it with {changed_world.noise!r}.",
+    )
     rules = read(Rules, {} if task is None else task, "`{}`".format, "task", preset.rules)
     changes = _differences(preset.world, changed_world) + _differences(preset.rules, rules)
     return changed_world, rules, " ".join([name, *changes])

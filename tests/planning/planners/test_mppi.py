@@ -8,8 +8,7 @@ from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective
 from benchnav.planning.planners import mppi
-from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState
-from benchnav.planning.planners.noise import NoiseBank
+from benchnav.planning.planners.mppi import MPPI, MPPIConfig, MPPIState, NoiseBank
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Unicycle
@@ -182,10 +181,10 @@ def test_on_open_ground_the_defaults_take_hardly_longer_than_a_straight_line(nam
 
 def test_noise_is_a_share_of_the_range_of_each_action_unless_it_is_given() -> None:
     problem = factories.problem(torch.full((1, 16, 16), 0.8), robot=Pushed(mass_kg=150.0))
-    scale = MPPI(replace(SMALL, noise_share=0.25)).init(problem, generator()).scale
+    scale = MPPI(replace(SMALL, noise_share=0.25)).init(problem, generator()).noise.scale
     assert scale.tolist() == pytest.approx([75.0, 0.5])
     given = replace(SMALL, noise=(3.0, 0.2), noise_share=0.25)
-    assert MPPI(given).init(problem, generator()).scale.tolist() == pytest.approx([3.0, 0.2])
+    assert MPPI(given).init(problem, generator()).noise.scale.tolist() == pytest.approx([3.0, 0.2])
 
 
 @pytest.mark.parametrize(
@@ -362,8 +361,8 @@ def test_no_tensor_is_made_on_another_device(robot, monkeypatch: pytest.MonkeyPa
         mean, scale = problem.start.new_zeros(2, 20, 2), problem.start.new_ones(2)
         values = mean.new_zeros(2, 20, 4 * 256)
         places = torch.zeros(20, 2, dtype=torch.int64, device=mean.device)
-        bank = NoiseBank(values=values, place=places, stride=places, samples=256)
-        state = MPPIState(problem, mean, scale, bank, step=0)
+        bank = NoiseBank(scale=scale, values=values, place=places, stride=places, samples=256)
+        state = MPPIState(problem, mean, bank, step=0)
         planner = MPPI(replace(SMALL, control_cost=0.1))
         action, state, plan = planner.plan(first(problem, draw=True), state)
         assert on_cuda(action, state.mean, plan.path, plan.samples, plan.status)

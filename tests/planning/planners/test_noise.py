@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from benchnav.planning.planners.noise import NoiseBank, draw_bank
+from benchnav.planning.planners.mppi import NoiseBank, draw_bank
 
 SCALE = torch.tensor([0.2, 0.7])
 
@@ -52,7 +52,7 @@ def marked(horizon: int, samples: int) -> NoiseBank:
     """A bank whose numbers tell their places."""
     one = bank(horizon=horizon, samples=samples)
     places = torch.arange(one.values.numel(), dtype=torch.float32).view(one.values.shape)
-    return NoiseBank(values=places, place=one.place, stride=one.stride, samples=samples)
+    return NoiseBank(scale=SCALE, values=places, place=one.place, stride=one.stride, samples=samples)
 
 
 @pytest.mark.parametrize(("horizon", "samples"), [(2, 50), (50, 40), (7, 1)])

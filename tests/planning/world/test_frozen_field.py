@@ -12,9 +12,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
-from benchnav.planning.world.frozen_field import draw_frozen
-from benchnav.planning.world.places import Places, joined
-from benchnav.planning.world.world import Immobile, World
+from benchnav.planning.world.realisation import draw_frozen, joined
+from benchnav.planning.world.world import Immobile, Places, World
 from tests import factories
 
 KEY = rng.stream_key(0, "noise")

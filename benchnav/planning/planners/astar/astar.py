@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from benchnav.core import gridgraph
-from benchnav.core.errors import ConfigError
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
@@ -23,7 +24,7 @@ from benchnav.planning.problem import Problem
 
 
 @dataclass(frozen=True)
-class CostToGo:
+class CostToGo(Batch):
     """Cheapest paths from every cell to the goal.
 
     Args:
@@ -57,20 +58,20 @@ def edge_costs(problem: Problem) -> Tensor:
     length_m = cells * problem.grid.resolution_m
     grade = (elevation[:, target] - elevation[:, source]) / length_m
     objective = problem.objective
-    expected = f"Expected `path_cost` of {type(objective).__name__}"
+    name = f"`path_cost` of {type(objective).__name__}"
     per_m = [objective.path_cost(traversability[:, cell], grade) for cell in (source, target)]
     for cost in per_m:
-        if not isinstance(cost, Tensor) or cost.shape != grade.shape:
-            got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
-            raise ConfigError(
-                f"{expected} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. "
-                "Give a cost for each piece of a path."
-            )
-    least, most = torch.stack(per_m).aminmax()
-    if not 0 < least <= most < torch.inf:
-        raise ConfigError(
-            f"{expected} as finite numbers > 0, got {least:g} to {most:g}. Let no metre of a path be free."
+        got = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
+        expect(
+            got == list(grade.shape),
+            f"{name} of the shape of λ̂ and grade, {list(grade.shape)}, got {got}. Give a cost for each piece of a "
+            "path.",
         )
+    least, most = torch.stack(per_m).aminmax()
+    expect(
+        0 < least <= most < torch.inf,
+        f"{name} as finite numbers > 0, got {least:g} to {most:g}. Let no metre of a path be free.",
+    )
     penalty = PENALTY * (not_free[:, source] + not_free[:, target])
     return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
 

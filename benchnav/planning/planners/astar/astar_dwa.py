@@ -32,5 +32,5 @@ class AStarDWA(Guided[DWAState]):
 
     def __init__(self, config: AStarDWAConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
-        self.config = config or AStarDWAConfig()
-        super().__init__(self.config, DWA(self.config.dwa))
+        config = config or AStarDWAConfig()
+        super().__init__(config, DWA(config.dwa))

@@ -32,5 +32,5 @@ class AStarMPPI(Guided[MPPIState]):
 
     def __init__(self, config: AStarMPPIConfig | None = None) -> None:
         """Keeps the settings; all else is in the plan state."""
-        self.config = config or AStarMPPIConfig()
-        super().__init__(self.config, MPPI(self.config.mppi))
+        config = config or AStarMPPIConfig()
+        super().__init__(config, MPPI(config.mppi))

@@ -18,13 +18,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite, rollout_path
 from benchnav.planning.planners.straight import turn_toward
 from benchnav.planning.problem import (
-    Batch,
     Problem,
     motion_traversability,
     predicted_traversability,
@@ -132,10 +132,6 @@ class DWA(LocalPlanner[DWAState]):
         """Notes the velocities that the robots now have; see `LocalPlanner`."""
         problem = plan_state.problem
         return DWAState(problem, action.clamp(*reachable(problem, plan_state.velocity)))
-
-    def select(self, plan_state: DWAState, members: Tensor) -> DWAState:
-        """Keeps some episodes; see `Planner`."""
-        return plan_state.select(members)
 
 
 def reachable(problem: Problem, velocity: Tensor) -> tuple[Tensor, Tensor]:

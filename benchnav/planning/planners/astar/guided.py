@@ -6,18 +6,19 @@ robot that its local planner holds in place is steered along the path. Source: p
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.planning.objective import GoalDistance, has_path_cost, toward_waypoints
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
 from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step, check_finite
 from benchnav.planning.planners.straight import steer_toward
-from benchnav.planning.problem import Batch, Problem, Task
+from benchnav.planning.problem import Problem, Task
 
 Local = TypeVar("Local")
 
@@ -62,13 +63,13 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     """A local planner guided by A*, as a planner.
 
     Args:
-        guide: settings of the global path.
+        config: settings of the global path.
         local: drives to way-points.
     """
 
-    def __init__(self, guide: GuideConfig, local: LocalPlanner[Local]) -> None:
+    def __init__(self, config: GuideConfig, local: LocalPlanner[Local]) -> None:
         """Keeps the settings; all else is in the plan state."""
-        self.guide, self.local = guide, local
+        self.config, self.local = config, local
 
     @property
     def compiled(self) -> bool | None:
@@ -106,9 +107,9 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
         """Follows the cheapest path; see `Planner`."""
         problem, field, state = plan_state.problem, plan_state.field, step.state
         # The robot, and as many points as can lie within the look-ahead.
-        count = 2 + int(self.guide.lookahead_m / problem.grid.resolution_m)
+        count = 2 + int(self.config.lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
-        target, straight = choose_waypoint(plan_state.ground, points, self.guide.lookahead_m)
+        target, straight = choose_waypoint(plan_state.ground, points, self.config.lookahead_m)
         action, local, plan = self.local.plan_toward(step, plan_state.local, target)
         recovery = watch(plan_state.recovery, state, action, problem.robot)
         recovery = aim(recovery, plan_state.recovery.active, problem, field, state, straight)
@@ -124,5 +125,4 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
         """Keeps some episodes; see `Planner`."""
         local = self.local.select(plan_state.local, members)
-        shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
-        return replace(shared.select(members), local=local)
+        return replace(plan_state.select(members), local=local)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.astar.astar import CostToGo, cell_at, cell_centres, cell_points, path_cells
 from benchnav.planning.problem import Problem
@@ -30,7 +31,7 @@ _RECOVERY_S = 20.0
 
 
 @dataclass(frozen=True)
-class Recovery:
+class Recovery(Batch):
     """How long each robot has stood, and whether it is being steered away.
 
     Args:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.astar.astar import cell_at, cell_centres
@@ -22,7 +23,7 @@ _SHORT_CUT = 1.1
 
 
 @dataclass(frozen=True)
-class GroundCosts:
+class GroundCosts(Batch):
     """What a metre of straight line costs in each cell; maps framed by `Grid.pad` for lookups.
 
     A metre costs path_cost(λ̂, gradient · direction) + penalty_per_m.

@@ -42,7 +42,8 @@ import torch
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.errors import ConfigError
+from benchnav.core.batch import Batch, map_tensors
+from benchnav.core.errors import expect
 from benchnav.planning.objective import TravelTime, distance
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import (
@@ -54,7 +55,7 @@ from benchnav.planning.planners.cl_rrt.pursuit import (
 )
 from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
 from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step, check_finite
-from benchnav.planning.problem import Batch, Problem, Task, map_tensors
+from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
@@ -93,13 +94,12 @@ class CLRRTConfig:
         """Refuses settings that grow no tree."""
         above = "expansions", "expansions_per_round", "step_m", "edge_time_s", "turning_radius_m"
         check_finite("CL-RRT", self, (*above, "replan_distance_m", "stall_s", "most_failures"))
-        if self.expansions % self.expansions_per_round:
-            raise ConfigError(
-                f"Expected `expansions` as a multiple of `expansions_per_round` = {self.expansions_per_round} "
-                f"for CL-RRT, got {self.expansions}."
-            )
-        if not 0 <= self.goal_bias <= 1:
-            raise ConfigError(f"Expected `goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.")
+        expect(
+            self.expansions % self.expansions_per_round == 0,
+            f"`expansions` as a multiple of `expansions_per_round` = {self.expansions_per_round} for CL-RRT, got "
+            f"{self.expansions}.",
+        )
+        expect(0 <= self.goal_bias <= 1, f"`goal_bias` in 0–1 for CL-RRT, got {self.goal_bias}.")
 
     @property
     def rounds(self) -> int:
@@ -115,10 +115,12 @@ class CLRRTState(Batch):
         problem: what is being solved.
         route: what is being followed.
         edge: which edge of the path, int64, shape [B].
-        tracking: of the controller, along that edge.
+        tracking: of the controller.
+        progress_m: arc length along the reference of that edge, shape [B].
         failures: plans in a row without a way to the goal, int64, shape [B].
         mark_m: progress along the path when last some was seen, shape [B].
         mark_step: the step of it, int64, shape [B].
+        follower: the controller.
         seed: root of the samples.
         step: steps planned so far.
     """
@@ -127,9 +129,11 @@ class CLRRTState(Batch):
     route: Route
     edge: Tensor
     tracking: Tracking
+    progress_m: Tensor
     failures: Tensor
     mark_m: Tensor
     mark_step: Tensor
+    follower: PathFollower
     seed: int
     step: int
 
@@ -173,22 +177,25 @@ class CLRRT(Planner[CLRRTState]):
         Raises:
             ConfigError: the robot cannot follow references, or none of the turning radius.
         """
-        config, tightest_m = self.config, self._follower(problem).tightest_m
-        if config.turning_radius_m < tightest_m:
-            raise ConfigError(
-                f"Expected `turning_radius_m` ≥ {tightest_m:g}, the radius of the robot's tightest turn, "
-                f"for CL-RRT, got {config.turning_radius_m}."
-            )
+        config = self.config
+        follower = PathFollower(config.follower, problem.robot)
+        expect(
+            config.turning_radius_m >= follower.tightest_m,
+            f"`turning_radius_m` ≥ {follower.tightest_m:g}, the radius of the robot's tightest turn, for CL-RRT, got "
+            f"{config.turning_radius_m}.",
+        )
         none = torch.zeros(len(problem), dtype=torch.int64, device=problem.start.device)
-        tracking = Tracking.standing(problem.start)
+        zero = torch.zeros_like(problem.start[:, 0])
         return CLRRTState(
             problem=problem,
-            route=no_route(self._closed_loop(problem, none), config.rounds, config.expansions),
+            route=no_route(self._closed_loop(problem, follower, none), config.rounds, config.expansions),
             edge=none,
-            tracking=tracking,
+            tracking=Tracking.standing(problem.start),
+            progress_m=zero,
             failures=none,
-            mark_m=tracking.progress_m,
+            mark_m=zero,
             mark_step=none,
+            follower=follower,
             seed=int(torch.randint(2**62, (), generator=generator)),
             step=0,
         )
@@ -205,17 +212,16 @@ class CLRRT(Planner[CLRRTState]):
         due = ((lost | again) & ~arrived & (ground != 0)).nonzero()[:, 0]  # not off the map
         if len(due):
             now = self._replan(state, now, due, lost[due])
-        route, follower = now.route, self._follower(problem)
+        route, follower = now.route, now.follower
         reference = _reference(route, now.edge)
-        progress = now.tracking.progress_m  # moved already, but on references that begin now
+        progress = now.progress_m  # moved already, but on references that begin now
         progress = torch.where(progress > 0, progress, follower.advance(reference, state, progress))
         action, tracking = follower.act(reference, state, now.tracking, progress)
         driving = (route.depth > 0) & ~arrived
-        low, high = problem.action_bounds
-        action = torch.where(driving[:, None], action, 0).clamp(low, high)
+        action = torch.where(driving[:, None], action, 0).clamp(*problem.action_bounds)
         layers = {"path": route.path, "reference": route.line, "tree": route.tree} if step.draw else {}
         plan = Plan.empty(len(state), state.device, status=route.status, **layers)
-        return action, replace(now, tracking=tracking, step=now.step + 1), plan
+        return action, replace(now, tracking=tracking, progress_m=progress, step=now.step + 1), plan
 
     def select(self, plan_state: CLRRTState, members: Tensor) -> CLRRTState:
         """Keeps some episodes, so that trees are grown for them alone; see `Planner`."""
@@ -223,9 +229,8 @@ class CLRRT(Planner[CLRRTState]):
 
     def _follow(self, state: Tensor, now: CLRRTState) -> CLRRTState:
         """Moves the progress to where the robots are, on to the next edge where one is done."""
-        tracking = now.tracking
         reference = _reference(now.route, now.edge)
-        progress = self._follower(now.problem).advance(reference, state, tracking.progress_m)
+        progress = now.follower.advance(reference, state, now.progress_m)
         last = now.route.end_m.shape[1] - 1
         done = progress >= now.route.end_m.gather(1, now.edge.clamp(max=last)[:, None])[:, 0]
         edge = torch.minimum(now.edge + done, now.route.depth)
@@ -237,7 +242,7 @@ class CLRRT(Planner[CLRRTState]):
         return replace(
             now,
             edge=edge,
-            tracking=replace(tracking, progress_m=progress),
+            progress_m=progress,
             failures=torch.where(astray, 0, now.failures),
             mark_m=torch.where(moved, along, now.mark_m),
             mark_step=torch.where(moved, now.step, now.mark_step),
@@ -260,12 +265,11 @@ class CLRRT(Planner[CLRRTState]):
         failures = torch.where(found | crosses, 0, failures + 1)
         taken = (found | lost).nonzero()[:, 0]
         members = due[taken]
-        tracking = now.tracking
         return replace(
             now,
-            route=map_tensors(lambda old, new: old.index_copy(0, members, new[taken]), now.route, route),
+            route=map_tensors(now.route, lambda old, new: old.index_copy(0, members, new[taken]), route),
             edge=now.edge.index_fill(0, members, 0),
-            tracking=replace(tracking, progress_m=tracking.progress_m.index_fill(0, members, 0)),
+            progress_m=now.progress_m.index_fill(0, members, 0),
             failures=now.failures.index_copy(0, due, failures),
             mark_m=now.mark_m.index_fill(0, members, 0),
             mark_step=now.mark_step.index_fill(0, members, now.step),
@@ -273,18 +277,20 @@ class CLRRT(Planner[CLRRTState]):
 
     def _search(self, root: Tensor, now: CLRRTState, members: Tensor, failures: Tensor) -> Route:
         """Grows trees from root states [M, S] of some episodes and takes the best path of each."""
-        config, everyone = self.config, len(members) == len(now.problem)
-        loop = self._closed_loop(now.problem if everyone else now.problem.select(members), failures)
+        config, problem = self.config, now.problem
+        if len(members) < len(problem):
+            problem = problem.select(members)
+        loop = self._closed_loop(problem, now.follower, failures)
         key = rng.stream_key(now.seed, "cl_rrt", now.step)
         draws = rng.uniform(key, np.zeros(1, dtype=np.int64), (config.rounds, config.expansions_per_round, 3))
         chance = torch.from_numpy(draws[0]).to(root)
-        sample_m = chance[..., :2] * root.new_tensor(now.problem.grid.extent_m)
+        sample_m = chance[..., :2] * root.new_tensor(problem.grid.extent_m)
         goal_edges = math.ceil(config.goal_bias * config.expansions_per_round)
         return search(loop, root, now.tracking.select(members), sample_m, chance[..., 2], goal_edges)
 
-    def _closed_loop(self, problem: Problem, failures: Tensor) -> ClosedLoop:
+    def _closed_loop(self, problem: Problem, follower: PathFollower, failures: Tensor) -> ClosedLoop:
         """What trees are grown with after so many failed plans, int64 [B]."""
-        config, follower = self.config, self._follower(problem)
+        config = self.config
         least_m = max(follower.tightest_m, min(config.turning_radius_m, SPACING_M))
         tries = failures % config.most_failures
         return ClosedLoop(
@@ -295,9 +301,6 @@ class CLRRT(Planner[CLRRTState]):
             step_m=config.step_m,
             edge_time_s=config.edge_time_s,
         )
-
-    def _follower(self, problem: Problem) -> PathFollower:
-        return PathFollower(self.config.follower, problem.robot)
 
 
 def _reference(route: Route, edge: Tensor) -> Reference:

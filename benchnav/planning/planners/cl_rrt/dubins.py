@@ -18,7 +18,7 @@ from torch import Tensor
 
 def dubins_length_to_point(start: Tensor, point: Tensor, radius: float | Tensor) -> Tensor:
     """Length of the shortest path to points with free heading; see `dubins_segments_to_point`."""
-    arc, rest, _, _ = _to_point(start, point, radius)
+    arc, rest, *_ = _to_point(start, point, radius)
     return (arc + rest) * radius
 
 

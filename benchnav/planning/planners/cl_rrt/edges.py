@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_segments_to_point, sample_segments
 from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, PathFollower, Reference, Tracking
@@ -52,18 +53,13 @@ class ClosedLoop:
     edge_time_s: float
 
     @property
-    def reference_points(self) -> int:
-        """Points N of a reference: as far as the controller looks ahead from an edge's end."""
-        return 2 + math.ceil((self.step_m + self.follower.lookahead_m) / SPACING_M)
-
-    @property
     def drawn_points(self) -> int:
         """Drawn points P of an edge."""
         return 1 + math.ceil(self.step_m / DRAWN_M)
 
 
 @dataclass(frozen=True, kw_only=True)
-class LoopState:
+class LoopState(Batch):
     """All that it takes to drive on from somewhere. Shapes begin with [B, R].
 
     Args:
@@ -112,7 +108,9 @@ def draw_references(loop: ClosedLoop, pose: Tensor, target_m: Tensor) -> tuple[R
         The references, and the length of each path, shape [B, R]; references run straight on past it.
     """
     curvature, lengths_m = dubins_segments_to_point(pose, target_m, loop.radius_m[:, None])
-    poses = sample_segments(pose, curvature, lengths_m, SPACING_M, loop.reference_points)
+    # As far as the controller looks ahead from an edge's end.
+    count = 2 + math.ceil((loop.step_m + loop.follower.lookahead_m) / SPACING_M)
+    poses = sample_segments(pose, curvature, lengths_m, SPACING_M, count)
     length_m = lengths_m.sum(dim=-1)
     return Reference.along(poses, length_m), length_m
 
@@ -122,7 +120,7 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
 
     Args:
         loop: robots, controller and ground.
-        begin: where the edges begin; the progress of its tracking is not read.
+        begin: where the edges begin.
         reference: what to follow, of shape [B, R].
         length_m: length of each reference, shape [B, R].
 
@@ -138,9 +136,7 @@ def drive(loop: ClosedLoop, begin: LoopState, reference: Reference, length_m: Te
     half = (_first(collided) - 1).clamp(min=0) // 2
     last = torch.where(_at(collided, last), half, last)
     before = (last - 1).clamp(min=0)
-    tracking = Tracking(
-        torch.zeros_like(end_m), _at(path, before)[..., :2], _at(integral, last), _at(error, last)
-    )
+    tracking = Tracking(_at(path, before)[..., :2], _at(integral, last), _at(error, last))
     return Edges(
         kept=last > 0,
         at=LoopState(state=_at(path, last), tracking=tracking, free=_at(free, last)),

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.batch import Batch
+from benchnav.core.errors import expect
 from benchnav.planning.planners.planner import check_finite
-from benchnav.planning.problem import Batch
 from benchnav.planning.robots import SPEED, TURN_RATE, Robot
 
 SPACING_M = 0.1  # between the points of a reference
@@ -98,16 +98,14 @@ class Reference:
 
 @dataclass(frozen=True)
 class Tracking(Batch):
-    """What a follower carries from step to step.
+    """What a follower carries from step to step, beside its progress.
 
     Args:
-        progress_m: arc length along the reference, shape [*B].
         position_m: where the robot was a step ago, shape [*B, 2].
         integral: the integral term of the speed, m/s, shape [*B].
         error_mps: the speed's error a step ago, shape [*B].
     """
 
-    progress_m: Tensor
     position_m: Tensor
     integral: Tensor
     error_mps: Tensor
@@ -116,7 +114,7 @@ class Tracking(Batch):
     def standing(cls, state: Tensor) -> "Tracking":
         """Tracking of robots that stand at the beginning of their references, states [*B, S]."""
         zero = torch.zeros_like(state[..., 0])
-        return cls(zero, state[..., :2], zero, zero)
+        return cls(state[..., :2], zero, zero)
 
 
 class PathFollower:
@@ -133,12 +131,12 @@ class PathFollower:
     def __init__(self, config: FollowerConfig, robot: Robot) -> None:
         """Reads the bounds."""
         names, low, high = tuple(robot.action_names), robot.action_low, robot.action_high
-        if names != (SPEED, TURN_RATE) or not high[0] > 0 or not low[1] < 0 < high[1]:
-            raise ConfigError(
-                f"Expected a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than 0 and the "
-                f"second to both sides, got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. "
-                "Take a planner that samples actions, such as mppi."
-            )
+        expect(
+            names == (SPEED, TURN_RATE) and high[0] > 0 and low[1] < 0 < high[1],
+            f"a robot with actions ({SPEED}, {TURN_RATE}), the first up to more than 0 and the second to both sides, "
+            f"got ({', '.join(names)}) from {tuple(low)} to {tuple(high)}. Take a planner that samples actions, such "
+            "as mppi.",
+        )
         self.config = config
         self.dt_s = robot.dt_s
         self.speed_mps = low[0], high[0]
@@ -174,7 +172,7 @@ class PathFollower:
         Args:
             reference: paths, of shape [*B].
             state: shape [*B, S].
-            tracking: from the step before; its progress is not read.
+            tracking: from the step before.
             progress_m: from `advance`, shape [*B].
 
         Returns:
@@ -201,4 +199,4 @@ class PathFollower:
         speed = speed.clamp(low, high)
         turn_rate = (speed * curvature).clamp(-self.turn_rate_radps, self.turn_rate_radps)
         action = torch.stack((speed, turn_rate), dim=-1)
-        return action, Tracking(progress_m, state[..., :2], integral, error)
+        return action, Tracking(state[..., :2], integral, error)

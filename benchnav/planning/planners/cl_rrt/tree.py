@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from benchnav.core.batch import Batch, map_tensors
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
@@ -37,7 +38,6 @@ from benchnav.planning.planners.cl_rrt.edges import (
 )
 from benchnav.planning.planners.cl_rrt.pursuit import SPACING_M, Tracking
 from benchnav.planning.planners.planner import PlanStatus
-from benchnav.planning.problem import map_tensors
 
 _EXPLORE = (0.7, 0.3)  # share of choices that explore, before and after a way to the goal is known
 _PARTIAL_GAIN_M = 0.5  # a partial path that leads no further than this toward the goal is none
@@ -79,13 +79,13 @@ class Tree(Choice, Edges):
         return self.time_s + PENALTY * self.blocked_m
 
     @property
-    def best_cost(self) -> Tensor:
-        """What the best way to the goal costs, inf where none is known, shape [B]."""
-        return torch.where(self.arrived, self.cost, math.inf).amin(dim=1)
+    def best(self) -> tuple[Tensor, Tensor]:
+        """What the best way to the goal costs, inf where none is known, and its node, each of shape [B]."""
+        return torch.where(self.arrived, self.cost, math.inf).min(dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Route:
+class Route(Batch):
     """What was planned for each episode.
 
     Args:
@@ -139,12 +139,22 @@ def search(
 def plant(loop: ClosedLoop, root: Tensor, tracking: Tracking) -> Tree:
     """A tree of the root alone; arguments as for `search`."""
     begin = LoopState(state=root, tracking=tracking, free=loop.problem.free_at(root))
-    at = map_tensors(lambda values: values[:, None], begin)
+    at = map_tensors(begin, lambda values: values[:, None])
     zero = torch.zeros_like(root[:, :1])
-    false, drawn = zero.bool(), zero.new_full((len(root), 1, loop.drawn_points, 2), math.nan)
-    choice = {"parent": zero.long(), "target_m": at.state[..., :2], "aimed": false}
-    driven = {"time_s": zero, "blocked_m": zero, "arrived": false, "end_m": zero, "drawn": drawn}
-    return Tree(at=at, kept=~false, to_goal_m=_to_goal_m(loop, at.state), **choice, **driven)
+    false = zero.bool()
+    return Tree(
+        parent=zero.long(),
+        target_m=at.state[..., :2],
+        aimed=false,
+        at=at,
+        kept=~false,
+        time_s=zero,
+        blocked_m=zero,
+        arrived=false,
+        end_m=zero,
+        drawn=zero.new_full((len(root), 1, loop.drawn_points, 2), math.nan),
+        to_goal_m=_to_goal_m(loop, at.state),
+    )
 
 
 def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_edges: int) -> Choice:
@@ -157,7 +167,7 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
         chance: uniform in [0, 1), shape [R].
         goal_edges: how many of the R edges go to the goal instead, while there are nodes that have not.
     """
-    best = tree.best_cost[:, None]
+    best = tree.best[0][:, None]
     found = best < math.inf
     straight_m = (distance(tree.at.state, loop.problem.goal_m[:, None]) - loop.problem.goal_radius_m).clamp(
         min=0
@@ -192,7 +202,7 @@ def choose(loop: ClosedLoop, tree: Tree, sample_m: Tensor, chance: Tensor, goal_
 
 def stand(tree: Tree, node: Tensor) -> LoopState:
     """Where the closed loop stands at nodes, int64 [B, R]."""
-    return map_tensors(lambda values: _take(values, node), tree.at)
+    return map_tensors(tree.at, lambda values: _take(values, node))
 
 
 def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
@@ -206,7 +216,7 @@ def add(loop: ClosedLoop, tree: Tree, choice: Choice, edges: Edges) -> Tree:
     )
     to_goal_m = torch.where(kept, _to_goal_m(loop, edges.at.state), math.inf)
     new = Tree(**vars(choice), **vars(edges), to_goal_m=to_goal_m)
-    return map_tensors(lambda old, added: torch.cat((old, added), dim=1), tree, new)
+    return map_tensors(tree, lambda old, added: torch.cat((old, added), dim=1), new)
 
 
 def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
@@ -217,18 +227,18 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
         tree: grown.
         rounds: in which it was grown, so that no path has more edges: D.
     """
-    found = tree.best_cost < math.inf
-    cheapest = torch.where(tree.arrived, tree.cost, math.inf).argmin(dim=1)
-    chain = [torch.where(found, cheapest, _best_partial(tree))]
+    cost, cheapest = tree.best
+    found = cost < math.inf
+    chain = [torch.where(found, cheapest, _best_partial(tree))[:, None]]
     for _ in range(rounds):
-        chain.append(tree.parent.gather(1, chain[-1][:, None])[:, 0])
-    backward = torch.stack(chain, dim=1)  # ends in zeros
+        chain.append(tree.parent.gather(1, chain[-1]))
+    backward = torch.cat(chain, dim=1)  # ends in zeros
     depth = (backward > 0).sum(dim=1)
     order = depth[:, None] - 1 - torch.arange(rounds, device=depth.device)
     nodes = torch.where(order >= 0, backward.gather(1, order.clamp(min=0)), 0)
     end_m = tree.end_m.gather(1, nodes)
     early = (order == 0) & ~found[:, None]
-    crossed = loop.crossing & (tree.blocked_m.gather(1, chain[0][:, None])[:, 0] > 0)
+    crossed = loop.crossing & (tree.blocked_m.gather(1, chain[0])[:, 0] > 0)
 
     pose = stand(tree, tree.parent.gather(1, nodes)).state[..., :3]
     reference, _ = draw_references(loop, pose, _take(tree.target_m, nodes))
@@ -244,17 +254,10 @@ def best_route(loop: ClosedLoop, tree: Tree, rounds: int) -> Route:
 
 
 def no_route(loop: ClosedLoop, rounds: int, edges: int) -> Route:
-    """Routes without a path, of the shapes that searched ones have."""
-    batch, start, points = len(loop.problem), loop.problem.start, loop.drawn_points
-    zero = start.new_zeros(batch).long()
-    return Route(
-        status=torch.full_like(zero, PlanStatus.PARTIAL),
-        depth=zero,
-        rows=start.new_zeros(batch, rounds, loop.reference_points, 4),
-        end_m=start.new_zeros(batch, rounds),
-        path=start.new_full((batch, rounds * points, 2), math.nan),
-        tree=start.new_full((batch, edges, points, 2), math.nan),
-    )
+    """Routes without a path, of the shapes that searched ones have: of trees with nothing but roots."""
+    root = plant(loop, loop.problem.start, Tracking.standing(loop.problem.start))
+    tree = map_tensors(root, lambda values: values.repeat_interleave(1 + edges, dim=1))
+    return best_route(loop, tree, rounds)
 
 
 def _best_partial(tree: Tree) -> Tensor:

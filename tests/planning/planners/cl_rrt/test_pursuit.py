@@ -45,9 +45,10 @@ def drive(
     follower = PathFollower(config or FollowerConfig(), robot)
     state = robot.initial_state(torch.tensor([start], dtype=torch.float32))
     tracking, ground = Tracking.standing(state), torch.tensor([traversability])
+    progress = torch.zeros_like(state[:, 0])
     states, actions, progresses = [state], [], []
     for _ in range(steps):
-        progress = follower.advance(reference, state, tracking.progress_m)
+        progress = follower.advance(reference, state, progress)
         action, tracking = follower.act(reference, state, tracking, progress)
         state = robot(state, action, ground)
         states.append(state)
@@ -104,7 +105,7 @@ def test_integral_makes_up_for_the_ground(gain: float, speed: float) -> None:
 def test_derivative_damps_a_change_of_speed() -> None:
     error = torch.tensor([0.5])
     state = torch.tensor([[0.05, 0.0, 0.0]])
-    tracking = Tracking(torch.zeros(1), torch.zeros(1, 2), torch.zeros(1), error)
+    tracking = Tracking(torch.zeros(1, 2), torch.zeros(1), error)
     speeds = []
     for gain in (0.0, 0.1):
         config = FollowerConfig(speed_mps=0.6, speed_kp=0.0, speed_ki=0.0, speed_kd=gain)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import map_tensors
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.planners.cl_rrt.dubins import dubins_length_to_point
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop, draw_references, drive
@@ -22,7 +23,6 @@ from benchnav.planning.planners.cl_rrt.tree import (
     stand,
 )
 from benchnav.planning.planners.planner import PlanStatus
-from benchnav.planning.problem import map_tensors
 from tests.planning.planners.cl_rrt.maps import known, make_loop, open_map, walled_map
 
 GAP = slice(24, 28)
@@ -57,7 +57,7 @@ def tensors(value: object) -> list[Tensor]:
         found.append(tensor)
         return tensor
 
-    map_tensors(keep, value)
+    map_tensors(value, keep)
     return found
 
 
@@ -150,7 +150,7 @@ def test_a_way_costs_its_time_and_the_penalty_of_metres_that_are_not_free() -> N
     )
     torch.testing.assert_close(tree.blocked_m[0], torch.tensor([0.0, 0.0, 1.0, 1.0]), rtol=0, atol=0.1)
     torch.testing.assert_close(tree.cost, tree.time_s + PENALTY * tree.blocked_m)
-    torch.testing.assert_close(tree.best_cost, tree.cost[:, 3])
+    torch.testing.assert_close(tree.best[0], tree.cost[:, 3])
 
 
 def test_cheapest_way_is_taken_and_one_that_crosses_is_partial() -> None:
