@@ -14,6 +14,7 @@ from benchnav.core.command import INTERRUPTED, Command, run, show_progress
 from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
+from benchnav.datagen.dem.raster import Rasters
 
 if TYPE_CHECKING:
     from benchnav.datagen.files.reader import TerrainDataset
@@ -189,6 +190,7 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
 
 
 def import_dem(
+    rasters: Rasters,
     dem: str,
     overrides: list[str],
     out: str,
@@ -197,11 +199,6 @@ def import_dem(
     splits: str = "test/real",
     stride: float | None = None,
     scenario: str = "std",
-    classes: str = "",
-    class_ids: dict[int, str | None] | None = None,
-    random_classes: bool = False,
-    photo: str = "",
-    traversability: str = "",
     solvable: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -210,6 +207,7 @@ def import_dem(
     Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip:// archives, mosaics (.vrt).
 
     Args:
+        rasters: What there is of the ground beside its elevation.
         dem: Raster of elevations in metres, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         out: File .h5 to write, or else a folder of many files.
@@ -218,35 +216,23 @@ def import_dem(
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
         scenario: Which of the recipe's scenarios lights the maps.
-        classes: Raster of terrain classes; laid out at random when not given.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
-        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
-        photo: Raster of red, green and blue; painted by the class when not given.
-        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
         solvable: Keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: Replace what is there.
     """
     from benchnav.datagen.dem.importer import import_dem as import_maps
-    from benchnav.datagen.dem.survey import Rasters
     from benchnav.datagen.dem.tiling import read_shares
     from benchnav.datagen.files.hdf5 import name_of
 
     path = output_path(out)
-    rasters = Rasters(
-        dem=dem,
-        classes=classes,
-        class_ids=class_ids,
-        random_classes=random_classes,
-        photo=photo,
-        traversability=traversability,
-    )
     name = id or name_of(path)
     chosen = datagen.load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
+    if id or not overrides:
+        chosen = replace(chosen, id=name)
     steps = import_maps(
-        rasters,
+        dem,
         path,
         chosen,
-        dataset_id=chosen.id if overrides and not id else name,
+        rasters,
         shares=read_shares(splits),
         scenario=scenario,
         stride_m=stride,
@@ -298,7 +284,7 @@ def export(
     """
     from rich.filesize import decimal
 
-    from benchnav.datagen.export.croissant import AUTHORS, Publication, is_ours
+    from benchnav.datagen.export.export import AUTHORS, Publication, is_ours
     from benchnav.datagen.export.export import export as export_dataset
 
     dataset = _opened(file)
@@ -378,7 +364,7 @@ def main() -> None:
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
-        "import-dem": Command(import_dem, ("dem", "overrides")),
+        "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),
     }

@@ -18,16 +18,16 @@ _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADINGS = (
     "split", "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
 )  # fmt: skip
-# What columns hold: heading and sentence.
-_EXPLAINED = (
-    ("stuck %", "share of the cells that count as stuck: their true mean λ is at most λ_stuck, {stuck:g}."),
-    ("soft ground %", "share of the cells whose class has soft spots, which no colour shows; 0 where no class has."),
-    ("soft spots %", "share of all ground that is itself a soft spot, on average over draws of λ."),
-    ("time s", "of the fastest path over cells that are not stuck, at 1 m/s times their mean λ: median, least and most "
-     "of the maps. A dash where the recipe does not ask for it with `solvable: true`."),
-    ("straight free", "maps on which the straight line from start to goal meets no stuck cell. Where these are nearly "
-     "all, there is little to plan."),
-)  # fmt: skip
+# What columns hold.
+_NOTES = (
+    "  stuck %: share of the cells that count as stuck: their true mean λ is at most λ_stuck, {stuck:g}.",
+    "  soft ground %: share of the cells whose class has soft spots, which no colour shows; 0 where no class has.",
+    "  soft spots %: share of all ground that is itself a soft spot, on average over draws of λ.",
+    "  time s: of the fastest path over cells that are not stuck, at 1 m/s times their mean λ: median, least and most "
+    "of the maps. A dash where the recipe does not ask for it with `solvable: true`.",
+    "  straight free: maps on which the straight line from start to goal meets no stuck cell. Where these are nearly "
+    "all, there is little to plan.",
+)
 
 
 def of_split(dataset: TerrainDataset, split: str) -> Maps:
@@ -117,5 +117,5 @@ def table(dataset: TerrainDataset) -> Table:
         headings=_HEADINGS,
         numbers=True,
         rows=tuple(rows),
-        notes=tuple(f"  {heading}: {sentence.format(stuck=stuck)}" for heading, sentence in _EXPLAINED),
+        notes=tuple(note.format(stuck=stuck) for note in _NOTES),
     )

@@ -122,8 +122,10 @@ def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> s
         width: columns of a map.
         fields: the F fields.
     """
-    arrays = stored_arrays(fields, height, width)
-    table = [[name, arrays[name][0], [len(digests), *arrays[name][1]]] for name in fields]
+    table = [
+        [name, field.dtype, [len(digests), *field.entry_shape(height, width)]]
+        for name, field in fields.items()
+    ]
     text = json.dumps(table, separators=(",", ":")).encode()
     return hashlib.sha256(text + digests.tobytes()).hexdigest()
 

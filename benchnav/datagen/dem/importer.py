@@ -23,8 +23,8 @@ import numpy as np
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import building, real_place
-from benchnav.datagen.dem.raster import load_rasterio
-from benchnav.datagen.dem.survey import Rasters, Survey
+from benchnav.datagen.dem.raster import Rasters, load_rasterio
+from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
 from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
 from benchnav.datagen.files.hdf5 import Contents, assemble, held, pack
@@ -46,11 +46,11 @@ _REASONS = {
 
 
 def import_dem(
-    rasters: Rasters,
+    dem: str,
     out: Path,
     recipe: Recipe,
+    rasters: Rasters = Rasters(),  # noqa: B008
     *,
-    dataset_id: str,
     shares: Mapping[str, float] | None = None,
     scenario: str = "std",
     stride_m: float | None = None,
@@ -63,10 +63,10 @@ def import_dem(
     such. A map's random numbers go by its number in the ground, so they are the same whichever others are left out.
 
     Args:
-        rasters: where elevation, classes, colours and λ come from.
+        dem: elevations in metres, by any name that rasterio opens.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
-        recipe: size, resolution, start and goal of the maps, class table, light, seed.
-        dataset_id: name and version of the dataset.
+        recipe: id of the dataset, size, resolution, start and goal of the maps, class table, light, seed.
+        rasters: where classes, colours and λ come from.
         shares: of the maps, by split; None for all in `test/real`.
         scenario: which of the recipe's scenarios lights the maps.
         stride_m: from one map to the next; None for maps side by side.
@@ -80,11 +80,11 @@ def import_dem(
     out = real_place(out)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
-    recipe = replace(recipe, id=dataset_id, splits=splits)
+    recipe = replace(recipe, splits=splits)
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = Survey(stack, rasters, recipe, shares, stride_m)
+        ground = Survey(stack, dem, rasters, recipe, shares, stride_m)
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
         done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
@@ -96,7 +96,7 @@ def import_dem(
             part.finish()
         sizes = {name: replace(splits[name], maps=len(part.about["kept"])) for name, part in parts.items()}
         contents = Contents(
-            id=dataset_id,
+            id=recipe.id,
             recipes=[replace(recipe, splits=sizes)],
             splits={name: part.entry() for name, part in parts.items()},
             files={name: part.files for name, part in parts.items()},
@@ -127,38 +127,38 @@ class _Part:
         framed_m, given = self.ground.read(run)
         kept = np.ones(len(run.columns), dtype=bool)
         lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
-        if "class_id" in given:
-            lacks = np.isnan(given["class_id"])
-            if "rgb" in given:
+        if "classes" in given:
+            lacks = np.isnan(given["classes"])
+            if "photo" in given:
                 # A measured λ is worth learning from without a class.
                 lacks = lacks & np.isnan(given.get("traversability", np.nan))
                 lacking["missing_classes"] = lacks.all(axis=(1, 2, 3))
             else:  # a cell is painted in the colour of its class
                 lacking["missing_classes"] = lacks.any(axis=(1, 2, 3))
-        if "rgb" in given:
-            lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
+        if "photo" in given:
+            lacking["missing_colours"] = np.isnan(given["photo"]).any(axis=(1, 2, 3))
         for reason, which in lacking.items():
             self.left_out[reason] += int((kept & which).sum())
             kept &= ~which
         numbers = (run.row * tiling.tiles[1] + np.array(run.columns))[kept]
         if not len(numbers):
             return
-        framed_m = quantise(framed_m[kept], 13)
+        framed_m, given = quantise(framed_m[kept], 13), {name: values[kept] for name, values in given.items()}
         lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
         class_id = class_map(recipe, self.name, numbers)
-        if "class_id" in given:
-            class_id = np.nan_to_num(given["class_id"][kept, 0], nan=UNLABELLED).astype(np.int64)
+        if "classes" in given:
+            class_id = np.nan_to_num(given["classes"][:, 0], nan=UNLABELLED).astype(np.int64)
         labelled = class_id != UNLABELLED
         height_m = framed_m - lowest_m[:, None, None]
         maps = complete(recipe, self.name, numbers, np.where(labelled, class_id, 0), height_m)
         maps["class_id"] = class_id
         maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
-        if "class_id" in given:
+        if "classes" in given:
             maps["environment"] = np.zeros(len(numbers))
-        if "rgb" in given:
-            maps["rgb"] = np.rint(given["rgb"][kept])
+        if "photo" in given:
+            maps["rgb"] = np.rint(given["photo"])
         if "traversability" in given:
-            maps["traversability"] = quantise(given["traversability"][kept, 0], 16)
+            maps["traversability"] = quantise(given["traversability"][:, 0], 16)
         solvable = recipe.splits[self.name].solvable
         times_s = reference_time_s(recipe, maps) if solvable else np.full(len(numbers), np.nan)
         maps["reference_time_s"] = times_s
@@ -179,7 +179,7 @@ class _Part:
         """
         if not self.about["kept"]:
             reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
-            dem = self.ground.layers["elevation_m"].raster.name
+            dem = self.ground.layers["dem"].raster.name
             raise DatasetError(
                 f"Expected split {self.name!r} to get at least one map, got none from {dem}: of "
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "

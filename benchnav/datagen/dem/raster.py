@@ -13,11 +13,44 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import ConfigError, DatasetError, expect
 
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
 _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CRS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rasters:
+    """What there is of the ground beside its elevation. Where a raster does not cover it, maps are left out.
+
+    Args:
+        classes: Raster of terrain classes; laid out at random when not given.
+        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
+        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
+        photo: Raster of red, green and blue; painted by the class when not given.
+        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
+    """
+
+    classes: str = ""
+    class_ids: dict[int, str | None] | None = None
+    random_classes: bool = False
+    photo: str = ""
+    traversability: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuses what does not go together."""
+        expect(
+            self.classes or self.class_ids is None,
+            "`classes` with `class_ids`, got none. Pass the raster they belong to.",
+        )
+        expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
+        for name in ("photo", "traversability"):
+            expect(
+                not getattr(self, name) or self.classes or self.random_classes,
+                f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
+                "Pass --classes RASTER, or --random-classes if that is what you want.",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

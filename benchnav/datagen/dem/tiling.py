@@ -45,8 +45,7 @@ class Tiling:
     @property
     def cells(self) -> list[int]:
         """Cells of all maps together, northward and eastward."""
-        sides = zip(self.tiles, self.stride, self.shape, strict=True)
-        return [(tiles - 1) * stride + size for tiles, stride, size in sides]
+        return (np.subtract(self.tiles, 1) * self.stride + self.shape).tolist()
 
     @property
     def maps(self) -> int:
@@ -56,7 +55,7 @@ class Tiling:
     @property
     def overlaps(self) -> bool:
         """Whether neighbouring maps show some of the same ground."""
-        return any(step < size for step, size in zip(self.stride, self.shape, strict=True))
+        return bool(np.less(self.stride, self.shape).any())
 
     def groups(self, numbers: Sequence[int]) -> np.ndarray:
         """Finds which maps overlap, directly or by others between them.

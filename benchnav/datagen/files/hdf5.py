@@ -255,14 +255,14 @@ def _new_arrays(group: h5py.Group, maps: int, contents: Contents) -> dict[str, h
     fields, arrays = contents.fields, {}
     kinds = schema.stored_arrays(fields, *contents.recipes[0].grid.shape)
     for name, (dtype, entry) in kinds.items():
-        chunk = 1 if name in fields and "H" in fields[name].shape else max(1, min(maps, _VALUES_A_CHUNK))
+        about = fields.get(name)
+        chunk = 1 if about and "H" in about.shape else max(1, min(maps, _VALUES_A_CHUNK))
         arrays[name] = group.create_dataset(
             name, (maps, *entry), dtype, chunks=(chunk, *entry),
             shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
         )  # fmt: skip
-        if name in fields:
-            arrays[name].attrs["unit"] = fields[name].unit
-            arrays[name].attrs["meaning"] = fields[name].meaning
+        if about:
+            arrays[name].attrs.update(unit=about.unit, meaning=about.meaning)
     return arrays
 
 

@@ -279,7 +279,7 @@ def _check_ends(recipe: Recipe) -> None:
 def _check_scenarios(recipe: Recipe) -> None:
     extent_x, extent_y = recipe.grid.extent_m
     for name, scenario in recipe.scenarios.items():
-        most = scenario.crater_count[1] if recipe.synthesis == 1 else recipe.craters(scenario)[1]
+        _, most = recipe.craters(scenario)
         expect(
             most == 0 or 2 * scenario.crater_radius_m[1] <= min(extent_x, extent_y),
             f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "

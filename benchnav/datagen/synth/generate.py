@@ -161,13 +161,11 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
     """Draws maps that may or may not be solvable; see `complete`."""
     key = partial(rng.stream_key, recipe.seed, split)
     grid, scenario = recipe.grid, recipe.scenarios[recipe.splits[split].scenario]
+    surface = key("elevation", attempt), indices, grid.shape, scenario.roughness
     if recipe.synthesis == 1:
-        ground = elevation.fractal(key("elevation", attempt), indices, grid.shape, scenario.roughness)
+        ground = elevation.fractal(*surface)
     else:
-        cells = max(3, round(REFERENCE_M / recipe.resolution_m))
-        ground = elevation.open_fractal(
-            key("elevation", attempt), indices, grid.shape, scenario.roughness, cells
-        )
+        ground = elevation.open_fractal(*surface, max(3, round(REFERENCE_M / recipe.resolution_m)))
     relief, crowding = rng.uniform(key("relief", attempt), indices, (2,)).T
     ground *= _within(scenario.relief_m, relief)[:, None, None]
     low, high = recipe.craters(scenario)
