@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from benchnav import datagen
-from benchnav.core.command import INTERRUPTED, Command, run, show_progress
+from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
 from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
@@ -76,7 +76,7 @@ def create(
     steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     done, total = next(steps)
     if done:
-        print(f"{done} of {total} maps were there already", file=sys.stderr)
+        tell(f"{done} of {total} maps were there already")
     show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
         print(
@@ -167,8 +167,10 @@ def validate(file: str) -> int:
             f"To make them anew, remove {' '.join(files)} in {path} and give the command again that made it."
         )
     else:
-        same = "the same recipe and version give the same digests"
-        print(f"To make them anew, make the file again with --overwrite: {same}.")
+        print(
+            "To make them anew, make the file again with --overwrite: the same recipe and version give the same "
+            "digests."
+        )
     return 1
 
 
@@ -288,7 +290,7 @@ def export(
     from benchnav.datagen.export.export import export as export_dataset
 
     dataset = _opened(file)
-    chosen = [name for name in dataset.splits if splits is None or name in splits]
+    chosen = choose("splits", splits, dataset.splits)
     expect(
         (license and creator) or is_ours(dataset, chosen),
         f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped recipe, got none. Pass yours; of "
@@ -296,7 +298,7 @@ def export(
     )
     publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
     path = output_path(out)
-    steps = export_dataset(dataset, path, publication, splits, fields, maps_per_file, overwrite)
+    steps = export_dataset(dataset, path, publication, chosen, fields, maps_per_file, overwrite)
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))
     size = decimal(sum(item.stat().st_size for item in files))
@@ -325,8 +327,10 @@ def preview(
     dataset = _opened(file)
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
     path = output_path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
-    is_picture = path.suffix in (".png", ".pdf", ".svg", ".jpg")
-    expect(is_picture, f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
+    expect(
+        path.suffix in (".png", ".pdf", ".svg", ".jpg"),
+        f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
+    )
     expect(maps is None or not contact_sheet, "either `maps` or `contact-sheet`, got both.")
     expect(maps is None or maps, "`maps` with at least one index, got none.")
     if contact_sheet:
@@ -371,5 +375,5 @@ def main() -> None:
     description = "Make, list, show, check, combine, import, export and draw terrain datasets."
     status = run("benchnav-datagen", description, commands)
     if status == INTERRUPTED and sys.argv[1] == "create":
-        print("benchnav-datagen: to go on, give the same command again", file=sys.stderr)
+        tell("benchnav-datagen: to go on, give the same command again")
     sys.exit(status)

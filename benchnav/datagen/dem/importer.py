@@ -26,8 +26,8 @@ from benchnav.core.store import building, real_place
 from benchnav.datagen.dem.raster import Rasters, load_rasterio
 from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
-from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
-from benchnav.datagen.files.hdf5 import Contents, assemble, held, pack
+from benchnav.datagen.files.create import SHARD_CELLS
+from benchnav.datagen.files.hdf5 import Contents, ShardFile, assemble, held, pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
 from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
@@ -87,8 +87,8 @@ def import_dem(
         ground = Survey(stack, dem, rasters, recipe, shares, stride_m)
         folder = stack.enter_context(building(out))
         parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
-        done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
-        for run in ground.tiling.runs(most):
+        done = 0
+        for run in ground.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
             parts[run.split].add(run)
             done += len(run.columns)
             yield done, ground.tiling.maps
@@ -119,7 +119,6 @@ class _Part:
     left_out: Counter[str] = field(default_factory=Counter)
     files: list[Path] = field(default_factory=list)
     pending: list[Maps] = field(default_factory=list)
-    written: int = 0
 
     def add(self, run: Run) -> None:
         """Makes maps and counts those that are left out; writes a shard where enough are kept."""
@@ -164,11 +163,10 @@ class _Part:
         maps["reference_time_s"] = times_s
         solved = np.isfinite(times_s) | (not solvable)
         self.left_out["not_solvable"] += int((~solved).sum())
-        found = (numbers, lowest_m, (~labelled).sum(axis=(1, 2)))
-        for values, more in zip(self.about.values(), found, strict=True):
-            values += more[solved].tolist()
-        self.pending.append({name: maps[name][solved].astype(kind.dtype) for name, kind in FIELDS.items()})
-        if (len(self.about["kept"]) - self.written) * recipe.height * recipe.width >= SHARD_CELLS:
+        about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
+        stored = {name: maps[name].astype(kind.dtype) for name, kind in FIELDS.items()}
+        self.pending.append({name: values[solved] for name, values in {**stored, **about}.items()})
+        if sum(maps["class_id"].size for maps in self.pending) >= SHARD_CELLS:
             self._flush()
 
     def finish(self) -> None:
@@ -177,6 +175,8 @@ class _Part:
         Raises:
             DatasetError: no map was kept.
         """
+        if self.pending:
+            self._flush()
         if not self.about["kept"]:
             reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
             dem = self.ground.layers["dem"].raster.name
@@ -185,17 +185,19 @@ class _Part:
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "
                 "or a recipe of easier ground."
             )
-        if self.written < len(self.about["kept"]):
-            self._flush()
         if self.ground.tiling.overlaps:
             self._add_groups()
 
     def _flush(self) -> None:
-        shard = ShardFile(split=self.name, first=self.written, stop=len(self.about["kept"]))
-        maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}
-        self.files.append(self.folder / shard.name)
-        self._write(self.files[-1], maps, shard.first)
-        self.pending, self.written = [], shard.stop
+        maps = {name: np.concatenate([some[name] for some in self.pending]) for name in self.pending[0]}
+        first = len(self.about["kept"])
+        for name, values in self.about.items():
+            values += maps.pop(name).tolist()
+        shard = ShardFile(self.name, first, len(self.about["kept"]))
+        self.pending = []
+        if shard.maps:
+            self.files.append(self.folder / shard.name)
+            self._write(self.files[-1], maps, first)
 
     def _write(self, file: Path, maps: Maps, first: int) -> None:
         entry = self.entry(first, first + len(maps["environment"]))

@@ -28,7 +28,7 @@ _MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to her
 _CLIFF = 5.67  # of 80°, metres a metre: steeper than natural ground beside cells of height 0
 _METRES = ("m", "metre", "meter", "metres", "meters")
 # Rasters beside the elevation model: what the user calls them, dtypes of their bands, and how they are resampled.
-_OTHERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+_OTHERS = (
     ("classes", (), "mode"),
     ("photo", ("uint8",) * 3, "average"),
     ("traversability", (), "average"),

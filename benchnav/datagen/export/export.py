@@ -1,6 +1,8 @@
 """Exports a dataset to a folder, whole or not at all: Parquet files, and what they are.
 
-For programs that is Croissant 1.0 metadata (JSON-LD), for hubs and people a card. Source: Croissant Format Specification 1.0, http://mlcommons.org/croissant/1.0.
+For programs that is Croissant 1.0 metadata (JSON-LD), for hubs and people a card.
+
+Source: Croissant Format Specification 1.0, http://mlcommons.org/croissant/1.0.
 """
 
 import datetime
@@ -203,7 +205,6 @@ def metadata(
         publication: licence, creator, place and date.
         folder: where the files are.
     """
-    files = {name: sorted((folder / FOLDER).glob(f"{name}-*-of-*.parquet")) for name in names.values()}
     content = hashlib.sha256(",".join(dataset.splits[split]["digest"] for split in names).encode())
     found = re.search(r"-v(\d+)", dataset.id)
     return {
@@ -219,7 +220,7 @@ def metadata(
         **({"version": f"{found[1]}.0.0"} if found else {}),
         "keywords": ["robotics", "off-road navigation", "traversability", "terrain"],
         **({"citeAs": PAPER} if is_ours(dataset, names) else {}),
-        "distribution": [item for name, own in files.items() for item in _distribution(name, own, folder)],
+        "distribution": [item for name in names.values() for item in _distribution(name, folder)],
         "recordSet": [
             _classes(dataset),
             *(_maps(dataset, split, name, fields) for split, name in names.items()),
@@ -232,9 +233,10 @@ def _node(kind: str, node_id: str, **about: Any) -> dict[str, Any]:
     return {"@type": f"cr:{kind}", "@id": node_id, "name": node_id.rpartition("/")[2], **about}
 
 
-def _distribution(name: str, files: Sequence[Path], folder: Path) -> Iterator[dict[str, Any]]:
+def _distribution(name: str, folder: Path) -> Iterator[dict[str, Any]]:
     """The files of a split, and all of them as a set."""
-    for path in files:
+    pattern = f"{FOLDER}/{name}-*-of-*.parquet"
+    for path in sorted(folder.glob(pattern)):
         yield _node(
             "FileObject",
             path.name,
@@ -243,7 +245,6 @@ def _distribution(name: str, files: Sequence[Path], folder: Path) -> Iterator[di
             encodingFormat="application/x-parquet",
             sha256=digest_of_path(path),
         )
-    pattern = f"{FOLDER}/{name}-*-of-*.parquet"
     yield _node("FileSet", f"{name}-files", encodingFormat="application/x-parquet", includes=pattern)
 
 

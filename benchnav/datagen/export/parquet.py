@@ -93,8 +93,8 @@ def write_split(
     Yields:
         How many maps were written in each step.
     """
-    cells = dataset.grid.height * dataset.grid.width
-    most, step = maps_a_file or max(1, CELLS_A_FILE // cells), max(1, _CELLS_A_ROW_GROUP // cells)
+    most = maps_a_file or dataset.grid.maps_in(CELLS_A_FILE)
+    step = dataset.grid.maps_in(_CELLS_A_ROW_GROUP)
     every, columns = range(dataset.map_count(split)), table_schema(dataset, split, fields)
     files = -(-len(every) // most)
     for number in range(files):

@@ -10,7 +10,6 @@ import platform
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from benchnav.core.errors import ConfigError, DatasetError, expect
 from benchnav.core.store import Shard, real_place, replacing, restore, sole_writer
 from benchnav.core.workers import run_calls
 from benchnav.datagen.files.hdf5 import (
+    ShardFile,
     assemble,
     check_place,
     is_one_file,
@@ -34,31 +34,6 @@ from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
 
 SHARD_CELLS = 2**20
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShardFile:
-    """Consecutive maps of a recipe's split, in a file that is a dataset by itself.
-
-    Args:
-        split: name of the split.
-        first: its first map.
-        stop: one past its last.
-    """
-
-    split: str
-    first: int
-    stop: int
-
-    @property
-    def maps(self) -> int:
-        """Number of maps."""
-        return self.stop - self.first
-
-    @property
-    def name(self) -> str:
-        """Name of its file."""
-        return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
 
 
 def create(
@@ -130,9 +105,9 @@ def create(
 
 def cut(recipe: Recipe, cells: int) -> list[ShardFile]:
     """Cuts a recipe into shards of about so many cells, in the order of splits and maps."""
-    size = max(1, cells // (recipe.height * recipe.width))
+    size = recipe.grid.maps_in(cells)
     return [
-        ShardFile(split=split, first=first, stop=min(first + size, spec.maps))
+        ShardFile(split, first, min(first + size, spec.maps))
         for split, spec in recipe.splits.items()
         for first in range(0, spec.maps, size)
     ]
@@ -153,8 +128,7 @@ def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, byt
             f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
         )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
-    entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
-    return shard, pack(recipe, shard.split, entry, maps)
+    return shard, pack(recipe, shard.split, recipe_entry(recipe, shard), maps)
 
 
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
@@ -163,7 +137,7 @@ def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
         manifest = read_manifest(path)
     except DatasetError:
         return False
-    entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
+    entry = recipe_entry(recipe, shard)
     made_by = manifest["recipes"], manifest["generator"]["version"]
     return made_by == ([recipe.to_dict()], benchnav.__version__) and (
         entry.items() <= manifest["splits"].get(shard.split, {}).items()

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -75,16 +75,36 @@ class Contents:
         }
 
 
+class ShardFile(NamedTuple):
+    """Consecutive maps of a recipe's split, in a file that is a dataset by itself: from one on, to before another."""
+
+    split: str
+    first: int
+    stop: int
+
+    @property
+    def maps(self) -> int:
+        """Number of maps."""
+        return self.stop - self.first
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
+
+
 def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
     """All maps of a recipe, by split the files that hold them."""
-    splits = {name: recipe_entry(recipe, name, 0, spec.maps) for name, spec in recipe.splits.items()}
+    splits = {
+        name: recipe_entry(recipe, ShardFile(name, 0, spec.maps)) for name, spec in recipe.splits.items()
+    }
     return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
 
 
-def recipe_entry(recipe: Recipe, split: str, first: int, stop: int) -> dict[str, Any]:
+def recipe_entry(recipe: Recipe, shard: ShardFile) -> dict[str, Any]:
     """The manifest's entry of consecutive maps of a recipe's split, without their digest."""
-    part = {"maps": stop - first, "recipe": 0, "split": split, "first": first}
-    return {"scenario": recipe.splits[split].scenario, "maps": stop - first, "parts": [part]}
+    part = {"maps": shard.maps, "recipe": 0, "split": shard.split, "first": shard.first}
+    return {"scenario": recipe.splits[shard.split].scenario, "maps": shard.maps, "parts": [part]}
 
 
 def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[Source]]) -> None:

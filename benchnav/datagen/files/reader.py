@@ -183,13 +183,12 @@ class TerrainDataset:
             place, index = item
             return self._piece_of(split, index).path, index - place
 
-        runs = []  # of maps that follow one another in a file
-        for _, items in groupby(enumerate(chosen), run_of):
-            run = [index for _, index in items]
-            runs.append(self.read_run(split, run[0], len(run), names))
-        if not runs:
-            return self.read_run(split, 0, 0, names)
-        return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
+        # Of maps that follow one another in a file; of none, the first none.
+        runs = [[index for _, index in items] for _, items in groupby(enumerate(chosen), run_of)] or [[]]
+        parts = [self._read_run(split, run, names) for run in runs]
+        return (
+            parts[0] if len(parts) == 1 else {n: np.concatenate([part[n] for part in parts]) for n in names}
+        )
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
@@ -212,8 +211,7 @@ class TerrainDataset:
         Yields:
             Which maps, and what `read` gives of them.
         """
-        size = max(1, cells // (self.grid.height * self.grid.width))
-        count = self.map_count(split)
+        size, count = self.grid.maps_in(cells), self.map_count(split)
         for first in range(0, count, size):
             indices = range(first, min(first + size, count))
             yield indices, self.read(split, indices, fields)
@@ -255,12 +253,13 @@ class TerrainDataset:
         pieces = self.pieces[split]
         return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1]
 
-    def read_run(self, split: str, first: int, count: int, names: Collection[str]) -> Maps:
-        """Reads maps that follow one another in a file, as `read` does; what is asked for has to be there."""
+    def _read_run(self, split: str, run: Sequence[int], names: Collection[str]) -> Maps:
+        """Reads maps that follow one another in a file, as `read` does."""
+        first = run[0] if run else 0
         piece = self._piece_of(split, first)
         file, arrays = self._open(piece.path)
         read, most = Maps(), len(self.recipe.classes) - 1
-        which = slice(first - piece.first, first - piece.first + count)
+        which = slice(first - piece.first, first - piece.first + len(run))
         try:
             for name in names:
                 if (split, name) not in arrays:

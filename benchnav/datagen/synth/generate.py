@@ -39,7 +39,7 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
         ConfigError: a split asks for solvable maps and the recipe yields none for some index.
     """
     indices = np.asarray(indices, dtype=np.int64)
-    size = max(1, min(_PIECE, _PIECE_CELLS // (recipe.height * recipe.width)))
+    size = min(_PIECE, recipe.grid.maps_in(_PIECE_CELLS))
     pieces = [
         _generate_piece(recipe, split, indices[i : i + size]) for i in range(0, max(len(indices), 1), size)
     ]
