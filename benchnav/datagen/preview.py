@@ -19,7 +19,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.patheffects import AbstractPathEffect, withStroke
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from benchnav.core.figures import (
@@ -30,6 +30,7 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     frame_map,
     hatching,
+    legend_outside,
     mark,
     mark_handle,
     outline,
@@ -40,6 +41,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
+from benchnav.datagen.synth.slope import framed, horn_gradient
 
 FIELDS = ("rgb", "class_id", "elevation_m", "slope_deg", "traversability")
 STEEP_DEG = 30.0
@@ -216,10 +218,9 @@ def sheet_of_maps(
     panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
     figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
     figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
-    sides: Any = ((marks, len(marks), "outside upper right"), (classes, legend_columns, "outside lower left"))
-    for handles, count, loc in sides:
+    for handles, count, side in ((marks, len(marks), "upper right"), (classes, legend_columns, "lower left")):
         if handles:
-            for text in figure.legend(handles=handles, loc=loc, ncols=count).get_texts():
+            for text in legend_outside(figure, handles, count, side).get_texts():
                 text.set_parse_math(False)
     return figure
 
@@ -259,7 +260,6 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
-    halo: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
     for index in range(count):
         stored = {name: values[0] for name, values in dataset.read(split, [index], fields).items()}
         x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
@@ -273,7 +273,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
         box = (x, x + wide, y + high, y)
         sheet.imshow(image, origin="lower", extent=box, aspect="auto", interpolation="none")
         label = sheet.text(x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top")
-        label.set_path_effects(halo)
+        label.set_path_effects([withStroke(linewidth=1.4, foreground="black")])
     return figure
 
 
@@ -325,9 +325,10 @@ def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: flo
     """
     lift = np.clip(0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30)
     light = light_direction(np.array([0.75 * np.pi]), np.array([0.7]))
-    lit = shade(lift * elevation_m.astype(np.float64), resolution_m, light, 0.0) - light[0, 2]
-    colour = np.repeat((lit > 0).astype(np.float64)[..., None], 3, axis=-1)
-    return np.concatenate([colour, 0.7 * np.abs(lit)[..., None]], axis=-1)
+    ground_m = framed(lift * elevation_m.astype(np.float64))
+    lit = shade(*horn_gradient(ground_m, resolution_m), light, 0.0) - light[0, 2]
+    white = lit > 0
+    return np.stack([white, white, white, 0.7 * np.abs(lit)], axis=-1)
 
 
 def _draw_soft_ground(panel: Axes, edges: np.ndarray, line: float = 0.4) -> None:

@@ -76,6 +76,7 @@ OPTIONAL: dict[str, Field] = {
     ),
 }
 
+KNOWN = FIELDS | OPTIONAL
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 
@@ -88,11 +89,6 @@ def stored_arrays(fields: Fields, height: int, width: int) -> dict[str, tuple[st
     """Dtype and shape of a map's entry in each array that is stored of a split: its fields', and of their digests."""
     arrays = {name: (field.dtype, field.entry_shape(height, width)) for name, field in fields.items()}
     return {**arrays, ENTRY_DIGESTS: ("|u1", (len(fields), DIGEST_BYTES))}
-
-
-def fields_in(maps: Maps) -> dict[str, Field]:
-    """The fields that maps have, in the order of being stored."""
-    return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
 
 
 def entry_digests(maps: Maps, fields: Fields) -> ndarray:
@@ -172,7 +168,7 @@ def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
         dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
         symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
         foreign = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
-        fields[name] = (FIELDS | OPTIONAL).get(name, foreign)
+        fields[name] = KNOWN.get(name, foreign)
     return fields
 
 

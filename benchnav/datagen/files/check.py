@@ -78,9 +78,8 @@ def find_faults(path: str | Path) -> list[Fault]:
 def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, str, str, str]]:
     """The faults of a split: map, field, problem and file of each."""
     fields, count = list(dataset.fields), dataset.map_count(split)
-    stored = np.zeros((count, len(fields), schema.DIGEST_BYTES), np.uint8)
-    computed = np.zeros_like(stored)
-    is_stored = np.zeros(count, dtype=bool)
+    stored = np.ma.masked_all((count, len(fields), schema.DIGEST_BYTES), np.uint8)
+    computed = stored.copy()
     files: list[str] = []  # of each map
     for piece in dataset.pieces[split]:
         own = piece.path.name if piece.path != dataset.path else ""
@@ -105,23 +104,23 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                         continue
                     maps = slice(first, first + len(values))
                     if name == schema.ENTRY_DIGESTS:
-                        stored[maps], is_stored[maps] = values, True
+                        stored[maps] = values
                         continue
                     for index in _out_of_range(dataset, split, name, values):
                         yield first + index, name, "is out of range", own
                     digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
                     computed[maps, fields.index(name)] = digests[:, 0]
-    readable = computed.any(axis=2)
-    unlike = (computed != stored).any(axis=2) & readable & is_stored[:, None]
-    digest = schema.split_digest(computed, *dataset.grid.shape, dataset.fields)
-    if readable.all() and digest == dataset.splits[split]["digest"]:
+    is_readable = not np.ma.is_masked(computed)
+    unlike = (computed != stored).filled(False).any(axis=2)
+    digest = schema.split_digest(computed.data, *dataset.grid.shape, dataset.fields)
+    if is_readable and digest == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
         for index in np.flatnonzero(unlike.any(axis=1)).tolist():
             yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
     for index, column in np.argwhere(unlike).tolist():
         yield index, fields[column], "does not match its digest", files[index]
-    if readable.all() and not unlike.any():
+    if is_readable and not unlike.any():
         yield -1, "", "the maps do not match the digest in the manifest", ""
 
 
@@ -147,6 +146,6 @@ def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.nda
     if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
         allowed |= values == schema.UNLABELLED
     # Not asked for; not observed; what a field that is not ours means by it, it may mean.
-    if name in ("reference_time_s", "traversability") or name not in schema.FIELDS | schema.OPTIONAL:
+    if name in ("reference_time_s", "traversability") or name not in schema.KNOWN:
         allowed |= np.isnan(values)
     return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

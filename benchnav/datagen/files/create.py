@@ -9,7 +9,7 @@ it replaces a finished one it is made in such a folder too.
 import platform
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -69,7 +69,13 @@ def create(
     )
     shards = cut(recipe, shard_cells)
     own = shards if shard is None else shards[shard.index - 1 :: shard.of]
-    with named_errors(path), _held(path, shard):
+    # Of a folder several shards may be made at once, each by one process.
+    held = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}") if shard else path
+    with (
+        named_errors(path),
+        sole_writer(path, str(path), shared=True) if shard else nullcontext(),
+        sole_writer(held, str(path)),
+    ):
         restore(path)
         folder = _workplace(path, shards, shard, overwrite)
         folder.mkdir(parents=True, exist_ok=True)
@@ -142,17 +148,6 @@ def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
     return made_by == ([recipe.to_dict()], benchnav.__version__) and (
         entry.items() <= manifest["splits"].get(shard.split, {}).items()
     )
-
-
-@contextmanager
-def _held(path: Path, shard: Shard | None) -> Iterator[None]:
-    """Holds the dataset for one process, or a shard of it: several may be made at once."""
-    name = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}") if shard else path
-    with (
-        sole_writer(path, str(path), shared=shard is not None),
-        sole_writer(name, str(path)) if shard else nullcontext(),
-    ):
-        yield
 
 
 def _workplace(path: Path, shards: Sequence[ShardFile], shard: Shard | None, overwrite: bool) -> Path:

@@ -135,9 +135,10 @@ def pack(recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps
         entry: the manifest's entry of the split without its digest.
         maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
     """
-    contents = Contents(id=recipe.id, recipes=[recipe], splits={split: entry}, fields=schema.fields_in(maps))
+    fields = {name: field for name, field in schema.KNOWN.items() if name in maps}
+    contents = Contents(id=recipe.id, recipes=[recipe], splits={split: entry}, fields=fields)
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
-        digests = schema.entry_digests(maps, contents.fields)
+        digests = schema.entry_digests(maps, fields)
         _fill(file, contents, {split: [{**maps, schema.ENTRY_DIGESTS: digests}]})
         return file.id.get_file_image()
 

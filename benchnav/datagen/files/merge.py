@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.core.settings import plain
 from benchnav.core.store import building, real_place
 from benchnav.datagen import schema
@@ -51,8 +51,9 @@ def merge(
     name = dataset_id or name_of(out)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
+    sources = dict.fromkeys(chain(*contents.files.values()))
     with held(out, overwrite):
-        for path in dict.fromkeys(chain(*contents.files.values())):
+        for path in sources:
             if faults := find_faults(path):
                 raise DatasetError(
                     f"{path} is damaged: {faults[0]}. Run `benchnav-datagen validate` on it, which says how to make "
@@ -64,28 +65,22 @@ def merge(
             assemble(contents, out.parent, out)
             return
         with building(out) as folder:
-            assemble(replace(contents, files=_copies(contents, folder)), folder, out)
-
-
-def _copies(contents: Contents, folder: Path) -> dict[str, list[Path]]:
-    """Copies each file into a folder, under its own name where that is free; gives the copies by split."""
-    copies: dict[Path, Path] = {}
-    for path in dict.fromkeys(chain(*contents.files.values())):
-        name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
-        copies[path] = folder / name
-        shutil.copy2(path, copies[path])
-    return {split: [copies[path] for path in files] for split, files in contents.files.items()}
+            copies: dict[Path, Path] = {}
+            for path in sources:
+                # Under its own name where that is free.
+                name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
+                copies[path] = folder / name
+                shutil.copy2(path, copies[path])
+            files = {split: [copies[path] for path in own] for split, own in contents.files.items()}
+            assemble(replace(contents, files=files), folder, out)
 
 
 def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
+    check_name("id", dataset_id)
     datasets = [TerrainDataset(path) for path in paths]
     reasons = list(why_unlike(datasets))
     if len(datasets) < 2:
         reasons.append("fewer than two files")
-    try:
-        check_name("id", dataset_id)
-    except ConfigError as error:
-        reasons.append(str(error).rstrip("."))
     if reasons:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
     # The recipes, each once, and of each split the parts that refer to them and the files.

@@ -179,13 +179,18 @@ class TerrainDataset:
         if not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
 
-        def run_of(item: tuple[int, int]) -> tuple[Path, int]:
-            place, index = item
-            return self._piece_of(split, index).path, index - place
+        pieces = self.pieces[split]
 
-        # Of maps that follow one another in a file; of none, the first none.
-        runs = [[index for _, index in items] for _, items in groupby(enumerate(chosen), run_of)] or [[]]
-        parts = [self._read_run(split, run, names) for run in runs]
+        def run_of(item: tuple[int, int]) -> tuple[Piece, int]:
+            place, index = item
+            return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1], index - place
+
+        parts = []  # of maps that follow one another in a file
+        for (piece, _), items in groupby(enumerate(chosen), run_of):
+            run = [index for _, index in items]
+            parts.append(self._read_run(split, piece, range(run[0], run[-1] + 1), names))
+        if not parts:
+            return self._read_run(split, pieces[0], range(0), names)
         return (
             parts[0] if len(parts) == 1 else {n: np.concatenate([part[n] for part in parts]) for n in names}
         )
@@ -249,17 +254,11 @@ class TerrainDataset:
         """The files that hold maps."""
         return {piece.path for pieces in self.pieces.values() for piece in pieces}
 
-    def _piece_of(self, split: str, index: int) -> Piece:
-        pieces = self.pieces[split]
-        return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1]
-
-    def _read_run(self, split: str, run: Sequence[int], names: Collection[str]) -> Maps:
+    def _read_run(self, split: str, piece: Piece, run: range, names: Collection[str]) -> Maps:
         """Reads maps that follow one another in a file, as `read` does."""
-        first = run[0] if run else 0
-        piece = self._piece_of(split, first)
         file, arrays = self._open(piece.path)
         read, most = Maps(), len(self.recipe.classes) - 1
-        which = slice(first - piece.first, first - piece.first + len(run))
+        which = slice(run.start - piece.first, run.stop - piece.first)
         try:
             for name in names:
                 if (split, name) not in arrays:
@@ -349,8 +348,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         text = _manifest_text(path)
         manifest = json.loads(text)
         kind, version = manifest["format"], manifest["format_version"]
-        major, minor = (int(part) for part in version.split("."))
-        if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
+        if kind == schema.FORMAT and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION:
             manifest = unseal(text)
             schema.check(manifest)
             return manifest

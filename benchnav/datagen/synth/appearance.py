@@ -7,8 +7,6 @@ cells, M classes that a map shows.
 import numpy as np
 from numpy import ndarray
 
-from benchnav.datagen.synth.slope import horn_gradient
-
 
 def class_bands(noise: ndarray, occupancy: ndarray) -> ndarray:
     """Cuts noise at the quantiles that give each band its share of the cells.
@@ -40,23 +38,18 @@ def light_direction(azimuth_rad: ndarray, height: ndarray) -> ndarray:
     return np.stack([across * np.cos(azimuth_rad), across * np.sin(azimuth_rad), height], axis=-1)
 
 
-def shade(elevation_m: ndarray, resolution_m: float, light: ndarray, ambient: float) -> ndarray:
+def shade(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) -> ndarray:
     """Brightness of the ground: ambient + (1 − ambient)·max(0, n·l).
 
     Args:
-        elevation_m: shape [B, H, W].
-        resolution_m: cell width.
+        along_x: ∂z/∂x, shape [B, H, W].
+        along_y: ∂z/∂y, shape [B, H, W].
         light: unit vectors toward the light, shape [B, 3].
         ambient: share of ambient light, in [0, 1].
 
     Returns:
         Brightness in [0, 1], shape [B, H, W].
     """
-    return lambert(*horn_gradient(elevation_m, resolution_m), light, ambient)
-
-
-def lambert(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) -> ndarray:
-    """Brightness of ground of the given ∂z/∂x and ∂z/∂y; see `shade`, shape [B, H, W]."""
     x, y, z = (light[:, k, None, None] for k in range(3))
     cosine = (z - x * along_x - y * along_y) / np.sqrt(1 + along_x * along_x + along_y * along_y)
     return np.maximum(cosine, 0) * (1 - ambient) + ambient

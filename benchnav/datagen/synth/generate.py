@@ -17,7 +17,7 @@ from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
 from benchnav.datagen.schema import FIELDS, Maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.fractal_noise import fractal_perlin
-from benchnav.datagen.synth.slope import framed, framed_gradient, inclination_deg
+from benchnav.datagen.synth.slope import framed, horn_gradient, inclination_deg
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
@@ -127,7 +127,7 @@ def complete(
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
     ground = quantise(framed_m, 13)
-    gradient = framed_gradient(ground, recipe.resolution_m)
+    gradient = horn_gradient(ground, recipe.resolution_m)
     slope = quantise(inclination_deg(*gradient), 10)
     azimuth, lift = rng.uniform(key("light", attempt), indices, (2,)).T
     light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
@@ -138,7 +138,7 @@ def complete(
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
     realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
-    brightness = appearance.lambert(*gradient, light, scenario.ambient)
+    brightness = appearance.shade(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)

@@ -7,27 +7,12 @@ import numpy as np
 from numpy import ndarray
 
 
-def horn_gradient(elevation_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
+def horn_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
     """Estimates ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
 
-    At the border the surface is continued linearly, so that planes are exact everywhere.
-
     Args:
-        elevation_m: shape [B, H, W].
-        resolution_m: cell width.
-
-    Returns:
-        Two arrays of shape [B, H, W], metres a metre.
-    """
-    return framed_gradient(framed(elevation_m), resolution_m)
-
-
-def framed_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
-    """Estimates ∂z/∂x and ∂z/∂y as `horn_gradient` does, with the ground one cell beyond the map.
-
-    Args:
-        framed_m: elevation, shape [B, H + 2, W + 2]; NaN beyond the map where it is not known, so that
-            the surface is continued linearly.
+        framed_m: elevation with the ground one cell beyond the map, shape [B, H + 2, W + 2]; where that is NaN, not
+            known, the surface is continued linearly, so that planes are exact everywhere. See `framed`.
         resolution_m: cell width.
 
     Returns:
