@@ -12,7 +12,7 @@ from benchnav.core.tables import NOTHING, Table
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import UNLABELLED, Maps
+from benchnav.datagen.schema import UNLABELLED, Maps, join_maps
 
 _FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADINGS = (
@@ -36,8 +36,7 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    parts = [measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return join_maps([measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS)])
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:

@@ -8,7 +8,7 @@ not the file's bytes, so they are the same whatever compression, machine or numb
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,6 +85,13 @@ def quantise(values: ndarray, bits: int) -> ndarray:
     return np.rint(values * 2.0**bits) * 2.0**-bits
 
 
+def join_maps(parts: Sequence[Maps]) -> Maps:
+    """Joins parts of a split, of which there is at least one, end to end."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def stored_arrays(fields: Fields, height: int, width: int) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Dtype and shape of a map's entry in each array that is stored of a split: its fields', and of their digests."""
     arrays = {name: (field.dtype, field.entry_shape(height, width)) for name, field in fields.items()}
@@ -101,12 +108,13 @@ def entry_digests(maps: Maps, fields: Fields) -> ndarray:
     Returns:
         uint8, shape [B, F, 32].
     """
-    columns = []
-    for name, field in fields.items():
-        entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
-        columns.append([hashlib.sha256(entry.tobytes()).digest() for entry in entries])
-    digests = np.frombuffer(b"".join(b"".join(row) for row in zip(*columns, strict=True)), np.uint8)
-    return digests.reshape(-1, len(fields), DIGEST_BYTES)
+    digests = [
+        hashlib.sha256(entry.tobytes()).digest()
+        for name, field in fields.items()
+        for entry in np.ascontiguousarray(maps[name], dtype=field.dtype)
+    ]
+    by_field = np.frombuffer(b"".join(digests), np.uint8).reshape(len(fields), -1, DIGEST_BYTES)
+    return by_field.swapaxes(0, 1)
 
 
 def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:

@@ -30,7 +30,7 @@ from benchnav.datagen.files.create import SHARD_CELLS
 from benchnav.datagen.files.hdf5 import Contents, ShardFile, assemble, held, pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
-from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
+from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, join_maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 
 _CELLS_AT_ONCE = 2**20
@@ -43,6 +43,7 @@ _REASONS = {
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
+_LACKING = {"missing_elevation": "dem", "missing_classes": "classes", "missing_colours": "photo"}
 
 
 def import_dem(
@@ -125,20 +126,15 @@ class _Part:
         recipe, tiling = self.recipe, self.ground.tiling
         framed_m, given = self.ground.read(run)
         kept = np.ones(len(run.columns), dtype=bool)
-        lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
-        if "classes" in given:
-            lacks = np.isnan(given["classes"])
-            if "photo" in given:
-                # A measured λ is worth learning from without a class.
-                lacks = lacks & np.isnan(given.get("traversability", np.nan))
-                lacking["missing_classes"] = lacks.all(axis=(1, 2, 3))
-            else:  # a cell is painted in the colour of its class
-                lacking["missing_classes"] = lacks.any(axis=(1, 2, 3))
-        if "photo" in given:
-            lacking["missing_colours"] = np.isnan(given["photo"]).any(axis=(1, 2, 3))
-        for reason, which in lacking.items():
-            self.left_out[reason] += int((kept & which).sum())
-            kept &= ~which
+        lacking = {name: np.isnan(values).any(axis=(1, 2, 3)) for name, values in given.items()}
+        if "classes" in given and "photo" in given:  # else a cell is painted in the colour of its class
+            # A measured λ is worth learning from without a class.
+            unknown = np.isnan(given["classes"]) & np.isnan(given.get("traversability", np.nan))
+            lacking["classes"] = unknown.all(axis=(1, 2, 3))
+        for reason, name in _LACKING.items():
+            if name in lacking:
+                self.left_out[reason] += int((kept & lacking[name]).sum())
+                kept &= ~lacking[name]
         numbers = (run.row * tiling.tiles[1] + np.array(run.columns))[kept]
         if not len(numbers):
             return
@@ -161,7 +157,7 @@ class _Part:
         solvable = recipe.splits[self.name].solvable
         times_s = reference_time_s(recipe, maps) if solvable else np.full(len(numbers), np.nan)
         maps["reference_time_s"] = times_s
-        solved = np.isfinite(times_s) | (not solvable)
+        solved = ~np.isinf(times_s)
         self.left_out["not_solvable"] += int((~solved).sum())
         about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
         stored = {name: maps[name].astype(kind.dtype) for name, kind in FIELDS.items()}
@@ -189,7 +185,7 @@ class _Part:
             self._add_groups()
 
     def _flush(self) -> None:
-        maps = {name: np.concatenate([some[name] for some in self.pending]) for name in self.pending[0]}
+        maps = join_maps(self.pending)
         first = len(self.about["kept"])
         for name, values in self.about.items():
             values += maps.pop(name).tolist()

@@ -219,8 +219,8 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
         y: northward, or latitude.
     """
     base = crs.to_dict(projjson=True)
-    while "base_crs" in base or "source_crs" in base:
-        base = base.get("base_crs") or base["source_crs"]
+    while inner := base.get("base_crs") or base.get("source_crs"):
+        base = inner
     if base["type"] not in ("GeographicCRS", "GeodeticCRS"):
         return None
     longitude, latitude = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]

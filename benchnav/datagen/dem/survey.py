@@ -88,8 +88,8 @@ class Survey:
         elif max(cell_m) <= step / 2 * (1 + 1e-9):
             how, reach_m = "average", 0.0
         size_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
-        rows, columns = np.floor(size_m / step + _SLACK).astype(int).tolist()
-        if rows < recipe.height or columns < recipe.width:
+        cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
+        if np.less(cells, recipe.grid.shape).any():
             wide, high = recipe.grid.extent_m
             raise DatasetError(
                 f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem} of "
@@ -97,13 +97,13 @@ class Survey:
             )
         stride = recipe.grid.shape
         if stride_m is not None:
-            cells = stride_m / step
+            apart = stride_m / step
             expect(
-                cells > 0.5 and abs(cells - round(cells)) < 1e-6,
+                apart > 0.5 and abs(apart - round(apart)) < 1e-6,
                 f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
             )
-            stride = round(cells), round(cells)
-        self.tiling = tiling = cut((rows, columns), recipe.grid.shape, stride, shares)
+            stride = round(apart), round(apart)
+        self.tiling = tiling = cut(cells, recipe.grid.shape, stride, shares)
         # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
         offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
         south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()

@@ -96,7 +96,7 @@ class Tiling:
 
 
 def cut(
-    cells: tuple[int, int], shape: tuple[int, int], stride: tuple[int, int], shares: Mapping[str, float]
+    cells: Sequence[int], shape: tuple[int, int], stride: tuple[int, int], shares: Mapping[str, float]
 ) -> Tiling:
     """Cuts ground into maps and splits.
 
@@ -109,7 +109,7 @@ def cut(
     Raises:
         DatasetError: the ground is too small for so many splits.
     """
-    rows, columns = ((cells[i] - shape[i]) // stride[i] + 1 for i in (0, 1))
+    rows, columns = (np.subtract(cells, shape) // stride + 1).tolist()
     side, lines = (0, rows) if rows > columns else (1, columns)
     gap = math.ceil(2 * shape[side] / stride[side]) - 1
     usable = lines - gap * (len(shares) - 1)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchnav.core.errors import DatasetError
+from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.core.settings import plain
 from benchnav.core.store import building, real_place
 from benchnav.datagen import schema
@@ -76,11 +76,14 @@ def merge(
 
 
 def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
-    check_name("id", dataset_id)
     datasets = [TerrainDataset(path) for path in paths]
     reasons = list(why_unlike(datasets))
     if len(datasets) < 2:
         reasons.append("fewer than two files")
+    try:
+        check_name("id", dataset_id)
+    except ConfigError as error:
+        reasons.append(str(error).rstrip("."))
     if reasons:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
     # The recipes, each once, and of each split the parts that refer to them and the files.

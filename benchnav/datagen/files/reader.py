@@ -191,9 +191,7 @@ class TerrainDataset:
             parts.append(self._read_run(split, piece, range(run[0], run[-1] + 1), names))
         if not parts:
             return self._read_run(split, pieces[0], range(0), names)
-        return (
-            parts[0] if len(parts) == 1 else {n: np.concatenate([part[n] for part in parts]) for n in names}
-        )
+        return schema.join_maps(parts)
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy import ndarray
 
 from benchnav.core.copula import LONGEST_CORRELATION
@@ -135,9 +134,7 @@ class Recipe:
 
     @cached_property
     def units(self) -> tuple[AlikeClasses, ...]:
-        """Classes that are shown together: in synthesis 2 those of one colour, in the table's order."""
-        if self.synthesis == 1:
-            return tuple((number,) for number in range(len(self.classes)))
+        """Classes that are shown together in synthesis 2: those of one colour, in the table's order."""
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     @cached_property
@@ -214,7 +211,7 @@ def shipped_recipes() -> list[str]:
 
 def shipped_sizes(recipe: str) -> dict[str, int]:
     """Maps by split of a shipped recipe, read without all that is to be checked of it."""
-    splits = yaml.safe_load((RECIPES / f"{recipe}.yaml").read_text())["splits"]
+    splits = read_yaml(RECIPES / f"{recipe}.yaml")["splits"]
     return {split: entry["maps"] for split, entry in splits.items()}
 
 

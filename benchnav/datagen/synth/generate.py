@@ -14,7 +14,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
-from benchnav.datagen.schema import FIELDS, Maps, quantise
+from benchnav.datagen.schema import FIELDS, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.fractal_noise import fractal_perlin
 from benchnav.datagen.synth.slope import framed, horn_gradient, inclination_deg
@@ -40,13 +40,9 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     """
     indices = np.asarray(indices, dtype=np.int64)
     size = min(_PIECE, recipe.grid.maps_in(_PIECE_CELLS))
-    pieces = [
-        _generate_piece(recipe, split, indices[i : i + size]) for i in range(0, max(len(indices), 1), size)
-    ]
-    return {
-        name: np.concatenate([piece[name] for piece in pieces]).astype(field.dtype, copy=False)
-        for name, field in FIELDS.items()
-    }
+    starts = range(0, max(len(indices), 1), size)
+    maps = join_maps([_generate_piece(recipe, split, indices[start : start + size]) for start in starts])
+    return {name: maps[name].astype(field.dtype, copy=False) for name, field in FIELDS.items()}
 
 
 def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
