@@ -22,6 +22,7 @@ ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
 UNLABELLED = 255  # `class_id` of a cell whose class is not known, as on real ground
 
+Json = dict[str, Any]  # a manifest, or what is in it
 Maps = dict[str, ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
 
 
@@ -134,7 +135,7 @@ def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> s
     return hashlib.sha256(text + digests.tobytes()).hexdigest()
 
 
-def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fields: Fields) -> str:
+def version_of(synthesis: Iterable[int], splits: Iterable[Json], fields: Fields) -> str:
     """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
     if set(fields) - set(FIELDS):
         return "1.3"
@@ -143,12 +144,12 @@ def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fi
     return "1.1" if max(synthesis) > 1 else "1.0"
 
 
-def has_unlabelled(entry: Mapping[str, Any]) -> bool:
+def has_unlabelled(entry: Json) -> bool:
     """Tells by a split's entry in the manifest whether some of its cells have no class."""
     return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
-def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
+def field_table(height: int, width: int, fields: Fields) -> Json:
     """Describes fields for the manifest."""
     return {
         name: {
@@ -161,7 +162,7 @@ def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
     }
 
 
-def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
+def read_field_table(table: Json) -> dict[str, Field]:
     """Gives the fields that a manifest describes, in its order; of those that are not ours any value is allowed.
 
     Raises:
@@ -194,7 +195,7 @@ _IMPORTED = {"maps": int, "source": {"file": str, "left_out": dict}}
 _RECIPE = {"id": str, "seed": int, "scenarios": dict, "splits": dict}
 
 
-def check(manifest: Mapping[str, Any]) -> None:
+def check(manifest: Json) -> None:
     """Refuses a manifest that does not say what a reader needs.
 
     Raises:
@@ -221,7 +222,7 @@ def check(manifest: Mapping[str, Any]) -> None:
             raise ValueError(f"a file of split {name!r} is not in the folder")
 
 
-def _check_kinds(given: Any, kinds: Mapping[str, Any]) -> None:
+def _check_kinds(given: Any, kinds: Json) -> None:
     for name, kind in kinds.items():
         value = given.get(name)
         if isinstance(kind, dict):

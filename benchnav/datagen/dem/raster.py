@@ -148,14 +148,12 @@ class Layer:
         window = ((top, top + len(rows) + 2), (columns.start, columns.stop + 2))
         with _naming(self.raster.argument, self.raster.name):
             values = warped.read(self.bands, window=window).astype(np.float64)
-            has_alpha = warped.count > file.count
-            mask = (
-                warped.read(warped.count, window=window) if has_alpha else warped.dataset_mask(window=window)
-            )
+            if warped.count > file.count:  # one more band says where there are values
+                mask = warped.read(warped.count, window=window)
+            else:
+                mask = warped.dataset_mask(window=window)
         values[:, (mask == 0) | ~np.isfinite(values).all(axis=0)] = np.nan
-        scales, offsets = (
-            np.array(numbers)[: len(values), None, None] for numbers in (file.scales, file.offsets)
-        )
+        scales, offsets = np.array([file.scales, file.offsets])[:, : len(values), None, None]
         return (values * scales + offsets)[:, ::-1]
 
 
@@ -171,10 +169,9 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
     Raises:
         DatasetError: it cannot be read, holds other bands, or does not say where it lies.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a missing place, which is an error below
-        with _naming(argument, name):
-            file = load_rasterio().open(name)
+    # Rasterio warns of a missing place, which is an error below.
+    with warnings.catch_warnings(action="ignore"), _naming(argument, name):
+        file = load_rasterio().open(name)
     with file:
         if file.crs is None:
             raise DatasetError(

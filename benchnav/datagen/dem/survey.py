@@ -215,8 +215,8 @@ class Survey:
 def _range(name: str, maps: Maps) -> tuple[float, float]:
     """The least and the greatest value, of what is averaged too."""
     low, high = (maps.get(f"{name} {end}", maps[name]) for end in ("min", "max"))
-    least = np.min(low, initial=np.inf, where=~np.isnan(low))
-    return float(least), float(np.max(high, initial=-np.inf, where=~np.isnan(high)))
+    least, most = np.fmin.reduce(low, None, initial=np.inf), np.fmax.reduce(high, None, initial=-np.inf)
+    return float(least), float(most)
 
 
 def provenance(name: str) -> dict[str, str | None]:

@@ -17,6 +17,8 @@ from scipy import ndimage
 
 from benchnav.core.errors import DatasetError, expect
 
+Shape = tuple[int, int]  # along y and along x
+
 
 class Run(NamedTuple):
     """Neighbouring maps of one split: their row of maps, and which of the row."""
@@ -37,9 +39,9 @@ class Tiling:
         strips: by split the rows of maps that it takes, or the columns where there are as many or more.
     """
 
-    shape: tuple[int, int]
-    stride: tuple[int, int]
-    tiles: tuple[int, int]
+    shape: Shape
+    stride: Shape
+    tiles: Shape
     strips: Mapping[str, range]
 
     @property
@@ -95,9 +97,7 @@ class Tiling:
                     yield Run(split, row, range(first, min(first + most, own.stop)))
 
 
-def cut(
-    cells: Sequence[int], shape: tuple[int, int], stride: tuple[int, int], shares: Mapping[str, float]
-) -> Tiling:
+def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, float]) -> Tiling:
     """Cuts ground into maps and splits.
 
     Args:

@@ -38,13 +38,15 @@ PAPER = """@misc{endo2024benchnav,
   archivePrefix = {arXiv},
 }"""
 
+Node = dict[str, Any]  # of JSON-LD
+
 # The context that readers of version 1.0 look for, whether or not a term is used.
 _OWN_TERMS = (
     "citeAs column extract field fileProperty fileObject fileSet format includes isLiveDataset jsonPath key md5 "
     "parentField path recordSet references regex repeated replace samplingRate separator source subField transform "
     "equivalentProperty"
 )
-_CONTEXT: dict[str, Any] = {
+_CONTEXT: Node = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     "sc": "https://schema.org/",
@@ -195,7 +197,7 @@ def metadata(
     fields: Sequence[str],
     publication: Publication,
     folder: Path,
-) -> dict[str, Any]:
+) -> Node:
     """Makes the metadata of files that are written.
 
     Args:
@@ -228,12 +230,12 @@ def metadata(
     }
 
 
-def _node(kind: str, node_id: str, **about: Any) -> dict[str, Any]:
+def _node(kind: str, node_id: str, **about: Any) -> Node:
     """A node of Croissant's own, named by the last part of its id."""
     return {"@type": f"cr:{kind}", "@id": node_id, "name": node_id.rpartition("/")[2], **about}
 
 
-def _distribution(name: str, folder: Path) -> Iterator[dict[str, Any]]:
+def _distribution(name: str, folder: Path) -> Iterator[Node]:
     """The files of a split, and all of them as a set."""
     pattern = f"{FOLDER}/{name}-*-of-*.parquet"
     for path in sorted(folder.glob(pattern)):
@@ -248,7 +250,7 @@ def _distribution(name: str, folder: Path) -> Iterator[dict[str, Any]]:
     yield _node("FileSet", f"{name}-files", encodingFormat="application/x-parquet", includes=pattern)
 
 
-def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]) -> dict[str, Any]:
+def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str]) -> Node:
     """The rows of a split, and what its columns are."""
     columns = []
     for of, field in columns_of(dataset, fields).items():
@@ -268,9 +270,9 @@ def _maps(dataset: TerrainDataset, split: str, name: str, fields: Sequence[str])
     return _node("RecordSet", name, description=description, key=key, field=columns)
 
 
-def _classes(dataset: TerrainDataset) -> dict[str, Any]:
+def _classes(dataset: TerrainDataset) -> Node:
     """The class table, whose numbers give the latent traversability of a cell."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Node] = []
     for number, item in enumerate(dataset.recipe.classes):
         row = {"id": number, **asdict(item), "colour": f"#{bytes(item.colour).hex()}"}
         soft = row.pop("soft") or {}

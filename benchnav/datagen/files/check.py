@@ -37,13 +37,7 @@ class Fault:
 
     def __str__(self) -> str:
         """One line."""
-        return self.line(f"map {self.map}" if self.map >= 0 else "")
-
-    def line(self, place: str) -> str:
-        """The fault of maps in words."""
-        problem = f"field {self.field!r} {self.problem}" if self.field else self.problem
-        where = f" ({self.file})" if self.file else ""
-        return ": ".join(word for word in (self.split, place, problem) if word) + where
+        return next(summarise([self]))
 
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
@@ -55,8 +49,13 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
 
     order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
     for _, items in groupby(enumerate(order), run_of):
-        run = [fault for _, fault in items]
-        yield run[0].line(f"maps {run[0].map}–{run[-1].map}") if len(run) > 1 else str(run[0])
+        (_, first), *others = items
+        maps = f"map {first.map}" if first.map >= 0 else ""
+        if others:
+            maps = f"maps {first.map}–{first.map + len(others)}"
+        problem = f"field {first.field!r} {first.problem}" if first.field else first.problem
+        where = f" ({first.file})" if first.file else ""
+        yield ": ".join(word for word in (first.split, maps, problem) if word) + where
 
 
 def find_faults(path: str | Path) -> list[Fault]:

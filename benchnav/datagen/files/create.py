@@ -67,7 +67,12 @@ def create(
     expect(
         shard is None or not is_one_file(path), f"`out` to be a folder, since a shard is made, got {path}."
     )
-    shards = cut(recipe, shard_cells)
+    size = recipe.grid.maps_in(shard_cells)
+    shards = [
+        ShardFile(split, first, min(first + size, spec.maps))
+        for split, spec in recipe.splits.items()
+        for first in range(0, spec.maps, size)
+    ]
     own = shards if shard is None else shards[shard.index - 1 :: shard.of]
     # Of a folder several shards may be made at once, each by one process.
     held = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}") if shard else path
@@ -77,7 +82,12 @@ def create(
         sole_writer(held, str(path)),
     ):
         restore(path)
-        folder = _workplace(path, shards, shard, overwrite)
+        # Of a folder, shards of this recipe are gone on with.
+        check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
+        folder = path
+        if is_one_file(path) or (overwrite and (path / FOLDER_MANIFEST).exists()):
+            expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
+            folder = path.with_name(f".{path.name}.partial")
         folder.mkdir(parents=True, exist_ok=True)
         missing = _missing(folder, recipe, shards, own, may_replace=overwrite or folder != path)
         manifest = folder / FOLDER_MANIFEST
@@ -109,16 +119,6 @@ def create(
                 shutil.rmtree(folder)
 
 
-def cut(recipe: Recipe, cells: int) -> list[ShardFile]:
-    """Cuts a recipe into shards of about so many cells, in the order of splits and maps."""
-    size = recipe.grid.maps_in(cells)
-    return [
-        ShardFile(split, first, min(first + size, spec.maps))
-        for split, spec in recipe.splits.items()
-        for first in range(0, spec.maps, size)
-    ]
-
-
 def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
     """Makes a shard, perhaps in a process on another machine.
 
@@ -148,21 +148,6 @@ def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
     return made_by == ([recipe.to_dict()], benchnav.__version__) and (
         entry.items() <= manifest["splits"].get(shard.split, {}).items()
     )
-
-
-def _workplace(path: Path, shards: Sequence[ShardFile], shard: Shard | None, overwrite: bool) -> Path:
-    """Where shards are made: where they are to be, or beside a file or a finished folder that they replace.
-
-    Raises:
-        ConfigError: what is there may not be replaced.
-    """
-    beside = path.with_name(f".{path.name}.partial")
-    # Of a folder, shards of this recipe are gone on with.
-    check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
-    if not is_one_file(path) and not (overwrite and (path / FOLDER_MANIFEST).exists()):
-        return path
-    expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
-    return beside
 
 
 def _missing(

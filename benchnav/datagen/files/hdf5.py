@@ -54,11 +54,11 @@ class Contents:
 
     id: str
     recipes: Sequence[Recipe]
-    splits: Mapping[str, Mapping[str, Any]]
+    splits: Mapping[str, schema.Json]
     files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
     fields: Mapping[str, schema.Field] = field(default_factory=lambda: schema.FIELDS)
 
-    def manifest(self, entry_digests: Mapping[str, ndarray]) -> dict[str, Any]:
+    def manifest(self, entry_digests: Mapping[str, ndarray]) -> schema.Json:
         """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of each split."""
         synthesis, shape = [recipe.synthesis for recipe in self.recipes], self.recipes[0].grid.shape
         return {
@@ -101,7 +101,7 @@ def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
     return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
 
 
-def recipe_entry(recipe: Recipe, shard: ShardFile) -> dict[str, Any]:
+def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
     """The manifest's entry of consecutive maps of a recipe's split, without their digest."""
     part = {"maps": shard.maps, "recipe": 0, "split": shard.split, "first": shard.first}
     return {"scenario": recipe.splits[shard.split].scenario, "maps": shard.maps, "parts": [part]}
@@ -126,7 +126,7 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
     file.flush()
 
 
-def pack(recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps) -> bytes:
+def pack(recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps) -> bytes:
     """Makes what a file of a few maps of one split holds, in memory.
 
     Args:
@@ -205,7 +205,7 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
         _join(out, contents)
         return
     digests: dict[str, ndarray] = {}
-    shards: dict[str, list[dict[str, Any]]] = {}
+    shards: dict[str, list[schema.Json]] = {}
     for split, files in contents.files.items():
         entries = [source[schema.ENTRY_DIGESTS][:] for source in _opened(split, files)]
         digests[split] = np.concatenate(entries)

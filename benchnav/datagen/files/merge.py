@@ -88,7 +88,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
     # The recipes, each once, and of each split the parts that refer to them and the files.
     recipes: list[Recipe] = []
-    splits: dict[str, dict[str, Any]] = {}
+    splits: dict[str, schema.Json] = {}
     files: dict[str, list[Path]] = {}
     for dataset in datasets:
         own = [recipe_from_dict(data, f"in {dataset.path}") for data in dataset.manifest["recipes"]]

@@ -14,7 +14,7 @@ from functools import cached_property, lru_cache
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import h5py
 import numpy as np
@@ -77,10 +77,10 @@ class TerrainDataset:
     def __init__(self, path: str | Path, keep_open: bool = False) -> None:
         """Reads and checks the manifest."""
         self.path, self.keep_open = Path(path), keep_open
-        self.manifest: dict[str, Any] = read_manifest(self.path)
+        self.manifest: schema.Json = read_manifest(self.path)
         self._opened: dict[tuple[int, Path], Opened] = {}  # by process, since one's files are not for another
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> schema.Json:
         """Leaves out the open files, so that it may be sent to other processes."""
         return self.__dict__ | {"_opened": {}}
 
@@ -90,7 +90,7 @@ class TerrainDataset:
         return self.manifest["id"]
 
     @property
-    def splits(self) -> dict[str, Any]:
+    def splits(self) -> schema.Json:
         """Splits by name, each with `maps`, `scenario`, `digest` and `parts`."""
         return self.manifest["splits"]
 
@@ -336,7 +336,7 @@ def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError
     )
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path) -> schema.Json:
     """Reads the manifest of a file or a folder.
 
     Raises:
@@ -372,7 +372,7 @@ def _values(array: h5py.Dataset, which: slice) -> np.ndarray:
 
 def _manifest_text(path: Path) -> str | bytes:
     if path.is_dir():
-        if not (path / FOLDER_MANIFEST).is_file():
+        if not is_dataset(path):
             raise DatasetError(
                 f"Expected a folder with a finished dataset, got {path} without {FOLDER_MANIFEST}. "
                 "Finish it by the command that began it, or by `benchnav-datagen merge` of its shares."

@@ -68,6 +68,9 @@ class TerrainClass:
         )
 
 
-def look_alike_classes(classes: tuple[TerrainClass, ...]) -> list[tuple[int, ...]]:
+ClassTable = tuple[TerrainClass, ...]
+
+
+def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
     """Classes that share a colour, by class: of each class those that look like it, itself among them."""
     return [tuple(i for i, c in enumerate(classes) if c.colour == own.colour) for own in classes]

@@ -10,7 +10,7 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 import numpy as np
 from numpy import ndarray
 
-from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
@@ -18,7 +18,7 @@ _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
 Parameters = tuple[ndarray, ndarray, ndarray]
 
 
-def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:
+def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> ndarray:
     """f_c(ψ) of each cell, in [0, 1], shape of `class_id`."""
     scale, exponent, offset = (
         np.array([getattr(c, name) for c in classes]) for name in ("scale", "exponent", "offset")
@@ -27,12 +27,12 @@ def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainCla
     return np.clip(1 - (loss + np.take(offset, class_id)), 0, 1)
 
 
-def latent_std(class_id: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:
+def latent_std(class_id: ndarray, classes: ClassTable) -> ndarray:
     """σ_c of each cell, shape of `class_id`."""
     return np.take(np.array([c.noise for c in classes]), class_id)
 
 
-def truth(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Parameters:
     """The true distribution of λ in each cell, as a Gaussian mixture before clipping.
 
     Args:
@@ -56,7 +56,7 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ..
     return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
-def look_alikes(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+def look_alikes(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Parameters:
     """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
 
     They are shown together, and which of them takes which ground is drawn anew in each map, so that each

@@ -19,7 +19,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.settings import changed, load_yaml, plain, read, read_yaml
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
 from benchnav.datagen.recipe.places import PlacesRule, check_places
 from benchnav.datagen.recipe.scenario import PRESETS, RECIPES, Scenario, load_presets, resolve
@@ -85,7 +85,7 @@ class Recipe:
     environments: int
     occupancy: tuple[float, ...]
     class_periods_m: tuple[float, ...]
-    classes: tuple[TerrainClass, ...]
+    classes: ClassTable
     scenarios: dict[str, Scenario]
     splits: dict[str, Split]
     stuck_threshold: float = 0.3

@@ -11,8 +11,10 @@ from numpy import ndarray
 
 from benchnav.core import rng
 
+Shape = tuple[int, int]  # (H, W)
 
-def fractal(key: int, indices: ndarray, shape: tuple[int, int], roughness: float) -> ndarray:
+
+def fractal(key: int, indices: ndarray, shape: Shape, roughness: float) -> ndarray:
     """Synthesises fractal surfaces from a power-law spectrum.
 
     Args:
@@ -34,7 +36,7 @@ def fractal(key: int, indices: ndarray, shape: tuple[int, int], roughness: float
 def open_fractal(
     key: int,
     indices: ndarray,
-    shape: tuple[int, int],
+    shape: Shape,
     roughness: float,
     reference_cells: int,
 ) -> ndarray:
@@ -68,7 +70,7 @@ def open_fractal(
     return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
 
 
-def _frequencies(shape: tuple[int, int]) -> ndarray:
+def _frequencies(shape: Shape) -> ndarray:
     """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
     return np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
 
@@ -121,7 +123,7 @@ def place_craters(
 def crater_elevation(
     centres_m: ndarray,
     radii_m: ndarray,
-    shape: tuple[int, int],
+    shape: Shape,
     resolution_m: float,
     depth_ratio: float,
 ) -> ndarray:
