@@ -7,7 +7,7 @@ import sys
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from benchnav import datagen
 from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
@@ -15,10 +15,6 @@ from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
 from benchnav.datagen.dem.raster import Rasters
-
-if TYPE_CHECKING:
-    from benchnav.datagen.files.reader import TerrainDataset
-
 
 # A dataset of more becomes a folder of files.
 _MOST_CELLS_OF_A_FILE = 2**28
@@ -343,12 +339,12 @@ def preview(
     print(f"wrote {path}")
 
 
-def _opened(file: str) -> "TerrainDataset":
+def _opened(file: str) -> "datagen.TerrainDataset":
     """The dataset of a path or an id."""
     return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
-def _written(path: Path) -> "TerrainDataset":
+def _written(path: Path) -> "datagen.TerrainDataset":
     """A new dataset, of which is printed where it is, its size, its splits and their digests."""
     from rich.filesize import decimal
 

@@ -41,7 +41,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.slope import framed, horn_gradient
+from benchnav.datagen.synth.elevation import framed, horn_gradient
 
 FIELDS = ("rgb", "class_id", "elevation_m", "slope_deg", "traversability")
 STEEP_DEG = 30.0

@@ -87,7 +87,7 @@ def import_dem(
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
         ground = Survey(stack, dem, rasters, recipe, shares, stride_m)
         folder = stack.enter_context(building(out))
-        parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
+        parts = {name: _Part(name, recipe, folder, ground) for name in shares}
         done = 0
         for run in ground.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
             parts[run.split].add(run)
@@ -106,7 +106,7 @@ def import_dem(
         assemble(contents, folder, out)
 
 
-@dataclass(kw_only=True)
+@dataclass
 class _Part:
     """What has become of the maps of one split: files of those kept, what is said of each, counts of the others."""
 

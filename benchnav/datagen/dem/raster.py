@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ class Rasters:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Raster:
+class Raster(NamedTuple):
     """An open raster: what the user calls it, its name, rasterio's reader."""
 
     argument: str
@@ -120,13 +119,10 @@ class Raster:
         resampling = load_rasterio().enums.Resampling[how]
         # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
         dtype = "float64" if len(bands) == 1 else self.file.dtypes[0]
-        return Layer(
-            raster=self, bands=bands, warped=self.warped(**frame, resampling=resampling, dtype=dtype)
-        )
+        return Layer(self, bands, self.warped(**frame, resampling=resampling, dtype=dtype))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layer:
+class Layer(NamedTuple):
     """The first bands of a raster as resampled to the cells of all maps and one around them."""
 
     raster: Raster
@@ -195,7 +191,7 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
                 "Convert it: gdal_translate -expand rgb for a palette, rio convert --dtype uint8 --scale-ratio RATIO "
                 "for deeper numbers."
             )
-        yield Raster(argument=argument, name=name, file=file)
+        yield Raster(argument, name, file)
 
 
 def _utm_of(crs: Any, x: float, y: float) -> Any:

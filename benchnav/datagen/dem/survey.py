@@ -108,8 +108,8 @@ class Survey:
         offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
         south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
         height, width = tiling.cells
-        corner = west_m - step, south_m + (height + 1) * step
-        transform = load_rasterio().transform.from_origin(*corner, step, step)
+        north_m = south_m + (height + 1) * step
+        transform = load_rasterio().transform.from_origin(west_m - step, north_m, step, step)
         frame = {"crs": crs, "transform": transform, "height": height + 2, "width": width + 2}
         sources = [(ground, how)]
         for argument, kinds, how in _OTHERS:

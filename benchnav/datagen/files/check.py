@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -17,8 +17,7 @@ from benchnav.datagen.files.reader import CHUNK_CELLS, READ_ERRORS, TerrainDatas
 _MISSING = "is missing or cannot be opened"
 
 
-@dataclass(frozen=True, order=True)
-class Fault:
+class Fault(NamedTuple):
     """Something wrong with a dataset.
 
     Args:
@@ -45,7 +44,7 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
 
     def run_of(item: tuple[int, Fault]) -> Fault:
         place, fault = item
-        return replace(fault, map=fault.map - place)
+        return fault._replace(map=fault.map - place)
 
     order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
     for _, items in groupby(enumerate(order), run_of):

@@ -9,12 +9,11 @@ import json
 import os
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import h5py
 import numpy as np
@@ -41,8 +40,7 @@ FOLDER_MANIFEST = "manifest.json"
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
 
 
-@dataclass(frozen=True, kw_only=True)
-class Piece:
+class Piece(NamedTuple):
     """What one file holds of a split: all maps under the split's name.
 
     Args:
@@ -243,7 +241,7 @@ class TerrainDataset:
             one = [{"file": "", "maps": self.splits[split]["maps"]}]
             first = 0
             for shard in self.manifest.get("shards", {}).get(split, one):
-                own.append(Piece(path=self.path / shard["file"], first=first, maps=shard["maps"]))
+                own.append(Piece(self.path / shard["file"], first, shard["maps"]))
                 first += shard["maps"]
         return pieces
 

@@ -17,7 +17,6 @@ from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
 from benchnav.datagen.schema import FIELDS, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.fractal_noise import fractal_perlin
-from benchnav.datagen.synth.slope import framed, horn_gradient, inclination_deg
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
@@ -123,8 +122,8 @@ def complete(
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
     ground = quantise(framed_m, 13)
-    gradient = horn_gradient(ground, recipe.resolution_m)
-    slope = quantise(inclination_deg(*gradient), 10)
+    gradient = elevation.horn_gradient(ground, recipe.resolution_m)
+    slope = quantise(elevation.inclination_deg(*gradient), 10)
     azimuth, lift = rng.uniform(key("light", attempt), indices, (2,)).T
     light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
     noise_key, shape = key("traversability", attempt), recipe.grid.shape
@@ -174,7 +173,7 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
         )
     class_id = class_map(recipe, split, indices, attempt)
-    return complete(recipe, split, indices, class_id, framed(ground), attempt)
+    return complete(recipe, split, indices, class_id, elevation.framed(ground), attempt)
 
 
 def _within(limits: tuple[float, float], share: ndarray) -> ndarray:

@@ -11,7 +11,7 @@ import pytest
 from benchnav.datagen.dem.survey import provenance
 from benchnav.datagen.schema import UNLABELLED, quantise
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.slope import framed, horn_gradient, inclination_deg
+from benchnav.datagen.synth.elevation import framed, horn_gradient, inclination_deg
 from tests.datagen.dem.rasters import (
     FLAT,
     NAMES,
