@@ -8,8 +8,7 @@ Where the classes have soft spots, the ground that may hide them is hatched and 
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -73,7 +72,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     maps = dataset.read(split, indices, (*FIELDS, "start_m", "goal_m"))
     maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
     # Heights over each map's lowest point compare between maps; heights over a datum seldom do.
-    maps["elevation_m"] = maps["elevation_m"] - maps["elevation_m"].min((1, 2), keepdims=True)
+    maps["elevation_m"] -= maps["elevation_m"].min((1, 2), keepdims=True)
     classes, grid = dataset.recipe.classes, dataset.grid
     unlabelled = maps["class_id"] == UNLABELLED
     shown, colours = np.unique(maps["class_id"][~unlabelled]), class_colours(classes)
@@ -141,8 +140,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     return figure
 
 
-@dataclass(frozen=True, kw_only=True)
-class SheetColumn:
+class SheetColumn(NamedTuple):
     """A column of a sheet of maps.
 
     Args:
@@ -158,7 +156,7 @@ class SheetColumn:
     name: str
     title: str
     layers: np.ndarray
-    shades: Mapping[str, Any] = field(default_factory=dict)
+    shades: Mapping[str, Any] = {}
     unit: str | None = None
     extend: str = "neither"
     most: int = 4
@@ -279,9 +277,7 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
 
 def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.ndarray:
     """Cells whose class has soft spots, bool, shape of `class_id`."""
-    soft = np.zeros(UNLABELLED + 1, dtype=bool)
-    soft[: len(classes)] = [item.soft is not None for item in classes]
-    return soft[class_id]
+    return np.isin(class_id, [number for number, item in enumerate(classes) if item.soft])
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:

@@ -78,13 +78,14 @@ class Raster(NamedTuple):
         x, y = np.meshgrid(
             np.linspace(bounds.left, bounds.right, 3), np.linspace(bounds.bottom, bounds.top, 3)
         )
-        local = local_crs(own, x[1, 1], y[1, 1])
+        middle = x[1, 1], y[1, 1]
+        local = local_crs(own, *middle)
         if local is None:
             raise DatasetError(
                 f"Expected `{self.argument}` in a CRS of the Earth or another body, got {own.to_string()[:80]} in "
                 f"{self.name}. If you know it, declare it: rio edit-info --crs EPSG:CODE {self.name}"
             )
-        for crs in (own, _utm_of(own, x[1, 1], y[1, 1]), local):
+        for crs in (own, _utm_of(own, *middle), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
                 places = _transformed(own, crs, x.ravel(), y.ravel()).T
                 if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:

@@ -130,10 +130,10 @@ class Survey:
             "kind": "dem",
             **origins["dem"],
             "crs": crs.to_string(),
-            "resolution_m": [cell_m[1], cell_m[0]],
+            "resolution_m": list(reversed(cell_m)),
             "origin_m": [west_m, south_m],
             "tiles": list(tiling.tiles),
-            "stride_m": [tiling.stride[1] * step, tiling.stride[0] * step],
+            "stride_m": [cells * step for cells in reversed(tiling.stride)],
             **{argument: origins.get(argument) for argument, _, _ in _OTHERS},
         }
         self.known = []

@@ -8,7 +8,6 @@ neither overlap nor touch.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -28,8 +27,7 @@ class Run(NamedTuple):
     columns: range
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tiling:
+class Tiling(NamedTuple):
     """Rows and columns of maps.
 
     Args:
@@ -126,7 +124,7 @@ def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, 
         split: range(ends[place] + place * gap, ends[place + 1] + place * gap)
         for place, split in enumerate(shares)
     }
-    return Tiling(shape=shape, stride=stride, tiles=(rows, columns), strips=strips)
+    return Tiling(shape, stride, (rows, columns), strips)
 
 
 def read_shares(text: str) -> dict[str, float]:

@@ -8,7 +8,6 @@ import re
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,8 +39,7 @@ _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 Source = Mapping[str, Any]  # stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
 
 
-@dataclass(frozen=True, kw_only=True)
-class Contents:
+class Contents(NamedTuple):
     """What a dataset is to hold, and the files that hold it.
 
     Args:
@@ -55,8 +53,8 @@ class Contents:
     id: str
     recipes: Sequence[Recipe]
     splits: Mapping[str, schema.Json]
-    files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
-    fields: Mapping[str, schema.Field] = field(default_factory=lambda: schema.FIELDS)
+    files: Mapping[str, Sequence[Path]] = {}
+    fields: schema.Fields = schema.FIELDS
 
     def manifest(self, entry_digests: Mapping[str, ndarray]) -> schema.Json:
         """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of each split."""
@@ -253,7 +251,6 @@ def named_errors(path: Path) -> Iterator[None]:
         DatasetError: the system, or HDF5, could not write.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         yield
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())

@@ -6,7 +6,6 @@ What is merged is packed already: files are copied into a folder, or their chunk
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
@@ -72,7 +71,7 @@ def merge(
                 copies[path] = folder / name
                 shutil.copy2(path, copies[path])
             files = {split: [copies[path] for path in own] for split, own in contents.files.items()}
-            assemble(replace(contents, files=files), folder, out)
+            assemble(contents._replace(files=files), folder, out)
 
 
 def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:

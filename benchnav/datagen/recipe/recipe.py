@@ -185,7 +185,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got {str(source)!r}.",
     )
     data = read_yaml(path)
-    own = _with_class_table(data) if overrides else data
+    own = _with_class_table(data)
     for text in overrides:
         name, equals, value = text.partition("=")
         expect(equals and all(name.split(".")), f"an override such as splits.train.maps=50, got {text!r}.")

@@ -16,7 +16,6 @@ from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
 from benchnav.datagen.schema import FIELDS, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
-from benchnav.datagen.synth.fractal_noise import fractal_perlin
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
@@ -87,7 +86,9 @@ def class_map(recipe: Recipe, split: str, indices: ndarray, attempt: int = 0) ->
         Class indices, shape [B, H, W].
     """
     periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
-    noise = fractal_perlin(recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods)
+    noise = appearance.fractal_perlin(
+        recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods
+    )
     # Which class takes which band differs from map to map, so no two classes are neighbours always.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.synth import appearance
+from benchnav.datagen.synth.appearance import fractal_perlin
 from benchnav.datagen.synth.elevation import framed, horn_gradient
-from benchnav.datagen.synth.fractal_noise import fractal_perlin
 
 
 @given(st.lists(st.floats(0.05, 1), min_size=1, max_size=6), st.integers(0, 5))
