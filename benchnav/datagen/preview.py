@@ -82,27 +82,17 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     levels = np.array(MaxNLocator(9, steps=[1, 2, 2.5, 5, 10]).tick_values(0, relief_m))
     levels = levels[levels <= relief_m]
     kinds = {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
-    looks: dict[str, dict[str, Any]] = {
-        "rgb": {"title": "RGB"},
-        "class_id": {"title": "Class", "shades": kinds},
-        "elevation_m": {
-            "title": "Elevation [m]",
-            "shades": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
-            "unit": f"above the lowest point,\ncontours every {levels[1]:g} m",
-        },
-        "slope_deg": {
-            "title": "Slope [°]",
-            "shades": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
-            "unit": "",
-            "extend": "max",
-        },
-        "traversability": {
-            "title": "Traversability λ",
-            "shades": {"cmap": _SHADES, "vmin": 0, "vmax": 1},
-            "unit": "",
-        },
-    }
-    columns = [SheetColumn(name=name, layers=maps[name], **look) for name, look in looks.items()]
+    relief = {"cmap": "cividis", "vmin": 0, "vmax": relief_m}
+    steepness = {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG}
+    shares = {"cmap": _SHADES, "vmin": 0, "vmax": 1}
+    contours = f"above the lowest point,\ncontours every {levels[1]:g} m"
+    columns = [
+        SheetColumn("rgb", "RGB", maps["rgb"]),
+        SheetColumn("class_id", "Class", maps["class_id"], kinds),
+        SheetColumn("elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours),
+        SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], steepness, "", "max"),
+        SheetColumn("traversability", "Traversability λ", maps["traversability"], shares, ""),
+    ]
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
     marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
     if unlabelled.any() or np.isnan(maps["traversability"]).any():
@@ -126,8 +116,9 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         heights = maps["elevation_m"][row]
         crossed = levels[(levels > heights.min()) & (levels < heights.max())]
         if len(crossed):
-            looks_of = {"colors": "black", "linewidths": 0.35, "alpha": 0.7}
-            panels[f"elevation_m {row}"].contour(x, y, heights, levels=crossed, **looks_of)
+            panels[f"elevation_m {row}"].contour(
+                x, y, heights, levels=crossed, colors="black", linewidths=0.35, alpha=0.7
+            )
         if soft[row].any():
             hatched = LineCollection(list(hatching(soft[row], resolution_m)), colors="black", linewidths=0.4)
             panels[f"class_id {row}"].add_collection(hatched)

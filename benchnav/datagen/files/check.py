@@ -75,8 +75,8 @@ def find_faults(path: str | Path) -> list[Fault]:
 
 def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, str, str, str]]:
     """The faults of a split: map, field, problem and file of each."""
-    fields, count = list(dataset.fields), dataset.map_count(split)
-    stored = np.ma.masked_all((count, len(fields), schema.DIGEST_BYTES), np.uint8)
+    fields = list(dataset.fields)
+    stored = np.ma.masked_all((dataset.map_count(split), len(fields), schema.DIGEST_BYTES), np.uint8)
     computed = stored.copy()
     files: list[str] = []  # of each map
     for piece in dataset.pieces[split]:

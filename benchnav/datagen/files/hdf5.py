@@ -96,7 +96,7 @@ def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
     splits = {
         name: recipe_entry(recipe, ShardFile(name, 0, spec.maps)) for name, spec in recipe.splits.items()
     }
-    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
+    return Contents(recipe.id, [recipe], splits, files)
 
 
 def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
@@ -134,7 +134,7 @@ def pack(recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps) -> b
         maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
     """
     fields = {name: field for name, field in schema.KNOWN.items() if name in maps}
-    contents = Contents(id=recipe.id, recipes=[recipe], splits={split: entry}, fields=fields)
+    contents = Contents(recipe.id, [recipe], {split: entry}, fields=fields)
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
         digests = schema.entry_digests(maps, fields)
         _fill(file, contents, {split: [{**maps, schema.ENTRY_DIGESTS: digests}]})

@@ -99,7 +99,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
             for part in entry["parts"]:
                 number = {"recipe": recipes.index(own[part["recipe"]])} if "recipe" in part else {}
                 gathered["parts"].append({**part, **number})
-    return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files, fields=datasets[0].fields)
+    return Contents(dataset_id, recipes, splits, files, datasets[0].fields)
 
 
 def _of_shards(folders: Sequence[Path]) -> Contents:
