@@ -100,7 +100,7 @@ def import_dem(
             id=recipe.id,
             recipes=[replace(recipe, splits=sizes)],
             splits={name: part.entry() for name, part in parts.items()},
-            files={name: part.files for name, part in parts.items()},
+            files={name: [folder / shard.name for shard in part.shards] for name, part in parts.items()},
             fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
         )
         assemble(contents, folder, out)
@@ -108,7 +108,7 @@ def import_dem(
 
 @dataclass
 class _Part:
-    """What has become of the maps of one split: files of those kept, what is said of each, counts of the others."""
+    """What has become of the maps of one split: shards of those kept, what is said of each, counts of the others."""
 
     name: str
     recipe: Recipe
@@ -118,7 +118,7 @@ class _Part:
         default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []}
     )
     left_out: Counter[str] = field(default_factory=Counter)
-    files: list[Path] = field(default_factory=list)
+    shards: list[ShardFile] = field(default_factory=list)
     pending: list[Maps] = field(default_factory=list)
 
     def add(self, run: Run) -> None:
@@ -192,12 +192,12 @@ class _Part:
         shard = ShardFile(self.name, first, len(self.about["kept"]))
         self.pending = []
         if shard.maps:
-            self.files.append(self.folder / shard.name)
-            self._write(self.files[-1], maps, first)
+            self.shards.append(shard)
+            self._write(shard, maps)
 
-    def _write(self, file: Path, maps: Maps, first: int) -> None:
-        entry = self.entry(first, first + len(maps["environment"]))
-        file.write_bytes(pack(self.recipe, self.name, entry, maps))
+    def _write(self, shard: ShardFile, maps: Maps) -> None:
+        content = pack(self.recipe, self.name, self.entry(shard.first, shard.stop), maps)
+        (self.folder / shard.name).write_bytes(content)
 
     def _add_groups(self) -> None:
         """Writes the shards anew with each map's group, which is known only when all maps are.
@@ -211,12 +211,10 @@ class _Part:
         firsts = self.ground.tiling.groups(self.about["kept"]).tolist()
         texts = (json.dumps([*about, first]).encode() for first in firsts)
         numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])
-        begin = 0
-        for file in self.files:
-            maps = TerrainDataset(file).read(self.name)
-            maps["group"] = numbers[begin : begin + len(maps["environment"])]
-            self._write(file, maps, begin)
-            begin += len(maps["environment"])
+        for shard in self.shards:
+            maps = TerrainDataset(self.folder / shard.name).read(self.name)
+            maps["group"] = numbers[shard.first : shard.stop]
+            self._write(shard, maps)
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """The manifest's entry of the maps from one on, to the last or before another."""
