@@ -123,7 +123,7 @@ class _Part:
 
     def add(self, run: Run) -> None:
         """Makes maps and counts those that are left out; writes a shard where enough are kept."""
-        recipe, tiling = self.recipe, self.ground.tiling
+        recipe = self.recipe
         framed_m, given = self.ground.read(run)
         kept = np.ones(len(run.columns), dtype=bool)
         lacking = {name: np.isnan(values).any(axis=(1, 2, 3)) for name, values in given.items()}
@@ -135,7 +135,7 @@ class _Part:
             if name in lacking:
                 self.left_out[reason] += int((kept & lacking[name]).sum())
                 kept &= ~lacking[name]
-        numbers = (run.row * tiling.tiles[1] + np.array(run.columns))[kept]
+        numbers = (run.row * self.ground.tiling.tiles[1] + np.array(run.columns))[kept]
         if not len(numbers):
             return
         framed_m, given = quantise(framed_m[kept], 13), {name: values[kept] for name, values in given.items()}
@@ -154,10 +154,10 @@ class _Part:
             maps["rgb"] = np.rint(given["photo"])
         if "traversability" in given:
             maps["traversability"] = quantise(given["traversability"][:, 0], 16)
-        solvable = recipe.splits[self.name].solvable
-        times_s = reference_time_s(recipe, maps) if solvable else np.full(len(numbers), np.nan)
-        maps["reference_time_s"] = times_s
-        solved = ~np.isinf(times_s)
+        maps["reference_time_s"] = np.full(len(numbers), np.nan)
+        if recipe.splits[self.name].solvable:
+            maps["reference_time_s"] = reference_time_s(recipe, maps)
+        solved = ~np.isinf(maps["reference_time_s"])
         self.left_out["not_solvable"] += int((~solved).sum())
         about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
         stored = {name: maps[name].astype(kind.dtype) for name, kind in FIELDS.items()}

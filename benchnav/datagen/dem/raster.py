@@ -294,9 +294,6 @@ def load_rasterio() -> Any:
         ConfigError: it is not installed.
     """
     try:
-        import rasterio.enums
-        import rasterio.errors
-        import rasterio.transform
         import rasterio.vrt
         import rasterio.warp
     except ImportError as error:

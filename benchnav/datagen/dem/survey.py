@@ -153,9 +153,14 @@ class Survey:
         Raises:
             DatasetError: a raster cannot be read, or holds what it should not.
         """
-        framed = {name: self._cut(layer, run) for name, layer in self.layers.items()}
-        (north, east), (rows, columns) = self.tiling.stride, self.known
-        for place, column in enumerate(run.columns):
+        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
+        south, wests = run.row * north, [column * east for column in run.columns]
+        framed = Maps()  # each map by a cell
+        for name, layer in self.layers.items():
+            strip = layer.read(range(south, south + height), range(wests[0], wests[-1] + width))
+            framed[name] = np.stack([strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests])
+        rows, columns = self.known
+        for place, west in enumerate(wests):
             own = {name: maps[place] for name, maps in framed.items()}
             low, high = _range("dem", own)
             if high - low > _MOST_RELIEF_M:
@@ -167,9 +172,8 @@ class Survey:
                 expected = "elevations of `dem` without a gap next to 0"
                 other = "Where 0 is a height, declare a value that does not occur, such as -9999."
                 raise self._out_of_range("dem", expected, low, high, 0, other)
-            _, height, width = own["dem"].shape
-            own["dem"][:, ~rows[run.row * north :][:height]] = np.nan
-            own["dem"][:, :, ~columns[column * east :][:width]] = np.nan
+            own["dem"][:, ~rows[south:][: height + 2]] = np.nan
+            own["dem"][:, :, ~columns[west:][: width + 2]] = np.nan
         if "traversability" in framed:
             low, high = _range("traversability", framed)
             if low < 0 or high > 1:
@@ -179,13 +183,6 @@ class Survey:
         if "classes" in given:
             given["classes"] = self._classes(given["classes"])
         return framed["dem"][:, 0], given
-
-    def _cut(self, layer: Layer, run: Run) -> ndarray:
-        """Cuts maps out of a layer, each framed by a cell, shape [B, K, H + 2, W + 2]."""
-        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        south, wests = run.row * north, [column * east for column in run.columns]
-        strip = layer.read(range(south, south + height), range(wests[0], wests[-1] + width))
-        return np.stack([strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests])
 
     def _out_of_range(
         self, name: str, expected: str, low: float, high: float, odd: float, other: str = ""

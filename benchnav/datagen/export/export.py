@@ -79,8 +79,18 @@ class Publication:
 
     def __post_init__(self) -> None:
         """Checks what programs read."""
-        if not self.is_url:
-            _check_licence(self.license)
+        from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+
+        try:
+            listed = str(canonicalize_license_expression(self.license))
+        except InvalidLicenseExpression:
+            listed = ""
+        near = f" Did you mean {listed!r}?" if listed not in ("", self.license) else ""
+        is_listed = listed == self.license and re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", listed)
+        expect(
+            self.is_url or is_listed,
+            f"`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {self.license!r}.{near}",
+        )
         expect(self.creator.strip(), "`creator` to be a name, got an empty one.")
         expect(_URL.fullmatch(self.url) or not self.url, f"`url` to begin with https://, got {self.url!r}.")
         try:
@@ -97,21 +107,6 @@ class Publication:
     def license_url(self) -> str:
         """Where the licence is to be read."""
         return self.license if self.is_url else f"https://spdx.org/licenses/{self.license}.html"
-
-
-def _check_licence(name: str) -> None:
-    """Refuses what is no single name of the SPDX list."""
-    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
-
-    try:
-        listed = str(canonicalize_license_expression(name))
-    except InvalidLicenseExpression:
-        listed = ""
-    near = f" Did you mean {listed!r}?" if listed not in ("", name) else ""
-    expect(
-        listed == name and re.fullmatch(r"(?!LicenseRef-)[A-Za-z0-9.+-]+", name),
-        f"`license` as a name of the SPDX list, such as CC-BY-4.0, or a URL, got {name!r}.{near}",
-    )
 
 
 def export(

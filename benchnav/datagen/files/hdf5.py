@@ -107,11 +107,21 @@ def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
 
 def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[Source]]) -> None:
     """Fills an empty file with a dataset: with all arrays of each split's sources, end to end."""
+    kinds = schema.stored_arrays(contents.fields, *contents.recipes[0].grid.shape)
     # Made at first and kept until all is written: HDF5 writes an array out when it is let go.
-    arrays = {
-        split: _new_arrays(file.create_group(split), entry["maps"], contents)
-        for split, entry in contents.splits.items()
-    }
+    arrays: dict[str, dict[str, h5py.Dataset]] = {split: {} for split in contents.splits}
+    for split, own in arrays.items():
+        group, maps = file.create_group(split), contents.splits[split]["maps"]
+        for name, (dtype, entry) in kinds.items():
+            field = contents.fields.get(name)
+            # Of cells, a map a chunk.
+            chunk = 1 if field and "H" in field.shape else max(1, min(maps, _VALUES_A_CHUNK))
+            own[name] = group.create_dataset(
+                name, (maps, *entry), dtype, chunks=(chunk, *entry),
+                shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
+            )  # fmt: skip
+            if field:
+                own[name].attrs.update(unit=field.unit, meaning=field.meaning)
     for split, several in sources.items():
         first = 0
         for source in several:
@@ -266,22 +276,6 @@ def held(out: Path, overwrite: bool, foreign: Callable[[Path], str] = foreign_in
         restore(out)
         refuse_taken(out, overwrite, foreign)
         yield
-
-
-def _new_arrays(group: h5py.Group, maps: int, contents: Contents) -> dict[str, h5py.Dataset]:
-    """The empty arrays of a split, those of cells with a map a chunk."""
-    fields, arrays = contents.fields, {}
-    kinds = schema.stored_arrays(fields, *contents.recipes[0].grid.shape)
-    for name, (dtype, entry) in kinds.items():
-        about = fields.get(name)
-        chunk = 1 if about and "H" in about.shape else max(1, min(maps, _VALUES_A_CHUNK))
-        arrays[name] = group.create_dataset(
-            name, (maps, *entry), dtype, chunks=(chunk, *entry),
-            shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
-        )  # fmt: skip
-        if about:
-            arrays[name].attrs.update(unit=about.unit, meaning=about.meaning)
-    return arrays
 
 
 def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:

@@ -165,7 +165,11 @@ def horn_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndar
     Returns:
         Two arrays of shape [B, H, W], metres a metre.
     """
-    z = _continue_linearly(framed_m)
+    z = framed_m.copy()
+    # Where the frame is not known, the plane through the two cells next to it.
+    for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
+        for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
+            lines[edge] = np.where(np.isnan(lines[edge]), 2 * lines[next_to] - lines[beyond], lines[edge])
     pairs_y, pairs_x = z[:, 1:] + z[:, :-1], z[:, :, 1:] + z[:, :, :-1]
     smooth_y, smooth_x = pairs_y[:, 1:] + pairs_y[:, :-1], pairs_x[:, :, 1:] + pairs_x[:, :, :-1]
     along_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
@@ -189,12 +193,3 @@ def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
 def framed(elevation_m: ndarray) -> ndarray:
     """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H + 2, W + 2]."""
     return np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)
-
-
-def _continue_linearly(framed_m: ndarray) -> ndarray:
-    """Where the frame is not known, takes the plane through the two cells next to it."""
-    z = framed_m.copy()
-    for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
-        for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
-            lines[edge] = np.where(np.isnan(lines[edge]), 2 * lines[next_to] - lines[beyond], lines[edge])
-    return z
