@@ -83,14 +83,14 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     levels = levels[levels <= relief_m]
     kinds = {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
     relief = {"cmap": "cividis", "vmin": 0, "vmax": relief_m}
-    steepness = {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG}
+    slopes = {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG}
     shares = {"cmap": _SHADES, "vmin": 0, "vmax": 1}
     contours = f"above the lowest point,\ncontours every {levels[1]:g} m"
     columns = [
         SheetColumn("rgb", "RGB", maps["rgb"]),
         SheetColumn("class_id", "Class", maps["class_id"], kinds),
         SheetColumn("elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours),
-        SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], steepness, "", "max"),
+        SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], slopes, "", "max"),
         SheetColumn("traversability", "Traversability λ", maps["traversability"], shares, ""),
     ]
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]

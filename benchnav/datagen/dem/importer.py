@@ -161,7 +161,7 @@ class _Part:
         self.left_out["not_solvable"] += int((~solved).sum())
         about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
         stored = {name: maps[name].astype(kind.dtype) for name, kind in FIELDS.items()}
-        self.pending.append({name: values[solved] for name, values in {**stored, **about}.items()})
+        self.pending.append({name: values[solved] for name, values in (stored | about).items()})
         if sum(maps["class_id"].size for maps in self.pending) >= SHARD_CELLS:
             self._flush()
 

@@ -200,7 +200,7 @@ def _utm_of(crs: Any, x: float, y: float) -> Any:
     longitude, latitude = _transformed(crs, "EPSG:4326", [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
-    zone = 61 if latitude > 84 or latitude < -80 else min(int((longitude + 180) // 6) + 1, 60)
+    zone = 61 if not -80 <= latitude <= 84 else min(int((longitude + 180) // 6) + 1, 60)
     return type(crs).from_epsg((326 if latitude >= 0 else 327) * 100 + zone)
 
 

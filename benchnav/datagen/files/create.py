@@ -144,9 +144,10 @@ def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
     except DatasetError:
         return False
     entry = recipe_entry(recipe, shard)
-    made_by = manifest["recipes"], manifest["generator"]["version"]
-    return made_by == ([recipe.to_dict()], benchnav.__version__) and (
-        entry.items() <= manifest["splits"].get(shard.split, {}).items()
+    return (
+        manifest["recipes"] == [recipe.to_dict()]
+        and manifest["generator"]["version"] == benchnav.__version__
+        and entry.items() <= manifest["splits"].get(shard.split, {}).items()
     )
 
 

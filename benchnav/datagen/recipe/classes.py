@@ -58,8 +58,10 @@ class TerrainClass:
 
     def __post_init__(self) -> None:
         """Refuses values that make no LT function or no colour."""
-        is_colour = all(0 <= value <= 255 for value in self.colour)
-        expect(is_colour, f"`colour` of class {self.name!r} in 0–255, got {self.colour}.")
+        expect(
+            all(0 <= value <= 255 for value in self.colour),
+            f"`colour` of class {self.name!r} in 0–255, got {self.colour}.",
+        )
         is_finite = np.isfinite([self.scale, self.exponent, self.offset, self.noise]).all()
         expect(
             is_finite and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
