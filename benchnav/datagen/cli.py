@@ -65,9 +65,8 @@ def create(
     for name in choose("splits", splits, chosen.splits):
         spec = chosen.splits[name]
         sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
-    chosen = replace(chosen, splits=sizes)
-    cells = sum(spec.maps for spec in sizes.values()) * chosen.height * chosen.width
-    is_folder = own is not None or cells > _MOST_CELLS_OF_A_FILE
+    chosen, maps = replace(chosen, splits=sizes), sum(spec.maps for spec in sizes.values())
+    is_folder = own is not None or maps * chosen.height * chosen.width > _MOST_CELLS_OF_A_FILE
     path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     done, total = next(steps)
@@ -297,8 +296,10 @@ def export(
     steps = export_dataset(dataset, path, publication, chosen, fields, maps_per_file, overwrite)
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))
-    size = decimal(sum(item.stat().st_size for item in files))
-    print(f"wrote {path} ({size} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)")
+    size = sum(item.stat().st_size for item in files)
+    print(
+        f"wrote {path} ({decimal(size)} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)"
+    )
 
 
 def preview(

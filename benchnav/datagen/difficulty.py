@@ -14,7 +14,6 @@ from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import UNLABELLED, Maps, join_maps
 
-_FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADINGS = (
     "split", "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
 )  # fmt: skip
@@ -36,7 +35,8 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    return join_maps([measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS)])
+    fields = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
+    return join_maps([measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, fields)])
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:

@@ -175,9 +175,9 @@ class _Part:
             self._flush()
         if not self.about["kept"]:
             reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
-            dem = self.ground.layers["dem"].raster.name
             raise DatasetError(
-                f"Expected split {self.name!r} to get at least one map, got none from {dem}: of "
+                f"Expected split {self.name!r} to get at least one map, got none from "
+                f"{self.ground.layers['dem'].raster.name}: of "
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "
                 "or a recipe of easier ground."
             )

@@ -105,7 +105,7 @@ class Survey:
             stride = round(apart), round(apart)
         self.tiling = tiling = cut(cells, recipe.grid.shape, stride, shares)
         # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
-        offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
+        offset_m = np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m)
         south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
         height, width = tiling.cells
         north_m = south_m + (height + 1) * step

@@ -43,8 +43,8 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
 
 def columns_of(dataset: TerrainDataset, fields: Iterable[str]) -> dict[str, schema.Field]:
     """The columns of a split: the number of the map, and some of the dataset's fields."""
-    number = schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")
-    return {MAP: number, **{name: dataset.fields[name] for name in fields}}
+    columns = {MAP: schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")}
+    return columns | {name: dataset.fields[name] for name in fields}
 
 
 def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> pa.Schema:

@@ -146,8 +146,8 @@ def pack(recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps) -> b
     fields = {name: field for name, field in schema.KNOWN.items() if name in maps}
     contents = Contents(recipe.id, [recipe], {split: entry}, fields=fields)
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
-        digests = schema.entry_digests(maps, fields)
-        _fill(file, contents, {split: [{**maps, schema.ENTRY_DIGESTS: digests}]})
+        digests = {schema.ENTRY_DIGESTS: schema.entry_digests(maps, fields)}
+        _fill(file, contents, {split: [maps | digests]})
         return file.id.get_file_image()
 
 
@@ -245,8 +245,7 @@ def _join(path: Path, contents: Contents) -> None:
             if hasattr(os, "posix_fallocate"):
                 with open(unfinished, "rb+") as raw:
                     os.posix_fallocate(raw.fileno(), 0, stored + _SPARE_BYTES + _SPARE_BYTES_A_MAP * maps)
-            sources = {split: _opened(split, files) for split, files in contents.files.items()}
-            _fill(file, contents, sources)
+            _fill(file, contents, {split: _opened(split, own) for split, own in contents.files.items()})
             size = file.id.get_filesize()
         os.truncate(unfinished, size)
         if path.exists():

@@ -62,9 +62,9 @@ class TerrainClass:
             all(0 <= value <= 255 for value in self.colour),
             f"`colour` of class {self.name!r} in 0–255, got {self.colour}.",
         )
-        is_finite = np.isfinite([self.scale, self.exponent, self.offset, self.noise]).all()
+        numbers = self.scale, self.exponent, self.offset, self.noise
         expect(
-            is_finite and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
+            np.isfinite(numbers).all() and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
             f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
             f"got {self.scale}, {self.exponent} and {self.noise}.",
         )

@@ -250,8 +250,10 @@ def check_name(kind: str, name: str) -> None:
     Raises:
         ConfigError: with `kind` in its message.
     """
-    fits = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest"
-    expect(fits, f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.")
+    expect(
+        re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest",
+        f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.",
+    )
 
 
 def _check_ends(recipe: Recipe) -> None:
@@ -314,8 +316,10 @@ def _check_splits(recipe: Recipe) -> None:
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)
-        inside = any(other.startswith(f"{name}/") for other in recipe.splits)
-        expect(not inside, f"splits side by side, got one inside {name!r}.")
+        expect(
+            not any(other.startswith(f"{name}/") for other in recipe.splits),
+            f"splits side by side, got one inside {name!r}.",
+        )
         expect(
             split.scenario in recipe.scenarios,
             f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, got {split.scenario!r}.",
@@ -323,18 +327,18 @@ def _check_splits(recipe: Recipe) -> None:
 
 
 def _check_look_alikes(recipe: Recipe) -> None:
-    names, groups, shown = [item.name for item in recipe.classes], recipe.units, len(recipe.occupancy)
+    names, shown = [item.name for item in recipe.classes], len(recipe.occupancy)
     flat = np.zeros((len(names), 1, 1))
     order = np.arange(len(names)).reshape(flat.shape)
     means = latent.expected_of(latent.truth(order, flat, recipe.classes)).ravel()
-    for first, second in (pair for group in groups for pair in combinations(group, 2)):
+    for first, second in (pair for group in recipe.units for pair in combinations(group, 2)):
         expect(
             abs(means[first] - means[second]) >= _LEAST_GAP,
             f"classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on flat ground, "
             f"got {means[first]:.3f} for {names[first]!r} and {means[second]:.3f} for {names[second]!r}. "
             "Change an `offset` or a `colour`.",
         )
-    for unit in never_shown(groups, shown):
+    for unit in never_shown(recipe.units, shown):
         raise ConfigError(
             f"Expected classes that can be shown {shown} at a time, one for each share in `occupancy`, those of one "
             "colour together; got no choice of others that goes with "
