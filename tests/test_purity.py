@@ -12,7 +12,7 @@ from benchnav.datagen.files.hdf5 import pack
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.schema import FIELDS, entry_digests
-from benchnav.datagen.synth import appearance, slope
+from benchnav.datagen.synth import appearance, elevation
 from benchnav.datagen.synth.generate import generate
 from benchnav.planning import risk
 from benchnav.planning.planners.astar import astar
@@ -53,8 +53,8 @@ def test_datagen() -> None:
     light = appearance.light_direction(np.zeros(2), np.full(2, 0.5))
     classes = load_recipe("paper-v1").classes
     colours = np.full((10, 3), 99.0)
-    same_after(lambda: slope.inclination_deg(*slope.horn_gradient(z, 0.5)), z)
-    same_after(lambda: appearance.shade(z, 0.5, light, 0.1), z, light)
+    same_after(lambda: elevation.inclination_deg(*elevation.horn_gradient(elevation.framed(z), 0.5)), z)
+    same_after(lambda: appearance.shade(z, z, light, 0.1), z, light)
     same_after(lambda: appearance.paint(class_id, colours, z), class_id, colours, z)
     same_after(lambda: appearance.class_bands(z, np.array([0.5, 0.5])), z)
     same_after(lambda: latent.latent_mean(class_id, z, classes), class_id, z)

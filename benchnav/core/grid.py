@@ -45,6 +45,10 @@ class Grid:
         """Size of the map along x and y in metres."""
         return self.width * self.resolution_m, self.height * self.resolution_m
 
+    def maps_in(self, cells: int) -> int:
+        """Number of maps that have so many cells together at most, but at least one."""
+        return max(1, cells // (self.height * self.width))
+
     def contains(self, x_m: "Tensor", y_m: "Tensor") -> "Tensor":
         """Tells which positions lie on the map, bool, shape of `x_m`."""
         extent_x, extent_y = self.extent_m

@@ -7,17 +7,14 @@ import sys
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from benchnav import datagen
-from benchnav.core.command import INTERRUPTED, Command, run, show_progress
+from benchnav.core.command import INTERRUPTED, Command, run, show_progress, tell
 from benchnav.core.errors import DatasetError, choose, expect
 from benchnav.core.store import output_path, read_shard, replacing
 from benchnav.core.tables import Table, print_table
-
-if TYPE_CHECKING:
-    from benchnav.datagen.files.reader import TerrainDataset
-
+from benchnav.datagen.dem.raster import Rasters
 
 # A dataset of more becomes a folder of files.
 _MOST_CELLS_OF_A_FILE = 2**28
@@ -68,14 +65,13 @@ def create(
     for name in choose("splits", splits, chosen.splits):
         spec = chosen.splits[name]
         sizes[name] = replace(spec, maps=min(first or spec.maps, spec.maps))
-    chosen = replace(chosen, splits=sizes)
-    cells = sum(spec.maps for spec in sizes.values()) * chosen.height * chosen.width
-    is_folder = own is not None or cells > _MOST_CELLS_OF_A_FILE
+    chosen, maps = replace(chosen, splits=sizes), sum(spec.maps for spec in sizes.values())
+    is_folder = own is not None or maps * chosen.height * chosen.width > _MOST_CELLS_OF_A_FILE
     path = output_path(out or f"datasets/{chosen.id}{'' if is_folder else '.h5'}")
     steps = datagen.create_dataset(chosen, path, jobs, scheduler, own, overwrite)
     done, total = next(steps)
     if done:
-        print(f"{done} of {total} maps were there already", file=sys.stderr)
+        tell(f"{done} of {total} maps were there already")
     show_progress(chain([(done, total)], steps), "maps")
     if not is_dataset(path):
         print(
@@ -166,8 +162,10 @@ def validate(file: str) -> int:
             f"To make them anew, remove {' '.join(files)} in {path} and give the command again that made it."
         )
     else:
-        same = "the same recipe and version give the same digests"
-        print(f"To make them anew, make the file again with --overwrite: {same}.")
+        print(
+            "To make them anew, make the file again with --overwrite: the same recipe and version give the same "
+            "digests."
+        )
     return 1
 
 
@@ -189,6 +187,7 @@ def merge(files: list[str], out: str, id: str = "", overwrite: bool = False) -> 
 
 
 def import_dem(
+    rasters: Rasters,
     dem: str,
     overrides: list[str],
     out: str,
@@ -197,11 +196,6 @@ def import_dem(
     splits: str = "test/real",
     stride: float | None = None,
     scenario: str = "std",
-    classes: str = "",
-    class_ids: dict[int, str | None] | None = None,
-    random_classes: bool = False,
-    photo: str = "",
-    traversability: str = "",
     solvable: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -210,6 +204,7 @@ def import_dem(
     Rasters may be anything that GDAL opens: files, https:// and s3:// addresses, zip:// archives, mosaics (.vrt).
 
     Args:
+        rasters: What there is of the ground beside its elevation.
         dem: Raster of elevations in metres, in any coordinate reference system.
         overrides: Changes to the recipe, such as resolution_m=1 goal_m=[50,50].
         out: File .h5 to write, or else a folder of many files.
@@ -218,35 +213,23 @@ def import_dem(
         splits: Splits and their shares of the maps, such as train:0.7,valid:0.1,test/site:0.2; no two of them touch.
         stride: Metres from one map to the next; a map's width when not given. Less makes maps of a split overlap.
         scenario: Which of the recipe's scenarios lights the maps.
-        classes: Raster of terrain classes; laid out at random when not given.
-        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
-        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
-        photo: Raster of red, green and blue; painted by the class when not given.
-        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
         solvable: Keep only maps whose goal can be reached, and store the grid reference time.
         overwrite: Replace what is there.
     """
     from benchnav.datagen.dem.importer import import_dem as import_maps
-    from benchnav.datagen.dem.survey import Rasters
     from benchnav.datagen.dem.tiling import read_shares
     from benchnav.datagen.files.hdf5 import name_of
 
     path = output_path(out)
-    rasters = Rasters(
-        dem=dem,
-        classes=classes,
-        class_ids=class_ids,
-        random_classes=random_classes,
-        photo=photo,
-        traversability=traversability,
-    )
     name = id or name_of(path)
     chosen = datagen.load_recipe(recipe, [f"id={name}", *overrides] if overrides else [])
+    if id or not overrides:
+        chosen = replace(chosen, id=name)
     steps = import_maps(
-        rasters,
+        dem,
         path,
         chosen,
-        dataset_id=chosen.id if overrides and not id else name,
+        rasters,
         shares=read_shares(splits),
         scenario=scenario,
         stride_m=stride,
@@ -298,11 +281,11 @@ def export(
     """
     from rich.filesize import decimal
 
-    from benchnav.datagen.export.croissant import AUTHORS, Publication, is_ours
+    from benchnav.datagen.export.export import AUTHORS, Publication, is_ours
     from benchnav.datagen.export.export import export as export_dataset
 
     dataset = _opened(file)
-    chosen = [name for name in dataset.splits if splits is None or name in splits]
+    chosen = choose("splits", splits, dataset.splits)
     expect(
         (license and creator) or is_ours(dataset, chosen),
         f"`license` and `creator` of {dataset.id}, whose maps are not of a shipped recipe, got none. Pass yours; of "
@@ -310,11 +293,13 @@ def export(
     )
     publication = Publication(license=license or "MIT", creator=creator or AUTHORS, url=url, date=date)
     path = output_path(out)
-    steps = export_dataset(dataset, path, publication, splits, fields, maps_per_file, overwrite)
+    steps = export_dataset(dataset, path, publication, chosen, fields, maps_per_file, overwrite)
     show_progress(steps, "maps")
     files = sorted(path.rglob("*.parquet"))
-    size = decimal(sum(item.stat().st_size for item in files))
-    print(f"wrote {path} ({size} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)")
+    size = sum(item.stat().st_size for item in files)
+    print(
+        f"wrote {path} ({decimal(size)} in {len(files)} Parquet file{'s' * (len(files) > 1)}, with croissant.json)"
+    )
 
 
 def preview(
@@ -339,8 +324,10 @@ def preview(
     dataset = _opened(file)
     split = split or ("test/std" if "test/std" in dataset.splits else next(iter(dataset.splits)))
     path = output_path(out or f"{'contact' if contact_sheet else 'preview'}-{split.replace('/', '-')}.png")
-    is_picture = path.suffix in (".png", ".pdf", ".svg", ".jpg")
-    expect(is_picture, f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.")
+    expect(
+        path.suffix in (".png", ".pdf", ".svg", ".jpg"),
+        f"`out` to end in .png, .pdf, .svg or .jpg, got {str(path)!r}.",
+    )
     expect(maps is None or not contact_sheet, "either `maps` or `contact-sheet`, got both.")
     expect(maps is None or maps, "`maps` with at least one index, got none.")
     if contact_sheet:
@@ -353,12 +340,12 @@ def preview(
     print(f"wrote {path}")
 
 
-def _opened(file: str) -> "TerrainDataset":
+def _opened(file: str) -> "datagen.TerrainDataset":
     """The dataset of a path or an id."""
     return datagen.TerrainDataset(datagen.find_dataset(file))
 
 
-def _written(path: Path) -> "TerrainDataset":
+def _written(path: Path) -> "datagen.TerrainDataset":
     """A new dataset, of which is printed where it is, its size, its splits and their digests."""
     from rich.filesize import decimal
 
@@ -378,12 +365,12 @@ def main() -> None:
         "show": Command(show, ("file",)),
         "validate": Command(validate, ("file",)),
         "merge": Command(merge, ("files",)),
-        "import-dem": Command(import_dem, ("dem", "overrides")),
+        "import-dem": Command(import_dem, ("dem", "overrides"), settings=Rasters),
         "export": Command(export, ("file",)),
         "preview": Command(preview, ("file",)),
     }
     description = "Make, list, show, check, combine, import, export and draw terrain datasets."
     status = run("benchnav-datagen", description, commands)
     if status == INTERRUPTED and sys.argv[1] == "create":
-        print("benchnav-datagen: to go on, give the same command again", file=sys.stderr)
+        tell("benchnav-datagen: to go on, give the same command again")
     sys.exit(status)

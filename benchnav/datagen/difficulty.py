@@ -12,22 +12,21 @@ from benchnav.core.tables import NOTHING, Table
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.datagen.schema import UNLABELLED, Maps
+from benchnav.datagen.schema import UNLABELLED, Maps, join_maps
 
-_FIELDS = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
 _HEADINGS = (
     "split", "stuck\n%", "soft\nground %", "soft\nspots %", "time s,\nmedian", "time s,\nrange", "straight\nfree",
 )  # fmt: skip
-# What columns hold: heading and sentence.
-_EXPLAINED = (
-    ("stuck %", "share of the cells that count as stuck: their true mean λ is at most λ_stuck, {stuck:g}."),
-    ("soft ground %", "share of the cells whose class has soft spots, which no colour shows; 0 where no class has."),
-    ("soft spots %", "share of all ground that is itself a soft spot, on average over draws of λ."),
-    ("time s", "of the fastest path over cells that are not stuck, at 1 m/s times their mean λ: median, least and most "
-     "of the maps. A dash where the recipe does not ask for it with `solvable: true`."),
-    ("straight free", "maps on which the straight line from start to goal meets no stuck cell. Where these are nearly "
-     "all, there is little to plan."),
-)  # fmt: skip
+# What columns hold.
+_NOTES = (
+    "  stuck %: share of the cells that count as stuck: their true mean λ is at most λ_stuck, {stuck:g}.",
+    "  soft ground %: share of the cells whose class has soft spots, which no colour shows; 0 where no class has.",
+    "  soft spots %: share of all ground that is itself a soft spot, on average over draws of λ.",
+    "  time s: of the fastest path over cells that are not stuck, at 1 m/s times their mean λ: median, least and most "
+    "of the maps. A dash where the recipe does not ask for it with `solvable: true`.",
+    "  straight free: maps on which the straight line from start to goal meets no stuck cell. Where these are nearly "
+    "all, there is little to plan.",
+)
 
 
 def of_split(dataset: TerrainDataset, split: str) -> Maps:
@@ -36,8 +35,8 @@ def of_split(dataset: TerrainDataset, split: str) -> Maps:
     Raises:
         DatasetError: there is no such split, or its data are damaged.
     """
-    parts = [measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, _FIELDS)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    fields = ("class_id", "slope_deg", "start_m", "goal_m", "reference_time_s")
+    return join_maps([measure(maps, dataset.recipe) for _, maps in dataset.chunks(split, fields)])
 
 
 def measure(maps: Maps, recipe: Recipe) -> Maps:
@@ -117,5 +116,5 @@ def table(dataset: TerrainDataset) -> Table:
         headings=_HEADINGS,
         numbers=True,
         rows=tuple(rows),
-        notes=tuple(f"  {heading}: {sentence.format(stuck=stuck)}" for heading, sentence in _EXPLAINED),
+        notes=tuple(note.format(stuck=stuck) for note in _NOTES),
     )

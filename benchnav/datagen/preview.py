@@ -8,8 +8,7 @@ Where the classes have soft spots, the ground that may hide them is hatched and 
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -19,7 +18,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.patheffects import AbstractPathEffect, withStroke
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from benchnav.core.figures import (
@@ -30,6 +29,7 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     frame_map,
     hatching,
+    legend_outside,
     mark,
     mark_handle,
     outline,
@@ -40,6 +40,7 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.datagen.synth.appearance import light_direction, shade
+from benchnav.datagen.synth.elevation import framed, horn_gradient
 
 FIELDS = ("rgb", "class_id", "elevation_m", "slope_deg", "traversability")
 STEEP_DEG = 30.0
@@ -71,7 +72,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     maps = dataset.read(split, indices, (*FIELDS, "start_m", "goal_m"))
     maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
     # Heights over each map's lowest point compare between maps; heights over a datum seldom do.
-    maps["elevation_m"] = maps["elevation_m"] - maps["elevation_m"].min((1, 2), keepdims=True)
+    maps["elevation_m"] -= maps["elevation_m"].min((1, 2), keepdims=True)
     classes, grid = dataset.recipe.classes, dataset.grid
     unlabelled = maps["class_id"] == UNLABELLED
     shown, colours = np.unique(maps["class_id"][~unlabelled]), class_colours(classes)
@@ -81,27 +82,17 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     levels = np.array(MaxNLocator(9, steps=[1, 2, 2.5, 5, 10]).tick_values(0, relief_m))
     levels = levels[levels <= relief_m]
     kinds = {"cmap": class_shades(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
-    looks: dict[str, dict[str, Any]] = {
-        "rgb": {"title": "RGB"},
-        "class_id": {"title": "Class", "shades": kinds},
-        "elevation_m": {
-            "title": "Elevation [m]",
-            "shades": {"cmap": "cividis", "vmin": 0, "vmax": relief_m},
-            "unit": f"above the lowest point,\ncontours every {levels[1]:g} m",
-        },
-        "slope_deg": {
-            "title": "Slope [°]",
-            "shades": {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG},
-            "unit": "",
-            "extend": "max",
-        },
-        "traversability": {
-            "title": "Traversability λ",
-            "shades": {"cmap": _SHADES, "vmin": 0, "vmax": 1},
-            "unit": "",
-        },
-    }
-    columns = [SheetColumn(name=name, layers=maps[name], **look) for name, look in looks.items()]
+    relief = {"cmap": "cividis", "vmin": 0, "vmax": relief_m}
+    slopes = {"cmap": "magma_r", "vmin": 0, "vmax": STEEP_DEG}
+    shares = {"cmap": _SHADES, "vmin": 0, "vmax": 1}
+    contours = f"above the lowest point,\ncontours every {levels[1]:g} m"
+    columns = [
+        SheetColumn("rgb", "RGB", maps["rgb"]),
+        SheetColumn("class_id", "Class", maps["class_id"], kinds),
+        SheetColumn("elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours),
+        SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], slopes, "", "max"),
+        SheetColumn("traversability", "Traversability λ", maps["traversability"], shares, ""),
+    ]
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
     marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
     if unlabelled.any() or np.isnan(maps["traversability"]).any():
@@ -125,8 +116,9 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         heights = maps["elevation_m"][row]
         crossed = levels[(levels > heights.min()) & (levels < heights.max())]
         if len(crossed):
-            looks_of = {"colors": "black", "linewidths": 0.35, "alpha": 0.7}
-            panels[f"elevation_m {row}"].contour(x, y, heights, levels=crossed, **looks_of)
+            panels[f"elevation_m {row}"].contour(
+                x, y, heights, levels=crossed, colors="black", linewidths=0.35, alpha=0.7
+            )
         if soft[row].any():
             hatched = LineCollection(list(hatching(soft[row], resolution_m)), colors="black", linewidths=0.4)
             panels[f"class_id {row}"].add_collection(hatched)
@@ -139,8 +131,7 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     return figure
 
 
-@dataclass(frozen=True, kw_only=True)
-class SheetColumn:
+class SheetColumn(NamedTuple):
     """A column of a sheet of maps.
 
     Args:
@@ -156,7 +147,7 @@ class SheetColumn:
     name: str
     title: str
     layers: np.ndarray
-    shades: Mapping[str, Any] = field(default_factory=dict)
+    shades: Mapping[str, Any] = {}
     unit: str | None = None
     extend: str = "neither"
     most: int = 4
@@ -216,10 +207,9 @@ def sheet_of_maps(
     panels[-1, across // 2].set_xlabel("x [m]", size=TEXT)
     figure.supylabel("y [m]", size=TEXT, y=0.5 + (ends / 2 - 0.45) / height)
     figure.suptitle(heading, x=0.01, ha="left", parse_math=False)
-    sides: Any = ((marks, len(marks), "outside upper right"), (classes, legend_columns, "outside lower left"))
-    for handles, count, loc in sides:
+    for handles, count, side in ((marks, len(marks), "upper right"), (classes, legend_columns, "lower left")):
         if handles:
-            for text in figure.legend(handles=handles, loc=loc, ncols=count).get_texts():
+            for text in legend_outside(figure, handles, count, side).get_texts():
                 text.set_parse_math(False)
     return figure
 
@@ -259,7 +249,6 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
     sheet = figure.add_axes((0, 0, 1, 1))
     sheet.set(xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     sheet.axis("off")
-    halo: list[AbstractPathEffect] = [withStroke(linewidth=1.4, foreground="black")]
     for index in range(count):
         stored = {name: values[0] for name, values in dataset.read(split, [index], fields).items()}
         x, y = gap + index % columns * (wide + gap), top + index // columns * (high + gap)
@@ -273,15 +262,13 @@ def contact_sheet_figure(dataset: TerrainDataset, split: str) -> Figure:
         box = (x, x + wide, y + high, y)
         sheet.imshow(image, origin="lower", extent=box, aspect="auto", interpolation="none")
         label = sheet.text(x + 0.03, y + 0.03, str(index), size=TEXT, color="white", va="top")
-        label.set_path_effects(halo)
+        label.set_path_effects([withStroke(linewidth=1.4, foreground="black")])
     return figure
 
 
 def soft_ground(class_id: np.ndarray, classes: Sequence[TerrainClass]) -> np.ndarray:
     """Cells whose class has soft spots, bool, shape of `class_id`."""
-    soft = np.zeros(UNLABELLED + 1, dtype=bool)
-    soft[: len(classes)] = [item.soft is not None for item in classes]
-    return soft[class_id]
+    return np.isin(class_id, [number for number, item in enumerate(classes) if item.soft])
 
 
 def class_colours(classes: Sequence[TerrainClass]) -> np.ndarray:
@@ -325,9 +312,10 @@ def _hillshade(elevation_m: np.ndarray, slope_deg: np.ndarray, resolution_m: flo
     """
     lift = np.clip(0.8 / np.tan(np.radians(np.percentile(slope_deg, 95) + 1e-3)), 0.1, 30)
     light = light_direction(np.array([0.75 * np.pi]), np.array([0.7]))
-    lit = shade(lift * elevation_m.astype(np.float64), resolution_m, light, 0.0) - light[0, 2]
-    colour = np.repeat((lit > 0).astype(np.float64)[..., None], 3, axis=-1)
-    return np.concatenate([colour, 0.7 * np.abs(lit)[..., None]], axis=-1)
+    ground_m = framed(lift * elevation_m.astype(np.float64))
+    lit = shade(*horn_gradient(ground_m, resolution_m), light, 0.0) - light[0, 2]
+    white = lit > 0
+    return np.stack([white, white, white, 0.7 * np.abs(lit)], axis=-1)
 
 
 def _draw_soft_ground(panel: Axes, edges: np.ndarray, line: float = 0.4) -> None:

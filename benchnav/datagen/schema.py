@@ -8,7 +8,7 @@ not the file's bytes, so they are the same whatever compression, machine or numb
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ ENTRY_DIGESTS = "entry_digests"
 DIGEST_BYTES = 32
 UNLABELLED = 255  # `class_id` of a cell whose class is not known, as on real ground
 
+Json = dict[str, Any]  # a manifest, or what is in it
 Maps = dict[str, ndarray]  # some maps: arrays by field, each of shape [B, *entry shape]
 
 
@@ -76,6 +77,7 @@ OPTIONAL: dict[str, Field] = {
     ),
 }
 
+KNOWN = FIELDS | OPTIONAL
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
 
 
@@ -84,15 +86,17 @@ def quantise(values: ndarray, bits: int) -> ndarray:
     return np.rint(values * 2.0**bits) * 2.0**-bits
 
 
+def join_maps(parts: Sequence[Maps]) -> Maps:
+    """Joins parts of a split, of which there is at least one, end to end."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def stored_arrays(fields: Fields, height: int, width: int) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Dtype and shape of a map's entry in each array that is stored of a split: its fields', and of their digests."""
     arrays = {name: (field.dtype, field.entry_shape(height, width)) for name, field in fields.items()}
     return {**arrays, ENTRY_DIGESTS: ("|u1", (len(fields), DIGEST_BYTES))}
-
-
-def fields_in(maps: Maps) -> dict[str, Field]:
-    """The fields that maps have, in the order of being stored."""
-    return {name: field for name, field in (FIELDS | OPTIONAL).items() if name in maps}
 
 
 def entry_digests(maps: Maps, fields: Fields) -> ndarray:
@@ -105,12 +109,13 @@ def entry_digests(maps: Maps, fields: Fields) -> ndarray:
     Returns:
         uint8, shape [B, F, 32].
     """
-    columns = []
-    for name, field in fields.items():
-        entries = np.ascontiguousarray(maps[name], dtype=field.dtype)
-        columns.append([hashlib.sha256(entry.tobytes()).digest() for entry in entries])
-    digests = np.frombuffer(b"".join(b"".join(row) for row in zip(*columns, strict=True)), np.uint8)
-    return digests.reshape(-1, len(fields), DIGEST_BYTES)
+    digests = [
+        hashlib.sha256(entry.tobytes()).digest()
+        for name, field in fields.items()
+        for entry in np.ascontiguousarray(maps[name], dtype=field.dtype)
+    ]
+    by_field = np.frombuffer(b"".join(digests), np.uint8).reshape(len(fields), -1, DIGEST_BYTES)
+    return by_field.swapaxes(0, 1)
 
 
 def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> str:
@@ -122,13 +127,15 @@ def split_digest(digests: ndarray, height: int, width: int, fields: Fields) -> s
         width: columns of a map.
         fields: the F fields.
     """
-    arrays = stored_arrays(fields, height, width)
-    table = [[name, arrays[name][0], [len(digests), *arrays[name][1]]] for name in fields]
+    table = [
+        [name, field.dtype, [len(digests), *field.entry_shape(height, width)]]
+        for name, field in fields.items()
+    ]
     text = json.dumps(table, separators=(",", ":")).encode()
     return hashlib.sha256(text + digests.tobytes()).hexdigest()
 
 
-def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fields: Fields) -> str:
+def version_of(synthesis: Iterable[int], splits: Iterable[Json], fields: Fields) -> str:
     """The format version of a file: the least that its recipes' synthesis, its splits' entries and its fields need."""
     if set(fields) - set(FIELDS):
         return "1.3"
@@ -137,12 +144,12 @@ def version_of(synthesis: Iterable[int], splits: Iterable[Mapping[str, Any]], fi
     return "1.1" if max(synthesis) > 1 else "1.0"
 
 
-def has_unlabelled(entry: Mapping[str, Any]) -> bool:
+def has_unlabelled(entry: Json) -> bool:
     """Tells by a split's entry in the manifest whether some of its cells have no class."""
     return any(sum(part.get("source", {}).get("unlabelled", ())) > 0 for part in entry["parts"])
 
 
-def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
+def field_table(height: int, width: int, fields: Fields) -> Json:
     """Describes fields for the manifest."""
     return {
         name: {
@@ -155,7 +162,7 @@ def field_table(height: int, width: int, fields: Fields) -> dict[str, Any]:
     }
 
 
-def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
+def read_field_table(table: Json) -> dict[str, Field]:
     """Gives the fields that a manifest describes, in its order; of those that are not ours any value is allowed.
 
     Raises:
@@ -170,7 +177,7 @@ def read_field_table(table: Mapping[str, Any]) -> dict[str, Field]:
         dtype, shape = np.dtype(about["dtype"]).str, tuple(about["shape"])
         symbols = (*shape[:-2], "H", "W") if shape[-2:] == (height, width) else shape
         foreign = Field(dtype, symbols, about["unit"], -np.inf, np.inf, about["meaning"])
-        fields[name] = (FIELDS | OPTIONAL).get(name, foreign)
+        fields[name] = KNOWN.get(name, foreign)
     return fields
 
 
@@ -188,7 +195,7 @@ _IMPORTED = {"maps": int, "source": {"file": str, "left_out": dict}}
 _RECIPE = {"id": str, "seed": int, "scenarios": dict, "splits": dict}
 
 
-def check(manifest: Mapping[str, Any]) -> None:
+def check(manifest: Json) -> None:
     """Refuses a manifest that does not say what a reader needs.
 
     Raises:
@@ -215,7 +222,7 @@ def check(manifest: Mapping[str, Any]) -> None:
             raise ValueError(f"a file of split {name!r} is not in the folder")
 
 
-def _check_kinds(given: Any, kinds: Mapping[str, Any]) -> None:
+def _check_kinds(given: Any, kinds: Json) -> None:
     for name, kind in kinds.items():
         value = given.get(name)
         if isinstance(kind, dict):

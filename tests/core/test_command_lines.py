@@ -131,8 +131,9 @@ GOOD: list[tuple[str, dict[str, Any]]] = [
      {"recipe": "tiny-v1", "overrides": ["id=a", "splits.train.maps=5"], "out": "o"}),
     ("datagen create tiny-v1 id=a --jobs 2 b=[1,2]",
      {"recipe": "tiny-v1", "overrides": ["id=a", "b=[1,2]"], "jobs": 2}),
-    ("datagen import-dem d.tif --out o --class-ids '{1: gravel, 9: null}'",
-     {"dem": "d.tif", "overrides": [], "out": "o", "class_ids": {1: "gravel", 9: None}}),
+    ("datagen import-dem d.tif --out o --classes c.tif --class-ids '{1: gravel, 9: null}'",
+     {"rasters": {"classes": "c.tif", "class_ids": {1: "gravel", 9: None}},
+      "dem": "d.tif", "overrides": [], "out": "o"}),
     ("eval merge out a b", {"out": "out", "parts": ["a", "b"]}),
     ("eval list", {"kinds": []}),
     # names, mappings, and keys within them

@@ -12,7 +12,7 @@ from benchnav.core.errors import ConfigError
 from benchnav.core.store import Shard
 from benchnav.datagen import cli
 from benchnav.datagen.files import create
-from benchnav.datagen.files.create import ShardFile
+from benchnav.datagen.files.hdf5 import ShardFile
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import SoftSpots
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, shipped_recipes

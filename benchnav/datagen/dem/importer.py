@@ -23,14 +23,14 @@ import numpy as np
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.store import building, real_place
-from benchnav.datagen.dem.raster import load_rasterio
-from benchnav.datagen.dem.survey import Rasters, Survey
+from benchnav.datagen.dem.raster import Rasters, load_rasterio
+from benchnav.datagen.dem.survey import Survey
 from benchnav.datagen.dem.tiling import Run
-from benchnav.datagen.files.create import SHARD_CELLS, ShardFile
-from benchnav.datagen.files.hdf5 import Contents, assemble, held, pack
+from benchnav.datagen.files.create import SHARD_CELLS
+from benchnav.datagen.files.hdf5 import Contents, ShardFile, assemble, held, pack
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import Recipe, Split
-from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, quantise
+from benchnav.datagen.schema import FIELDS, OPTIONAL, UNLABELLED, Maps, join_maps, quantise
 from benchnav.datagen.synth.generate import class_map, complete, reference_time_s
 
 _CELLS_AT_ONCE = 2**20
@@ -43,14 +43,15 @@ _REASONS = {
     "missing_colours": "have cells without colour",
     "not_solvable": "have a goal that cannot be reached",
 }
+_LACKING = {"missing_elevation": "dem", "missing_classes": "classes", "missing_colours": "photo"}
 
 
 def import_dem(
-    rasters: Rasters,
+    dem: str,
     out: Path,
     recipe: Recipe,
+    rasters: Rasters = Rasters(),  # noqa: B008
     *,
-    dataset_id: str,
     shares: Mapping[str, float] | None = None,
     scenario: str = "std",
     stride_m: float | None = None,
@@ -63,10 +64,10 @@ def import_dem(
     such. A map's random numbers go by its number in the ground, so they are the same whichever others are left out.
 
     Args:
-        rasters: where elevation, classes, colours and λ come from.
+        dem: elevations in metres, by any name that rasterio opens.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
-        recipe: size, resolution, start and goal of the maps, class table, light, seed.
-        dataset_id: name and version of the dataset.
+        recipe: id of the dataset, size, resolution, start and goal of the maps, class table, light, seed.
+        rasters: where classes, colours and λ come from.
         shares: of the maps, by split; None for all in `test/real`.
         scenario: which of the recipe's scenarios lights the maps.
         stride_m: from one map to the next; None for maps side by side.
@@ -80,15 +81,15 @@ def import_dem(
     out = real_place(out)
     shares = {"test/real": 1.0} if shares is None else shares
     splits = {name: Split(scenario=scenario, maps=1, solvable=solvable) for name in shares}
-    recipe = replace(recipe, id=dataset_id, splits=splits)
+    recipe = replace(recipe, splits=splits)
     with ExitStack() as stack:
         stack.enter_context(held(out, overwrite))
         stack.enter_context(load_rasterio().Env(GDAL_CACHEMAX=_CACHE_BYTES))
-        ground = Survey(stack, rasters, recipe, shares, stride_m)
+        ground = Survey(stack, dem, rasters, recipe, shares, stride_m)
         folder = stack.enter_context(building(out))
-        parts = {name: _Part(name=name, recipe=recipe, folder=folder, ground=ground) for name in shares}
-        done, most = 0, max(1, _CELLS_AT_ONCE // (recipe.height * recipe.width))
-        for run in ground.tiling.runs(most):
+        parts = {name: _Part(name, recipe, folder, ground) for name in shares}
+        done = 0
+        for run in ground.tiling.runs(recipe.grid.maps_in(_CELLS_AT_ONCE)):
             parts[run.split].add(run)
             done += len(run.columns)
             yield done, ground.tiling.maps
@@ -96,18 +97,18 @@ def import_dem(
             part.finish()
         sizes = {name: replace(splits[name], maps=len(part.about["kept"])) for name, part in parts.items()}
         contents = Contents(
-            id=dataset_id,
+            id=recipe.id,
             recipes=[replace(recipe, splits=sizes)],
             splits={name: part.entry() for name, part in parts.items()},
-            files={name: part.files for name, part in parts.items()},
+            files={name: [folder / shard.name for shard in part.shards] for name, part in parts.items()},
             fields=FIELDS | ({"group": OPTIONAL["group"]} if ground.tiling.overlaps else {}),
         )
         assemble(contents, folder, out)
 
 
-@dataclass(kw_only=True)
+@dataclass
 class _Part:
-    """What has become of the maps of one split: files of those kept, what is said of each, counts of the others."""
+    """What has become of the maps of one split: shards of those kept, what is said of each, counts of the others."""
 
     name: str
     recipe: Recipe
@@ -117,58 +118,51 @@ class _Part:
         default_factory=lambda: {"kept": [], "lowest_m": [], "unlabelled": []}
     )
     left_out: Counter[str] = field(default_factory=Counter)
-    files: list[Path] = field(default_factory=list)
+    shards: list[ShardFile] = field(default_factory=list)
     pending: list[Maps] = field(default_factory=list)
-    written: int = 0
 
     def add(self, run: Run) -> None:
         """Makes maps and counts those that are left out; writes a shard where enough are kept."""
-        recipe, tiling = self.recipe, self.ground.tiling
+        recipe = self.recipe
         framed_m, given = self.ground.read(run)
         kept = np.ones(len(run.columns), dtype=bool)
-        lacking = {"missing_elevation": np.isnan(framed_m[:, 1:-1, 1:-1]).any(axis=(1, 2))}
-        if "class_id" in given:
-            lacks = np.isnan(given["class_id"])
-            if "rgb" in given:
-                # A measured λ is worth learning from without a class.
-                lacks = lacks & np.isnan(given.get("traversability", np.nan))
-                lacking["missing_classes"] = lacks.all(axis=(1, 2, 3))
-            else:  # a cell is painted in the colour of its class
-                lacking["missing_classes"] = lacks.any(axis=(1, 2, 3))
-        if "rgb" in given:
-            lacking["missing_colours"] = np.isnan(given["rgb"]).any(axis=(1, 2, 3))
-        for reason, which in lacking.items():
-            self.left_out[reason] += int((kept & which).sum())
-            kept &= ~which
-        numbers = (run.row * tiling.tiles[1] + np.array(run.columns))[kept]
+        lacking = {name: np.isnan(values).any(axis=(1, 2, 3)) for name, values in given.items()}
+        if "classes" in given and "photo" in given:  # else a cell is painted in the colour of its class
+            # A measured λ is worth learning from without a class.
+            unknown = np.isnan(given["classes"]) & np.isnan(given.get("traversability", np.nan))
+            lacking["classes"] = unknown.all(axis=(1, 2, 3))
+        for reason, name in _LACKING.items():
+            if name in lacking:
+                self.left_out[reason] += int((kept & lacking[name]).sum())
+                kept &= ~lacking[name]
+        numbers = (run.row * self.ground.tiling.tiles[1] + np.array(run.columns))[kept]
         if not len(numbers):
             return
-        framed_m = quantise(framed_m[kept], 13)
+        framed_m, given = quantise(framed_m[kept], 13), {name: values[kept] for name, values in given.items()}
         lowest_m = framed_m[:, 1:-1, 1:-1].min(axis=(1, 2))
         class_id = class_map(recipe, self.name, numbers)
-        if "class_id" in given:
-            class_id = np.nan_to_num(given["class_id"][kept, 0], nan=UNLABELLED).astype(np.int64)
+        if "classes" in given:
+            class_id = np.nan_to_num(given["classes"][:, 0], nan=UNLABELLED).astype(np.int64)
         labelled = class_id != UNLABELLED
         height_m = framed_m - lowest_m[:, None, None]
         maps = complete(recipe, self.name, numbers, np.where(labelled, class_id, 0), height_m)
         maps["class_id"] = class_id
         maps["traversability"] = np.where(labelled, maps["traversability"], np.nan)
-        if "class_id" in given:
+        if "classes" in given:
             maps["environment"] = np.zeros(len(numbers))
-        if "rgb" in given:
-            maps["rgb"] = np.rint(given["rgb"][kept])
+        if "photo" in given:
+            maps["rgb"] = np.rint(given["photo"])
         if "traversability" in given:
-            maps["traversability"] = quantise(given["traversability"][kept, 0], 16)
-        solvable = recipe.splits[self.name].solvable
-        times_s = reference_time_s(recipe, maps) if solvable else np.full(len(numbers), np.nan)
-        maps["reference_time_s"] = times_s
-        solved = np.isfinite(times_s) | (not solvable)
+            maps["traversability"] = quantise(given["traversability"][:, 0], 16)
+        maps["reference_time_s"] = np.full(len(numbers), np.nan)
+        if recipe.splits[self.name].solvable:
+            maps["reference_time_s"] = reference_time_s(recipe, maps)
+        solved = ~np.isinf(maps["reference_time_s"])
         self.left_out["not_solvable"] += int((~solved).sum())
-        found = (numbers, lowest_m, (~labelled).sum(axis=(1, 2)))
-        for values, more in zip(self.about.values(), found, strict=True):
-            values += more[solved].tolist()
-        self.pending.append({name: maps[name][solved].astype(kind.dtype) for name, kind in FIELDS.items()})
-        if (len(self.about["kept"]) - self.written) * recipe.height * recipe.width >= SHARD_CELLS:
+        about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
+        stored = {name: maps[name].astype(kind.dtype) for name, kind in FIELDS.items()}
+        self.pending.append({name: values[solved] for name, values in (stored | about).items()})
+        if sum(maps["class_id"].size for maps in self.pending) >= SHARD_CELLS:
             self._flush()
 
     def finish(self) -> None:
@@ -177,29 +171,33 @@ class _Part:
         Raises:
             DatasetError: no map was kept.
         """
+        if self.pending:
+            self._flush()
         if not self.about["kept"]:
             reasons = [f"{count} {_REASONS[reason]}" for reason, count in self.left_out.items() if count]
-            dem = self.ground.layers["elevation_m"].raster.name
             raise DatasetError(
-                f"Expected split {self.name!r} to get at least one map, got none from {dem}: of "
+                f"Expected split {self.name!r} to get at least one map, got none from "
+                f"{self.ground.layers['dem'].raster.name}: of "
                 f"{self.left_out.total()}, {', '.join(reasons)}. Fill the gaps, or take smaller maps, other shares "
                 "or a recipe of easier ground."
             )
-        if self.written < len(self.about["kept"]):
-            self._flush()
         if self.ground.tiling.overlaps:
             self._add_groups()
 
     def _flush(self) -> None:
-        shard = ShardFile(split=self.name, first=self.written, stop=len(self.about["kept"]))
-        maps = {name: np.concatenate([some[name] for some in self.pending]) for name in FIELDS}
-        self.files.append(self.folder / shard.name)
-        self._write(self.files[-1], maps, shard.first)
-        self.pending, self.written = [], shard.stop
+        maps = join_maps(self.pending)
+        first = len(self.about["kept"])
+        for name, values in self.about.items():
+            values += maps.pop(name).tolist()
+        shard = ShardFile(self.name, first, len(self.about["kept"]))
+        self.pending = []
+        if shard.maps:
+            self.shards.append(shard)
+            self._write(shard, maps)
 
-    def _write(self, file: Path, maps: Maps, first: int) -> None:
-        entry = self.entry(first, first + len(maps["environment"]))
-        file.write_bytes(pack(self.recipe, self.name, entry, maps))
+    def _write(self, shard: ShardFile, maps: Maps) -> None:
+        content = pack(self.recipe, self.name, self.entry(shard.first, shard.stop), maps)
+        (self.folder / shard.name).write_bytes(content)
 
     def _add_groups(self) -> None:
         """Writes the shards anew with each map's group, which is known only when all maps are.
@@ -213,12 +211,10 @@ class _Part:
         firsts = self.ground.tiling.groups(self.about["kept"]).tolist()
         texts = (json.dumps([*about, first]).encode() for first in firsts)
         numbers = np.array([int(hashlib.sha256(text).hexdigest()[:13], 16) for text in texts])
-        begin = 0
-        for file in self.files:
-            maps = TerrainDataset(file).read(self.name)
-            maps["group"] = numbers[begin : begin + len(maps["environment"])]
-            self._write(file, maps, begin)
-            begin += len(maps["environment"])
+        for shard in self.shards:
+            maps = TerrainDataset(self.folder / shard.name).read(self.name)
+            maps["group"] = numbers[shard.first : shard.stop]
+            self._write(shard, maps)
 
     def entry(self, first: int = 0, stop: int | None = None) -> dict[str, Any]:
         """The manifest's entry of the maps from one on, to the last or before another."""

@@ -9,11 +9,11 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import ConfigError, DatasetError, expect
 
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
@@ -21,7 +21,39 @@ _TOLERANCE = 0.01  # of a raster's cell that a place may be off by in another CR
 
 
 @dataclass(frozen=True, kw_only=True)
-class Raster:
+class Rasters:
+    """What there is of the ground beside its elevation. Where a raster does not cover it, maps are left out.
+
+    Args:
+        classes: Raster of terrain classes; laid out at random when not given.
+        class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
+        random_classes: Allow a photo or measured traversability without classes: these are laid out at random.
+        photo: Raster of red, green and blue; painted by the class when not given.
+        traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
+    """
+
+    classes: str = ""
+    class_ids: dict[int, str | None] | None = None
+    random_classes: bool = False
+    photo: str = ""
+    traversability: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuses what does not go together."""
+        expect(
+            self.classes or self.class_ids is None,
+            "`classes` with `class_ids`, got none. Pass the raster they belong to.",
+        )
+        expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
+        for name in ("photo", "traversability"):
+            expect(
+                not getattr(self, name) or self.classes or self.random_classes,
+                f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
+                "Pass --classes RASTER, or --random-classes if that is what you want.",
+            )
+
+
+class Raster(NamedTuple):
     """An open raster: what the user calls it, its name, rasterio's reader."""
 
     argument: str
@@ -46,13 +78,14 @@ class Raster:
         x, y = np.meshgrid(
             np.linspace(bounds.left, bounds.right, 3), np.linspace(bounds.bottom, bounds.top, 3)
         )
-        local = local_crs(own, x[1, 1], y[1, 1])
+        middle = x[1, 1], y[1, 1]
+        local = local_crs(own, *middle)
         if local is None:
             raise DatasetError(
                 f"Expected `{self.argument}` in a CRS of the Earth or another body, got {own.to_string()[:80]} in "
                 f"{self.name}. If you know it, declare it: rio edit-info --crs EPSG:CODE {self.name}"
             )
-        for crs in (own, _utm_of(own, x[1, 1], y[1, 1]), local):
+        for crs in (own, _utm_of(own, *middle), local):
             if crs is not None and crs.is_projected and crs.linear_units_factor[1] == 1:
                 places = _transformed(own, crs, x.ravel(), y.ravel()).T
                 if max(stretch(crs, *place) for place in places) <= _MOST_STRETCH:
@@ -87,13 +120,10 @@ class Raster:
         resampling = load_rasterio().enums.Resampling[how]
         # Of whole numbers the means need not be whole; with transparency GDAL wants a photo's own type.
         dtype = "float64" if len(bands) == 1 else self.file.dtypes[0]
-        return Layer(
-            raster=self, bands=bands, warped=self.warped(**frame, resampling=resampling, dtype=dtype)
-        )
+        return Layer(self, bands, self.warped(**frame, resampling=resampling, dtype=dtype))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Layer:
+class Layer(NamedTuple):
     """The first bands of a raster as resampled to the cells of all maps and one around them."""
 
     raster: Raster
@@ -115,14 +145,12 @@ class Layer:
         window = ((top, top + len(rows) + 2), (columns.start, columns.stop + 2))
         with _naming(self.raster.argument, self.raster.name):
             values = warped.read(self.bands, window=window).astype(np.float64)
-            has_alpha = warped.count > file.count
-            mask = (
-                warped.read(warped.count, window=window) if has_alpha else warped.dataset_mask(window=window)
-            )
+            if warped.count > file.count:  # one more band says where there are values
+                mask = warped.read(warped.count, window=window)
+            else:
+                mask = warped.dataset_mask(window=window)
         values[:, (mask == 0) | ~np.isfinite(values).all(axis=0)] = np.nan
-        scales, offsets = (
-            np.array(numbers)[: len(values), None, None] for numbers in (file.scales, file.offsets)
-        )
+        scales, offsets = np.array([file.scales, file.offsets])[:, : len(values), None, None]
         return (values * scales + offsets)[:, ::-1]
 
 
@@ -138,10 +166,9 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
     Raises:
         DatasetError: it cannot be read, holds other bands, or does not say where it lies.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a missing place, which is an error below
-        with _naming(argument, name):
-            file = load_rasterio().open(name)
+    # Rasterio warns of a missing place, which is an error below.
+    with warnings.catch_warnings(action="ignore"), _naming(argument, name):
+        file = load_rasterio().open(name)
     with file:
         if file.crs is None:
             raise DatasetError(
@@ -165,7 +192,7 @@ def opened(argument: str, name: str, kinds: tuple[str, ...] = ()) -> Iterator[Ra
                 "Convert it: gdal_translate -expand rgb for a palette, rio convert --dtype uint8 --scale-ratio RATIO "
                 "for deeper numbers."
             )
-        yield Raster(argument=argument, name=name, file=file)
+        yield Raster(argument, name, file)
 
 
 def _utm_of(crs: Any, x: float, y: float) -> Any:
@@ -173,7 +200,7 @@ def _utm_of(crs: Any, x: float, y: float) -> Any:
     longitude, latitude = _transformed(crs, "EPSG:4326", [x], [y])[:, 0]
     if not np.isfinite(longitude + latitude):
         return None
-    zone = 61 if latitude > 84 or latitude < -80 else min(int((longitude + 180) // 6) + 1, 60)
+    zone = 61 if not -80 <= latitude <= 84 else min(int((longitude + 180) // 6) + 1, 60)
     return type(crs).from_epsg((326 if latitude >= 0 else 327) * 100 + zone)
 
 
@@ -186,8 +213,8 @@ def local_crs(crs: Any, x: float, y: float) -> Any:
         y: northward, or latitude.
     """
     base = crs.to_dict(projjson=True)
-    while "base_crs" in base or "source_crs" in base:
-        base = base.get("base_crs") or base["source_crs"]
+    while inner := base.get("base_crs") or base.get("source_crs"):
+        base = inner
     if base["type"] not in ("GeographicCRS", "GeodeticCRS"):
         return None
     longitude, latitude = _transformed(crs, type(crs).from_user_input(json.dumps(base)), [x], [y])[:, 0]
@@ -267,9 +294,6 @@ def load_rasterio() -> Any:
         ConfigError: it is not installed.
     """
     try:
-        import rasterio.enums
-        import rasterio.errors
-        import rasterio.transform
         import rasterio.vrt
         import rasterio.warp
     except ImportError as error:

@@ -6,11 +6,9 @@ interpolated by cubic convolution. Colours and traversability are averaged; a ce
 covers most of it. Letters in shapes: B maps, K bands, H×W cells of a map.
 """
 
-import hashlib
 import re
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,8 @@ import numpy as np
 from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
-from benchnav.datagen.dem.raster import Layer, load_rasterio, opened
+from benchnav.core.sources import digest_of_path
+from benchnav.datagen.dem.raster import Layer, Rasters, load_rasterio, opened
 from benchnav.datagen.dem.tiling import Run, cut
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
@@ -28,43 +27,12 @@ _KERNEL_CELLS = 2.0  # that cubic convolution reaches to either side
 _MOST_RELIEF_M = 2048.0  # float32 holds the schema's steps of 2^-13 m up to here
 _CLIFF = 5.67  # of 80°, metres a metre: steeper than natural ground beside cells of height 0
 _METRES = ("m", "metre", "meter", "metres", "meters")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rasters:
-    """Rasters by any name that rasterio opens. Where one does not cover the ground, maps are left out.
-
-    Args:
-        dem: elevations in metres, one band.
-        classes: terrain classes, one band. Empty: the recipe lays classes out at random.
-        class_ids: class names by value of `classes`, None for no label. None: values are indices into the
-            class table.
-        photo: red, green and blue, uint8. Empty: the classes are painted.
-        traversability: measured λ in [0, 1], one band; a cell without any is stored as not observed. Empty:
-            λ is drawn by the class table.
-        random_classes: join a photo or measured λ to classes laid out at random.
-    """
-
-    dem: str
-    classes: str = ""
-    class_ids: Mapping[int, str | None] | None = None
-    photo: str = ""
-    traversability: str = ""
-    random_classes: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuses what does not go together."""
-        expect(
-            self.classes or self.class_ids is None,
-            "`classes` with `class_ids`, got none. Pass the raster they belong to.",
-        )
-        expect(not (self.classes and self.random_classes), "either `classes` or `random_classes`, got both.")
-        for name in ("photo", "traversability"):
-            expect(
-                not getattr(self, name) or self.classes or self.random_classes,
-                f"`classes` with `{name}`, got none: what is real would be joined to classes laid out at random. "
-                "Pass --classes RASTER, or --random-classes if that is what you want.",
-            )
+# Rasters beside the elevation model: what the user calls them, dtypes of their bands, and how they are resampled.
+_OTHERS = (
+    ("classes", (), "mode"),
+    ("photo", ("uint8",) * 3, "average"),
+    ("traversability", (), "average"),
+)
 
 
 class Survey:
@@ -72,7 +40,7 @@ class Survey:
 
     Attributes:
         tiling: how the ground is cut into maps.
-        layers: by field; under `FIELD min` and `FIELD max` what is averaged there.
+        layers: by what the user calls the raster; under `NAME min` and `NAME max` what is averaged there.
         known: which rows and columns of all cells, framed by one, lie wholly on the elevation model.
         indices: of classes, by value of their raster; NaN for no label.
         cliff_m: height over 0 that only cells without a value leave bare; infinite where these are declared.
@@ -82,6 +50,7 @@ class Survey:
     def __init__(
         self,
         stack: ExitStack,
+        dem: str,
         rasters: Rasters,
         recipe: Recipe,
         shares: Mapping[str, float],
@@ -91,7 +60,8 @@ class Survey:
 
         Args:
             stack: closes them.
-            rasters: which.
+            dem: of elevations in metres, one band, by any name that rasterio opens.
+            rasters: the others.
             recipe: size and resolution of the maps, class table.
             shares: of the maps, by split.
             stride_m: from one map to the next; None for maps side by side.
@@ -102,130 +72,117 @@ class Survey:
         """
         names, step = [kind.name for kind in recipe.classes], recipe.resolution_m
         named = dict(enumerate(names)) if rasters.class_ids is None else rasters.class_ids
-        unknown = sorted({name for name in named.values() if name is not None} - set(names))
+        unknown = sorted(map(str, {*named.values()} - {*names, None}))
         expect(not unknown, f"`class_ids` to name classes of the recipe, {names}, got {unknown}.")
-        dem = stack.enter_context(opened("dem", rasters.dem))
-        unit = dem.file.units[0] or "m"
+        ground = stack.enter_context(opened("dem", dem))
+        unit = ground.file.units[0] or "m"
         if unit.lower() not in _METRES:
             raise DatasetError(
-                f"Expected elevations of `dem` in metres, got {unit!r} in {dem.name}. Convert them (gdal_calc.py, "
-                f"× 0.3048 for feet), then declare the unit: rio edit-info --bidx 1 --units metre {dem.name}"
+                f"Expected elevations of `dem` in metres, got {unit!r} in {dem}. Convert them (gdal_calc.py, "
+                f"× 0.3048 for feet), then declare the unit: rio edit-info --bidx 1 --units metre {dem}"
             )
-        crs, bounds, cell_m = dem.place()
+        crs, bounds, cell_m = ground.place()
         how, reach_m = "cubic", _KERNEL_CELLS * max(*cell_m, step)
-        if np.allclose(cell_m, step, rtol=1e-9) and bounds == dem.file.bounds:
+        if np.allclose(cell_m, step, rtol=1e-9) and bounds == ground.file.bounds:
             how, reach_m = "nearest", 0.0
         elif max(cell_m) <= step / 2 * (1 + 1e-9):
             how, reach_m = "average", 0.0
         size_m = np.array([bounds.top - bounds.bottom, bounds.right - bounds.left])
-        rows, columns = np.floor(size_m / step + _SLACK).astype(int).tolist()
-        if rows < recipe.height or columns < recipe.width:
+        cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
+        if np.less(cells, recipe.grid.shape).any():
             wide, high = recipe.grid.extent_m
             raise DatasetError(
-                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem.name} of "
+                f"Expected `dem` to hold at least one map of {wide:g} m × {high:g} m, got {dem} of "
                 f"{size_m[1]:g} m × {size_m[0]:g} m. Take a larger raster or a recipe of smaller maps."
             )
         stride = recipe.grid.shape
         if stride_m is not None:
-            cells = stride_m / step
+            apart = stride_m / step
             expect(
-                cells > 0.5 and abs(cells - round(cells)) < 1e-6,
+                apart > 0.5 and abs(apart - round(apart)) < 1e-6,
                 f"`stride` as a multiple of the maps' resolution, {step:g} m, got {stride_m:g}.",
             )
-            stride = round(cells), round(cells)
-        self.tiling = tiling = cut((rows, columns), recipe.grid.shape, stride, shares)
+            stride = round(apart), round(apart)
+        self.tiling = tiling = cut(cells, recipe.grid.shape, stride, shares)
         # What would be left over keeps the maps off the raster's edges, where interpolation lacks neighbours.
-        offset_m = np.clip((size_m - step * np.array(tiling.cells)) / 2, 0, reach_m)
+        offset_m = np.clip((size_m - np.multiply(step, tiling.cells)) / 2, 0, reach_m)
         south_m, west_m = (np.array([bounds.bottom, bounds.left]) + offset_m).tolist()
         height, width = tiling.cells
-        corner = west_m - step, south_m + (height + 1) * step
-        transform = load_rasterio().transform.from_origin(*corner, step, step)
+        north_m = south_m + (height + 1) * step
+        transform = load_rasterio().transform.from_origin(west_m - step, north_m, step, step)
         frame = {"crs": crs, "transform": transform, "height": height + 2, "width": width + 2}
-        sources = [("elevation_m", dem, how)]
-        for field, argument, kinds, how in (
-            ("class_id", "classes", (), "mode"),
-            ("rgb", "photo", ("uint8",) * 3, "average"),
-            ("traversability", "traversability", (), "average"),
-        ):
+        sources = [(ground, how)]
+        for argument, kinds, how in _OTHERS:
             if name := getattr(rasters, argument):
-                sources.append((field, stack.enter_context(opened(argument, name, kinds)), how))
+                sources.append((stack.enter_context(opened(argument, name, kinds)), how))
         self.layers: dict[str, Layer] = {}
-        for field, raster, how in sources:
-            bands = [1, 2, 3] if field == "rgb" else [1]
-            ends = ("min", "max") if how in ("average", "cubic") and field != "rgb" else ()
-            for layer, way in ((field, how), *((f"{field} {end}", end) for end in ends)):
-                self.layers[layer] = raster.laid(frame, bands, way)
-                stack.enter_context(self.layers[layer].warped)
-        origins = {field: provenance(raster.name) for field, raster, _ in sources}
-        ids = {str(value): name for value, name in sorted(named.items())}
+        for raster, how in sources:
+            is_photo = raster.argument == "photo"
+            ends = ("min", "max") if how in ("average", "cubic") and not is_photo else ()
+            for way in (how, *ends):
+                layer = raster.laid(frame, [1, 2, 3] if is_photo else [1], way)
+                self.layers[raster.argument + f" {way}" * (way in ends)] = layer
+                stack.enter_context(layer.warped)
+        origins: dict[str, Any] = {raster.argument: provenance(raster.name) for raster, _ in sources}
+        if rasters.classes:
+            origins["classes"]["ids"] = {str(value): name for value, name in sorted(named.items())}
         self.source: dict[str, Any] = {
             "kind": "dem",
-            **origins["elevation_m"],
+            **origins["dem"],
             "crs": crs.to_string(),
-            "resolution_m": [cell_m[1], cell_m[0]],
+            "resolution_m": list(reversed(cell_m)),
             "origin_m": [west_m, south_m],
             "tiles": list(tiling.tiles),
-            "stride_m": [tiling.stride[1] * step, tiling.stride[0] * step],
-            "classes": {**origins["class_id"], "ids": ids} if rasters.classes else None,
-            "photo": origins.get("rgb"),
-            "traversability": origins.get("traversability"),
+            "stride_m": [cells * step for cells in reversed(tiling.stride)],
+            **{argument: origins.get(argument) for argument, _, _ in _OTHERS},
         }
         self.known = []
         for offset, count, size in zip(offset_m, tiling.cells, size_m, strict=True):
             edges = offset + step * np.arange(-1, count + 2)
             self.known.append((edges[:-1] > -_SLACK * step) & (edges[1:] < size + _SLACK * step))
         self.indices = {value: np.nan if name is None else names.index(name) for value, name in named.items()}
-        self.cliff_m = _CLIFF * max(*cell_m, step) if dem.mask_kinds == {"all_valid"} else np.inf
+        self.cliff_m = _CLIFF * max(*cell_m, step) if ground.mask_kinds == {"all_valid"} else np.inf
 
     def read(self, run: Run) -> tuple[ndarray, Maps]:
         """Reads some maps.
 
         Returns:
-            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by field what other
-            rasters say, shape [B, K, H, W]; NaN where there is nothing.
+            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by the names of `Rasters` what
+            others say, shape [B, K, H, W]; NaN where there is nothing.
 
         Raises:
             DatasetError: a raster cannot be read, or holds what it should not.
         """
-        framed = {name: self._cut(layer, run) for name, layer in self.layers.items()}
-        ground = framed["elevation_m"][:, 0]
-        for place in range(len(ground)):
-            low, high = self._range("elevation_m", {name: maps[place] for name, maps in framed.items()})
+        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
+        south, wests = run.row * north, [column * east for column in run.columns]
+        framed = Maps()  # each map by a cell
+        for name, layer in self.layers.items():
+            strip = layer.read(range(south, south + height), range(wests[0], wests[-1] + width))
+            framed[name] = np.stack([strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests])
+        rows, columns = self.known
+        for place, west in enumerate(wests):
+            own = {name: maps[place] for name, maps in framed.items()}
+            low, high = _range("dem", own)
             if high - low > _MOST_RELIEF_M:
                 expected = f"elevations of `dem` within {_MOST_RELIEF_M:g} m on a map"
-                raise self._out_of_range("elevation_m", expected, low, high, low if low < -1000 else high)
-            heights = np.abs(framed.get("elevation_m min", framed["elevation_m"])[place])
+                raise self._out_of_range("dem", expected, low, high, low if low < -1000 else high)
+            heights = np.abs(own.get("dem min", own["dem"]))
             least = np.min(heights, initial=np.inf, where=heights > 0)
             if (heights == 0).any() and self.cliff_m < least < np.inf:
                 expected = "elevations of `dem` without a gap next to 0"
                 other = "Where 0 is a height, declare a value that does not occur, such as -9999."
-                raise self._out_of_range("elevation_m", expected, low, high, 0, other)
-        (north, east), (rows, columns) = self.tiling.stride, self.known
-        ground[:, ~rows[run.row * north :][: ground.shape[1]]] = np.nan
-        for map_m, column in zip(ground, run.columns, strict=True):
-            map_m[:, ~columns[column * east :][: ground.shape[2]]] = np.nan
+                raise self._out_of_range("dem", expected, low, high, 0, other)
+            own["dem"][:, ~rows[south:][: height + 2]] = np.nan
+            own["dem"][:, :, ~columns[west:][: width + 2]] = np.nan
         if "traversability" in framed:
-            low, high = self._range("traversability", framed)
+            low, high = _range("traversability", framed)
             if low < 0 or high > 1:
                 expected = "values of `traversability` in [0, 1]"
                 raise self._out_of_range("traversability", expected, low, high, low if low < 0 else high)
         given = {name: maps[:, :, 1:-1, 1:-1] for name, maps in framed.items() if " " not in name}
-        if "class_id" in given:
-            given["class_id"] = self._classes(given["class_id"])
-        return ground, given
-
-    def _cut(self, layer: Layer, run: Run) -> ndarray:
-        """Cuts maps out of a layer, each framed by a cell, shape [B, K, H + 2, W + 2]."""
-        (north, east), (height, width) = self.tiling.stride, self.tiling.shape
-        south, wests = run.row * north, [column * east for column in run.columns]
-        strip = layer.read(range(south, south + height), range(wests[0], wests[-1] + width))
-        return np.stack([strip[:, :, west - wests[0] :][:, :, : width + 2] for west in wests])
-
-    def _range(self, name: str, maps: Maps) -> tuple[float, float]:
-        """The least and the greatest value, of what is averaged too."""
-        low, high = (maps.get(f"{name} {end}", maps[name]) for end in ("min", "max"))
-        least = np.min(low, initial=np.inf, where=~np.isnan(low))
-        return float(least), float(np.max(high, initial=-np.inf, where=~np.isnan(high)))
+        if "classes" in given:
+            given["classes"] = self._classes(given["classes"])
+        return framed["dem"][:, 0], given
 
     def _out_of_range(
         self, name: str, expected: str, low: float, high: float, odd: float, other: str = ""
@@ -242,7 +199,7 @@ class Survey:
             indices[values == value] = index
         strange = np.setdiff1d(values[~np.isnan(values)], list(self.indices))
         if len(strange):
-            name = self.layers["class_id"].raster.name
+            name = self.layers["classes"].raster.name
             few = ", ".join(f"{value:g}" for value in strange[:10]) + (", …" if len(strange) > 10 else "")
             raise DatasetError(
                 f"Expected values of `classes` in {sorted(self.indices)}, got [{few}] too in {name}. Name each by "
@@ -252,9 +209,16 @@ class Survey:
         return indices
 
 
+def _range(name: str, maps: Maps) -> tuple[float, float]:
+    """The least and the greatest value, of what is averaged too."""
+    low, high = (maps.get(f"{name} {end}", maps[name]) for end in ("min", "max"))
+    least, most = np.fmin.reduce(low, None, initial=np.inf), np.fmax.reduce(high, None, initial=-np.inf)
+    return float(least), float(most)
+
+
 def provenance(name: str) -> dict[str, str | None]:
     """The name of a raster and, of a file, its SHA-256; of an address without what may be secret."""
-    if Path(name).is_file():
-        with open(name, "rb") as file:
-            return {"file": Path(name).name, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+    path = Path(name)
+    if path.is_file():
+        return {"file": path.name, "sha256": digest_of_path(path)}
     return {"file": re.sub("//[^/@]*@", "//", name).partition("?")[0], "sha256": None}

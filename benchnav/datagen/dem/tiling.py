@@ -8,7 +8,6 @@ neither overlap nor touch.
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -16,6 +15,8 @@ import numpy as np
 from scipy import ndimage
 
 from benchnav.core.errors import DatasetError, expect
+
+Shape = tuple[int, int]  # along y and along x
 
 
 class Run(NamedTuple):
@@ -26,8 +27,7 @@ class Run(NamedTuple):
     columns: range
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tiling:
+class Tiling(NamedTuple):
     """Rows and columns of maps.
 
     Args:
@@ -37,16 +37,15 @@ class Tiling:
         strips: by split the rows of maps that it takes, or the columns where there are as many or more.
     """
 
-    shape: tuple[int, int]
-    stride: tuple[int, int]
-    tiles: tuple[int, int]
+    shape: Shape
+    stride: Shape
+    tiles: Shape
     strips: Mapping[str, range]
 
     @property
     def cells(self) -> list[int]:
         """Cells of all maps together, northward and eastward."""
-        sides = zip(self.tiles, self.stride, self.shape, strict=True)
-        return [(tiles - 1) * stride + size for tiles, stride, size in sides]
+        return (np.subtract(self.tiles, 1) * self.stride + self.shape).tolist()
 
     @property
     def maps(self) -> int:
@@ -56,7 +55,7 @@ class Tiling:
     @property
     def overlaps(self) -> bool:
         """Whether neighbouring maps show some of the same ground."""
-        return any(step < size for step, size in zip(self.stride, self.shape, strict=True))
+        return bool(np.less(self.stride, self.shape).any())
 
     def groups(self, numbers: Sequence[int]) -> np.ndarray:
         """Finds which maps overlap, directly or by others between them.
@@ -96,9 +95,7 @@ class Tiling:
                     yield Run(split, row, range(first, min(first + most, own.stop)))
 
 
-def cut(
-    cells: tuple[int, int], shape: tuple[int, int], stride: tuple[int, int], shares: Mapping[str, float]
-) -> Tiling:
+def cut(cells: Sequence[int], shape: Shape, stride: Shape, shares: Mapping[str, float]) -> Tiling:
     """Cuts ground into maps and splits.
 
     Args:
@@ -110,7 +107,7 @@ def cut(
     Raises:
         DatasetError: the ground is too small for so many splits.
     """
-    rows, columns = ((cells[i] - shape[i]) // stride[i] + 1 for i in (0, 1))
+    rows, columns = (np.subtract(cells, shape) // stride + 1).tolist()
     side, lines = (0, rows) if rows > columns else (1, columns)
     gap = math.ceil(2 * shape[side] / stride[side]) - 1
     usable = lines - gap * (len(shares) - 1)
@@ -127,7 +124,7 @@ def cut(
         split: range(ends[place] + place * gap, ends[place + 1] + place * gap)
         for place, split in enumerate(shares)
     }
-    return Tiling(shape=shape, stride=stride, tiles=(rows, columns), strips=strips)
+    return Tiling(shape, stride, (rows, columns), strips)
 
 
 def read_shares(text: str) -> dict[str, float]:

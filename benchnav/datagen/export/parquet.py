@@ -43,8 +43,8 @@ def split_names(splits: Iterable[str]) -> dict[str, str]:
 
 def columns_of(dataset: TerrainDataset, fields: Iterable[str]) -> dict[str, schema.Field]:
     """The columns of a split: the number of the map, and some of the dataset's fields."""
-    number = schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")
-    return {MAP: number, **{name: dataset.fields[name] for name in fields}}
+    columns = {MAP: schema.Field("<i8", (), "1", 0, np.inf, "number of the map in its split")}
+    return columns | {name: dataset.fields[name] for name in fields}
 
 
 def table_schema(dataset: TerrainDataset, split: str, fields: Sequence[str]) -> pa.Schema:
@@ -93,8 +93,8 @@ def write_split(
     Yields:
         How many maps were written in each step.
     """
-    cells = dataset.grid.height * dataset.grid.width
-    most, step = maps_a_file or max(1, CELLS_A_FILE // cells), max(1, _CELLS_A_ROW_GROUP // cells)
+    most = maps_a_file or dataset.grid.maps_in(CELLS_A_FILE)
+    step = dataset.grid.maps_in(_CELLS_A_ROW_GROUP)
     every, columns = range(dataset.map_count(split)), table_schema(dataset, split, fields)
     files = -(-len(every) // most)
     for number in range(files):

@@ -2,10 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -17,8 +17,7 @@ from benchnav.datagen.files.reader import CHUNK_CELLS, READ_ERRORS, TerrainDatas
 _MISSING = "is missing or cannot be opened"
 
 
-@dataclass(frozen=True, order=True)
-class Fault:
+class Fault(NamedTuple):
     """Something wrong with a dataset.
 
     Args:
@@ -37,13 +36,7 @@ class Fault:
 
     def __str__(self) -> str:
         """One line."""
-        return self.line(f"map {self.map}" if self.map >= 0 else "")
-
-    def line(self, place: str) -> str:
-        """The fault of maps in words."""
-        problem = f"field {self.field!r} {self.problem}" if self.field else self.problem
-        where = f" ({self.file})" if self.file else ""
-        return ": ".join(word for word in (self.split, place, problem) if word) + where
+        return next(summarise([self]))
 
 
 def summarise(faults: list[Fault]) -> Iterator[str]:
@@ -51,12 +44,17 @@ def summarise(faults: list[Fault]) -> Iterator[str]:
 
     def run_of(item: tuple[int, Fault]) -> Fault:
         place, fault = item
-        return replace(fault, map=fault.map - place)
+        return fault._replace(map=fault.map - place)
 
     order = sorted(faults, key=attrgetter("split", "field", "problem", "file", "map"))
     for _, items in groupby(enumerate(order), run_of):
-        run = [fault for _, fault in items]
-        yield run[0].line(f"maps {run[0].map}–{run[-1].map}") if len(run) > 1 else str(run[0])
+        (_, first), *others = items
+        maps = f"map {first.map}" if first.map >= 0 else ""
+        if others:
+            maps = f"maps {first.map}–{first.map + len(others)}"
+        problem = f"field {first.field!r} {first.problem}" if first.field else first.problem
+        where = f" ({first.file})" if first.file else ""
+        yield ": ".join(word for word in (first.split, maps, problem) if word) + where
 
 
 def find_faults(path: str | Path) -> list[Fault]:
@@ -77,10 +75,9 @@ def find_faults(path: str | Path) -> list[Fault]:
 
 def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, str, str, str]]:
     """The faults of a split: map, field, problem and file of each."""
-    fields, count = list(dataset.fields), dataset.map_count(split)
-    stored = np.zeros((count, len(fields), schema.DIGEST_BYTES), np.uint8)
-    computed = np.zeros_like(stored)
-    is_stored = np.zeros(count, dtype=bool)
+    fields = list(dataset.fields)
+    stored = np.ma.masked_all((dataset.map_count(split), len(fields), schema.DIGEST_BYTES), np.uint8)
+    computed = stored.copy()
     files: list[str] = []  # of each map
     for piece in dataset.pieces[split]:
         own = piece.path.name if piece.path != dataset.path else ""
@@ -105,23 +102,23 @@ def _split_faults(dataset: TerrainDataset, split: str) -> Iterator[tuple[int, st
                         continue
                     maps = slice(first, first + len(values))
                     if name == schema.ENTRY_DIGESTS:
-                        stored[maps], is_stored[maps] = values, True
+                        stored[maps] = values
                         continue
                     for index in _out_of_range(dataset, split, name, values):
                         yield first + index, name, "is out of range", own
                     digests = schema.entry_digests({name: values}, {name: dataset.fields[name]})
                     computed[maps, fields.index(name)] = digests[:, 0]
-    readable = computed.any(axis=2)
-    unlike = (computed != stored).any(axis=2) & readable & is_stored[:, None]
-    digest = schema.split_digest(computed, *dataset.grid.shape, dataset.fields)
-    if readable.all() and digest == dataset.splits[split]["digest"]:
+    is_readable = not np.ma.is_masked(computed)
+    unlike = (computed != stored).filled(False).any(axis=2)
+    digest = schema.split_digest(computed.data, *dataset.grid.shape, dataset.fields)
+    if is_readable and digest == dataset.splits[split]["digest"]:
         # The maps are what the manifest says, so it is the digests beside them that differ.
         for index in np.flatnonzero(unlike.any(axis=1)).tolist():
             yield index, schema.ENTRY_DIGESTS, "does not match the map", files[index]
         return
     for index, column in np.argwhere(unlike).tolist():
         yield index, fields[column], "does not match its digest", files[index]
-    if readable.all() and not unlike.any():
+    if is_readable and not unlike.any():
         yield -1, "", "the maps do not match the digest in the manifest", ""
 
 
@@ -147,6 +144,6 @@ def _out_of_range(dataset: TerrainDataset, split: str, name: str, values: np.nda
     if name == "class_id" and schema.has_unlabelled(dataset.splits[split]):
         allowed |= values == schema.UNLABELLED
     # Not asked for; not observed; what a field that is not ours means by it, it may mean.
-    if name in ("reference_time_s", "traversability") or name not in schema.FIELDS | schema.OPTIONAL:
+    if name in ("reference_time_s", "traversability") or name not in schema.KNOWN:
         allowed |= np.isnan(values)
     return np.flatnonzero(~allowed.reshape(len(values), -1).all(axis=1)).tolist()

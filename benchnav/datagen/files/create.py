@@ -9,8 +9,7 @@ it replaces a finished one it is made in such a folder too.
 import platform
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from benchnav.core.errors import ConfigError, DatasetError, expect
 from benchnav.core.store import Shard, real_place, replacing, restore, sole_writer
 from benchnav.core.workers import run_calls
 from benchnav.datagen.files.hdf5 import (
+    ShardFile,
     assemble,
     check_place,
     is_one_file,
@@ -34,31 +34,6 @@ from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.synth.generate import generate
 
 SHARD_CELLS = 2**20
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShardFile:
-    """Consecutive maps of a recipe's split, in a file that is a dataset by itself.
-
-    Args:
-        split: name of the split.
-        first: its first map.
-        stop: one past its last.
-    """
-
-    split: str
-    first: int
-    stop: int
-
-    @property
-    def maps(self) -> int:
-        """Number of maps."""
-        return self.stop - self.first
-
-    @property
-    def name(self) -> str:
-        """Name of its file."""
-        return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
 
 
 def create(
@@ -92,11 +67,27 @@ def create(
     expect(
         shard is None or not is_one_file(path), f"`out` to be a folder, since a shard is made, got {path}."
     )
-    shards = cut(recipe, shard_cells)
+    size = recipe.grid.maps_in(shard_cells)
+    shards = [
+        ShardFile(split, first, min(first + size, spec.maps))
+        for split, spec in recipe.splits.items()
+        for first in range(0, spec.maps, size)
+    ]
     own = shards if shard is None else shards[shard.index - 1 :: shard.of]
-    with named_errors(path), _held(path, shard):
+    # Of a folder several shards may be made at once, each by one process.
+    held = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}") if shard else path
+    with (
+        named_errors(path),
+        sole_writer(path, str(path), shared=True) if shard else nullcontext(),
+        sole_writer(held, str(path)),
+    ):
         restore(path)
-        folder = _workplace(path, shards, shard, overwrite)
+        # Of a folder, shards of this recipe are gone on with.
+        check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
+        folder = path
+        if is_one_file(path) or (overwrite and (path / FOLDER_MANIFEST).exists()):
+            expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
+            folder = path.with_name(f".{path.name}.partial")
         folder.mkdir(parents=True, exist_ok=True)
         missing = _missing(folder, recipe, shards, own, may_replace=overwrite or folder != path)
         manifest = folder / FOLDER_MANIFEST
@@ -128,16 +119,6 @@ def create(
                 shutil.rmtree(folder)
 
 
-def cut(recipe: Recipe, cells: int) -> list[ShardFile]:
-    """Cuts a recipe into shards of about so many cells, in the order of splits and maps."""
-    size = max(1, cells // (recipe.height * recipe.width))
-    return [
-        ShardFile(split=split, first=first, stop=min(first + size, spec.maps))
-        for split, spec in recipe.splits.items()
-        for first in range(0, spec.maps, size)
-    ]
-
-
 def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, bytes]:
     """Makes a shard, perhaps in a process on another machine.
 
@@ -153,8 +134,7 @@ def make(recipe: Recipe, shard: ShardFile, version: str) -> tuple[ShardFile, byt
             f"Expected workers with benchnav {version}, got one on {platform.node()} with {benchnav.__version__}."
         )
     maps = generate(recipe, shard.split, np.arange(shard.first, shard.stop))
-    entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
-    return shard, pack(recipe, shard.split, entry, maps)
+    return shard, pack(recipe, shard.split, recipe_entry(recipe, shard), maps)
 
 
 def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
@@ -163,37 +143,12 @@ def is_there(path: Path, recipe: Recipe, shard: ShardFile) -> bool:
         manifest = read_manifest(path)
     except DatasetError:
         return False
-    entry = recipe_entry(recipe, shard.split, shard.first, shard.stop)
-    made_by = manifest["recipes"], manifest["generator"]["version"]
-    return made_by == ([recipe.to_dict()], benchnav.__version__) and (
-        entry.items() <= manifest["splits"].get(shard.split, {}).items()
+    entry = recipe_entry(recipe, shard)
+    return (
+        manifest["recipes"] == [recipe.to_dict()]
+        and manifest["generator"]["version"] == benchnav.__version__
+        and entry.items() <= manifest["splits"].get(shard.split, {}).items()
     )
-
-
-@contextmanager
-def _held(path: Path, shard: Shard | None) -> Iterator[None]:
-    """Holds the dataset for one process, or a shard of it: several may be made at once."""
-    name = path.with_name(f"{path.name}.{shard.index}-of-{shard.of}") if shard else path
-    with (
-        sole_writer(path, str(path), shared=shard is not None),
-        sole_writer(name, str(path)) if shard else nullcontext(),
-    ):
-        yield
-
-
-def _workplace(path: Path, shards: Sequence[ShardFile], shard: Shard | None, overwrite: bool) -> Path:
-    """Where shards are made: where they are to be, or beside a file or a finished folder that they replace.
-
-    Raises:
-        ConfigError: what is there may not be replaced.
-    """
-    beside = path.with_name(f".{path.name}.partial")
-    # Of a folder, shards of this recipe are gone on with.
-    check_place(path, overwrite or not is_one_file(path), [file.name for file in shards])
-    if not is_one_file(path) and not (overwrite and (path / FOLDER_MANIFEST).exists()):
-        return path
-    expect(shard is None, f"no finished dataset to replace by a shard, got {path}. Remove it first.")
-    return beside
 
 
 def _missing(

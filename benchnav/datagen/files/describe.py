@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
 
 from benchnav.core.settings import plain
 from benchnav.core.tables import Table
@@ -15,7 +14,7 @@ _DIGESTS = {
 }
 
 
-def describe(dataset: TerrainDataset) -> dict[str, Any]:
+def describe(dataset: TerrainDataset) -> schema.Json:
     """Gathers what `show` shows, ready for JSON."""
     manifest, about = dataset.manifest, plain(dataset.recipe)
     made_by = ("environments", "stuck_threshold", "synthesis", "places", "correlation_m", "classes")
@@ -54,7 +53,7 @@ def _stored_bytes(dataset: TerrainDataset, split: str) -> int:
     return total
 
 
-def tables(described: dict[str, Any]) -> Iterator[Table | str]:
+def tables(described: schema.Json) -> Iterator[Table | str]:
     """Lays out what `describe` gathered, for a terminal."""
     grid, generator = described["grid"], described["generator"]
     files = f" in {described['files']} files" if described["files"] > 1 else ""
@@ -108,7 +107,7 @@ def tables(described: dict[str, Any]) -> Iterator[Table | str]:
     yield Table(title=title, headings=tuple(headings), rows=tuple(rows))
 
 
-def _origin(described: dict[str, Any], part: dict[str, Any]) -> str:
+def _origin(described: schema.Json, part: schema.Json) -> str:
     if "recipe" not in part:
         return f"{part['maps']} of {part['source']['file']}"
     recipe = described["recipes"][part["recipe"]]

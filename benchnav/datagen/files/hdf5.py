@@ -8,10 +8,9 @@ import re
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -40,8 +39,7 @@ _HALF = re.compile(r"\..+\.partial")  # of a shard or of the manifest
 Source = Mapping[str, Any]  # stored arrays, or those to be stored, by name, `ENTRY_DIGESTS` among them
 
 
-@dataclass(frozen=True, kw_only=True)
-class Contents:
+class Contents(NamedTuple):
     """What a dataset is to hold, and the files that hold it.
 
     Args:
@@ -54,11 +52,11 @@ class Contents:
 
     id: str
     recipes: Sequence[Recipe]
-    splits: Mapping[str, Mapping[str, Any]]
-    files: Mapping[str, Sequence[Path]] = field(default_factory=dict)
-    fields: Mapping[str, schema.Field] = field(default_factory=lambda: schema.FIELDS)
+    splits: Mapping[str, schema.Json]
+    files: Mapping[str, Sequence[Path]] = {}
+    fields: schema.Fields = schema.FIELDS
 
-    def manifest(self, entry_digests: Mapping[str, ndarray]) -> dict[str, Any]:
+    def manifest(self, entry_digests: Mapping[str, ndarray]) -> schema.Json:
         """The manifest, by the digests of all maps' entries, `schema.entry_digests`, of each split."""
         synthesis, shape = [recipe.synthesis for recipe in self.recipes], self.recipes[0].grid.shape
         return {
@@ -75,25 +73,55 @@ class Contents:
         }
 
 
+class ShardFile(NamedTuple):
+    """Consecutive maps of a recipe's split, in a file that is a dataset by itself: from one on, to before another."""
+
+    split: str
+    first: int
+    stop: int
+
+    @property
+    def maps(self) -> int:
+        """Number of maps."""
+        return self.stop - self.first
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"{self.split.replace('/', '+')}-{self.first:08d}-{self.stop:08d}.h5"
+
+
 def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
     """All maps of a recipe, by split the files that hold them."""
-    splits = {name: recipe_entry(recipe, name, 0, spec.maps) for name, spec in recipe.splits.items()}
-    return Contents(id=recipe.id, recipes=[recipe], splits=splits, files=files)
+    splits = {
+        name: recipe_entry(recipe, ShardFile(name, 0, spec.maps)) for name, spec in recipe.splits.items()
+    }
+    return Contents(recipe.id, [recipe], splits, files)
 
 
-def recipe_entry(recipe: Recipe, split: str, first: int, stop: int) -> dict[str, Any]:
+def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
     """The manifest's entry of consecutive maps of a recipe's split, without their digest."""
-    part = {"maps": stop - first, "recipe": 0, "split": split, "first": first}
-    return {"scenario": recipe.splits[split].scenario, "maps": stop - first, "parts": [part]}
+    part = {"maps": shard.maps, "recipe": 0, "split": shard.split, "first": shard.first}
+    return {"scenario": recipe.splits[shard.split].scenario, "maps": shard.maps, "parts": [part]}
 
 
 def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[Source]]) -> None:
     """Fills an empty file with a dataset: with all arrays of each split's sources, end to end."""
+    kinds = schema.stored_arrays(contents.fields, *contents.recipes[0].grid.shape)
     # Made at first and kept until all is written: HDF5 writes an array out when it is let go.
-    arrays = {
-        split: _new_arrays(file.create_group(split), entry["maps"], contents)
-        for split, entry in contents.splits.items()
-    }
+    arrays: dict[str, dict[str, h5py.Dataset]] = {split: {} for split in contents.splits}
+    for split, own in arrays.items():
+        group, maps = file.create_group(split), contents.splits[split]["maps"]
+        for name, (dtype, entry) in kinds.items():
+            field = contents.fields.get(name)
+            # Of cells, a map a chunk.
+            chunk = 1 if field and "H" in field.shape else max(1, min(maps, _VALUES_A_CHUNK))
+            own[name] = group.create_dataset(
+                name, (maps, *entry), dtype, chunks=(chunk, *entry),
+                shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
+            )  # fmt: skip
+            if field:
+                own[name].attrs.update(unit=field.unit, meaning=field.meaning)
     for split, several in sources.items():
         first = 0
         for source in several:
@@ -106,7 +134,7 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
     file.flush()
 
 
-def pack(recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps) -> bytes:
+def pack(recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps) -> bytes:
     """Makes what a file of a few maps of one split holds, in memory.
 
     Args:
@@ -115,10 +143,11 @@ def pack(recipe: Recipe, split: str, entry: Mapping[str, Any], maps: schema.Maps
         entry: the manifest's entry of the split without its digest.
         maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
     """
-    contents = Contents(id=recipe.id, recipes=[recipe], splits={split: entry}, fields=schema.fields_in(maps))
+    fields = {name: field for name, field in schema.KNOWN.items() if name in maps}
+    contents = Contents(recipe.id, [recipe], {split: entry}, fields=fields)
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
-        digests = schema.entry_digests(maps, contents.fields)
-        _fill(file, contents, {split: [{**maps, schema.ENTRY_DIGESTS: digests}]})
+        digests = {schema.ENTRY_DIGESTS: schema.entry_digests(maps, fields)}
+        _fill(file, contents, {split: [maps | digests]})
         return file.id.get_file_image()
 
 
@@ -184,7 +213,7 @@ def assemble(contents: Contents, folder: Path, out: Path) -> None:
         _join(out, contents)
         return
     digests: dict[str, ndarray] = {}
-    shards: dict[str, list[dict[str, Any]]] = {}
+    shards: dict[str, list[schema.Json]] = {}
     for split, files in contents.files.items():
         entries = [source[schema.ENTRY_DIGESTS][:] for source in _opened(split, files)]
         digests[split] = np.concatenate(entries)
@@ -216,8 +245,7 @@ def _join(path: Path, contents: Contents) -> None:
             if hasattr(os, "posix_fallocate"):
                 with open(unfinished, "rb+") as raw:
                     os.posix_fallocate(raw.fileno(), 0, stored + _SPARE_BYTES + _SPARE_BYTES_A_MAP * maps)
-            sources = {split: _opened(split, files) for split, files in contents.files.items()}
-            _fill(file, contents, sources)
+            _fill(file, contents, {split: _opened(split, own) for split, own in contents.files.items()})
             size = file.id.get_filesize()
         os.truncate(unfinished, size)
         if path.exists():
@@ -232,7 +260,6 @@ def named_errors(path: Path) -> Iterator[None]:
         DatasetError: the system, or HDF5, could not write.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         yield
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
@@ -248,22 +275,6 @@ def held(out: Path, overwrite: bool, foreign: Callable[[Path], str] = foreign_in
         restore(out)
         refuse_taken(out, overwrite, foreign)
         yield
-
-
-def _new_arrays(group: h5py.Group, maps: int, contents: Contents) -> dict[str, h5py.Dataset]:
-    """The empty arrays of a split, those of cells with a map a chunk."""
-    fields, arrays = contents.fields, {}
-    kinds = schema.stored_arrays(fields, *contents.recipes[0].grid.shape)
-    for name, (dtype, entry) in kinds.items():
-        chunk = 1 if name in fields and "H" in fields[name].shape else max(1, min(maps, _VALUES_A_CHUNK))
-        arrays[name] = group.create_dataset(
-            name, (maps, *entry), dtype, chunks=(chunk, *entry),
-            shuffle=True, compression="gzip", compression_opts=1, fletcher32=True,
-        )  # fmt: skip
-        if name in fields:
-            arrays[name].attrs["unit"] = fields[name].unit
-            arrays[name].attrs["meaning"] = fields[name].meaning
-    return arrays
 
 
 def _put(source: ndarray | h5py.Dataset, target: h5py.Dataset, first: int) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -60,11 +59,7 @@ class TerrainMaps(Dataset[dict[str, Tensor]]):
         """
         if not -len(self) <= index < len(self):
             raise IndexError(f"Expected a map index in 0–{len(self) - 1}, got {index}.")
-        index = int(index) % len(self)
-        if self._memory is not None:
-            return {name: values[index].clone() for name, values in self._memory.items()}
-        maps = self.dataset.read_run(self.split, index, 1, self.fields)
-        return {name: torch.from_numpy(np.asarray(values[0])) for name, values in maps.items()}
+        return {name: values[0] for name, values in self.read([int(index) % len(self)]).items()}
 
     def read(self, indices: Sequence[int]) -> dict[str, Tensor]:
         """Reads maps by their indices ≥ 0, in any order; tensors by field, each of shape [B, *entry shape]."""

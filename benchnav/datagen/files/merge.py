@@ -6,7 +6,6 @@ What is merged is packed already: files are copied into a folder, or their chunk
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
@@ -51,8 +50,9 @@ def merge(
     name = dataset_id or name_of(out)
     contents = _of_datasets(finished, name) if finished else _of_shards(paths)
     total, done = sum(entry["maps"] for entry in contents.splits.values()), 0
+    sources = dict.fromkeys(chain(*contents.files.values()))
     with held(out, overwrite):
-        for path in dict.fromkeys(chain(*contents.files.values())):
+        for path in sources:
             if faults := find_faults(path):
                 raise DatasetError(
                     f"{path} is damaged: {faults[0]}. Run `benchnav-datagen validate` on it, which says how to make "
@@ -64,17 +64,14 @@ def merge(
             assemble(contents, out.parent, out)
             return
         with building(out) as folder:
-            assemble(replace(contents, files=_copies(contents, folder)), folder, out)
-
-
-def _copies(contents: Contents, folder: Path) -> dict[str, list[Path]]:
-    """Copies each file into a folder, under its own name where that is free; gives the copies by split."""
-    copies: dict[Path, Path] = {}
-    for path in dict.fromkeys(chain(*contents.files.values())):
-        name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
-        copies[path] = folder / name
-        shutil.copy2(path, copies[path])
-    return {split: [copies[path] for path in files] for split, files in contents.files.items()}
+            copies: dict[Path, Path] = {}
+            for path in sources:
+                # Under its own name where that is free.
+                name = f"{len(copies)}-{path.name}" if (folder / path.name).exists() else path.name
+                copies[path] = folder / name
+                shutil.copy2(path, copies[path])
+            files = {split: [copies[path] for path in own] for split, own in contents.files.items()}
+            assemble(contents._replace(files=files), folder, out)
 
 
 def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
@@ -90,7 +87,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
         raise DatasetError(f"Expected datasets that can be merged, got: {'; '.join(reasons)}.")
     # The recipes, each once, and of each split the parts that refer to them and the files.
     recipes: list[Recipe] = []
-    splits: dict[str, dict[str, Any]] = {}
+    splits: dict[str, schema.Json] = {}
     files: dict[str, list[Path]] = {}
     for dataset in datasets:
         own = [recipe_from_dict(data, f"in {dataset.path}") for data in dataset.manifest["recipes"]]
@@ -102,7 +99,7 @@ def _of_datasets(paths: Sequence[Path], dataset_id: str) -> Contents:
             for part in entry["parts"]:
                 number = {"recipe": recipes.index(own[part["recipe"]])} if "recipe" in part else {}
                 gathered["parts"].append({**part, **number})
-    return Contents(id=dataset_id, recipes=recipes, splits=splits, files=files, fields=datasets[0].fields)
+    return Contents(dataset_id, recipes, splits, files, datasets[0].fields)
 
 
 def _of_shards(folders: Sequence[Path]) -> Contents:

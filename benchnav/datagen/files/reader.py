@@ -9,12 +9,11 @@ import json
 import os
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import h5py
 import numpy as np
@@ -41,8 +40,7 @@ FOLDER_MANIFEST = "manifest.json"
 Opened = tuple[h5py.File, dict[tuple[str, str], h5py.Dataset]]  # a file, and its arrays by split and name
 
 
-@dataclass(frozen=True, kw_only=True)
-class Piece:
+class Piece(NamedTuple):
     """What one file holds of a split: all maps under the split's name.
 
     Args:
@@ -77,10 +75,10 @@ class TerrainDataset:
     def __init__(self, path: str | Path, keep_open: bool = False) -> None:
         """Reads and checks the manifest."""
         self.path, self.keep_open = Path(path), keep_open
-        self.manifest: dict[str, Any] = read_manifest(self.path)
+        self.manifest: schema.Json = read_manifest(self.path)
         self._opened: dict[tuple[int, Path], Opened] = {}  # by process, since one's files are not for another
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> schema.Json:
         """Leaves out the open files, so that it may be sent to other processes."""
         return self.__dict__ | {"_opened": {}}
 
@@ -90,7 +88,7 @@ class TerrainDataset:
         return self.manifest["id"]
 
     @property
-    def splits(self) -> dict[str, Any]:
+    def splits(self) -> schema.Json:
         """Splits by name, each with `maps`, `scenario`, `digest` and `parts`."""
         return self.manifest["splits"]
 
@@ -179,17 +177,19 @@ class TerrainDataset:
         if not all(type(i) is int and 0 <= i < size for i in chosen):
             raise DatasetError(f"Expected map indices in 0–{size - 1} of split {split!r}, got {chosen}.")
 
-        def run_of(item: tuple[int, int]) -> tuple[Path, int]:
-            place, index = item
-            return self._piece_of(split, index).path, index - place
+        pieces = self.pieces[split]
 
-        runs = []  # of maps that follow one another in a file
-        for _, items in groupby(enumerate(chosen), run_of):
+        def run_of(item: tuple[int, int]) -> tuple[Piece, int]:
+            place, index = item
+            return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1], index - place
+
+        parts = []  # of maps that follow one another in a file
+        for (piece, _), items in groupby(enumerate(chosen), run_of):
             run = [index for _, index in items]
-            runs.append(self.read_run(split, run[0], len(run), names))
-        if not runs:
-            return self.read_run(split, 0, 0, names)
-        return runs[0] if len(runs) == 1 else {n: np.concatenate([run[n] for run in runs]) for n in names}
+            parts.append(self._read_run(split, piece, range(run[0], run[-1] + 1), names))
+        if not parts:
+            return self._read_run(split, pieces[0], range(0), names)
+        return schema.join_maps(parts)
 
     def entry_digests(self, split: str, indices: Sequence[int] | None = None) -> np.ndarray:
         """Reads the stored SHA-256 of every entry, as `schema.entry_digests` gives them.
@@ -212,8 +212,7 @@ class TerrainDataset:
         Yields:
             Which maps, and what `read` gives of them.
         """
-        size = max(1, cells // (self.grid.height * self.grid.width))
-        count = self.map_count(split)
+        size, count = self.grid.maps_in(cells), self.map_count(split)
         for first in range(0, count, size):
             indices = range(first, min(first + size, count))
             yield indices, self.read(split, indices, fields)
@@ -242,7 +241,7 @@ class TerrainDataset:
             one = [{"file": "", "maps": self.splits[split]["maps"]}]
             first = 0
             for shard in self.manifest.get("shards", {}).get(split, one):
-                own.append(Piece(path=self.path / shard["file"], first=first, maps=shard["maps"]))
+                own.append(Piece(self.path / shard["file"], first, shard["maps"]))
                 first += shard["maps"]
         return pieces
 
@@ -251,16 +250,11 @@ class TerrainDataset:
         """The files that hold maps."""
         return {piece.path for pieces in self.pieces.values() for piece in pieces}
 
-    def _piece_of(self, split: str, index: int) -> Piece:
-        pieces = self.pieces[split]
-        return pieces[bisect_right(pieces, index, key=attrgetter("first")) - 1]
-
-    def read_run(self, split: str, first: int, count: int, names: Collection[str]) -> Maps:
-        """Reads maps that follow one another in a file, as `read` does; what is asked for has to be there."""
-        piece = self._piece_of(split, first)
+    def _read_run(self, split: str, piece: Piece, run: range, names: Collection[str]) -> Maps:
+        """Reads maps that follow one another in a file, as `read` does."""
         file, arrays = self._open(piece.path)
         read, most = Maps(), len(self.recipe.classes) - 1
-        which = slice(first - piece.first, first - piece.first + count)
+        which = slice(run.start - piece.first, run.stop - piece.first)
         try:
             for name in names:
                 if (split, name) not in arrays:
@@ -340,7 +334,7 @@ def damage(path: Path, split: str, field: str, error: Exception) -> DatasetError
     )
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path) -> schema.Json:
     """Reads the manifest of a file or a folder.
 
     Raises:
@@ -350,8 +344,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         text = _manifest_text(path)
         manifest = json.loads(text)
         kind, version = manifest["format"], manifest["format_version"]
-        major, minor = (int(part) for part in version.split("."))
-        if kind == schema.FORMAT and (major, minor) <= schema.FORMAT_VERSION:
+        if kind == schema.FORMAT and tuple(map(int, version.split("."))) <= schema.FORMAT_VERSION:
             manifest = unseal(text)
             schema.check(manifest)
             return manifest
@@ -377,7 +370,7 @@ def _values(array: h5py.Dataset, which: slice) -> np.ndarray:
 
 def _manifest_text(path: Path) -> str | bytes:
     if path.is_dir():
-        if not (path / FOLDER_MANIFEST).is_file():
+        if not is_dataset(path):
             raise DatasetError(
                 f"Expected a folder with a finished dataset, got {path} without {FOLDER_MANIFEST}. "
                 "Finish it by the command that began it, or by `benchnav-datagen merge` of its shares."

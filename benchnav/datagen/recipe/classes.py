@@ -58,16 +58,21 @@ class TerrainClass:
 
     def __post_init__(self) -> None:
         """Refuses values that make no LT function or no colour."""
-        is_colour = all(0 <= value <= 255 for value in self.colour)
-        expect(is_colour, f"`colour` of class {self.name!r} in 0–255, got {self.colour}.")
-        is_finite = np.isfinite([self.scale, self.exponent, self.offset, self.noise]).all()
         expect(
-            is_finite and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
+            all(0 <= value <= 255 for value in self.colour),
+            f"`colour` of class {self.name!r} in 0–255, got {self.colour}.",
+        )
+        numbers = self.scale, self.exponent, self.offset, self.noise
+        expect(
+            np.isfinite(numbers).all() and self.scale >= 0 and self.exponent > 0 and self.noise > 0,
             f"`scale` ≥ 0, `exponent` > 0 and `noise` > 0 of class {self.name!r}, "
             f"got {self.scale}, {self.exponent} and {self.noise}.",
         )
 
 
-def look_alike_classes(classes: tuple[TerrainClass, ...]) -> list[tuple[int, ...]]:
+ClassTable = tuple[TerrainClass, ...]
+
+
+def look_alike_classes(classes: ClassTable) -> list[tuple[int, ...]]:
     """Classes that share a colour, by class: of each class those that look like it, itself among them."""
     return [tuple(i for i, c in enumerate(classes) if c.colour == own.colour) for own in classes]

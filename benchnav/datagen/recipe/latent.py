@@ -10,7 +10,7 @@ classes may share a colour. Letters in shapes: B maps, H×W cells, K components.
 import numpy as np
 from numpy import ndarray
 
-from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
 from benchnav.datagen.schema import UNLABELLED
 
 _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
@@ -18,21 +18,20 @@ _BISECTIONS = 24  # leave an error of at most 2⁻²⁵
 Parameters = tuple[ndarray, ndarray, ndarray]
 
 
-def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:
+def latent_mean(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> ndarray:
     """f_c(ψ) of each cell, in [0, 1], shape of `class_id`."""
-    scale, exponent, offset = (
-        np.array([getattr(c, name) for c in classes]) for name in ("scale", "exponent", "offset")
-    )
-    loss = slope_deg ** np.take(exponent, class_id) * np.take(scale * 1e-3, class_id)
-    return np.clip(1 - (loss + np.take(offset, class_id)), 0, 1)
+    numbers = np.array([(c.scale, c.exponent, c.offset) for c in classes])
+    scale, exponent, offset = np.take(numbers.T, class_id, axis=1)
+    loss = slope_deg**exponent * (scale * 1e-3)
+    return np.clip(1 - (loss + offset), 0, 1)
 
 
-def latent_std(class_id: ndarray, classes: tuple[TerrainClass, ...]) -> ndarray:
+def latent_std(class_id: ndarray, classes: ClassTable) -> ndarray:
     """σ_c of each cell, shape of `class_id`."""
     return np.take(np.array([c.noise for c in classes]), class_id)
 
 
-def truth(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Parameters:
     """The true distribution of λ in each cell, as a Gaussian mixture before clipping.
 
     Args:
@@ -50,13 +49,13 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ..
     components: list[tuple[ndarray, ...]] = [(np.ones(mean.shape), mean, std)]
     if any(c.soft for c in classes):
         spots = [(c.soft.weight, c.soft.mean, c.soft.std) if c.soft else (0.0, 0.0, 1.0) for c in classes]
-        soft = tuple(np.take(values, class_id) for values in zip(*spots, strict=True))
+        soft = tuple(np.take(np.transpose(spots), class_id, axis=1))
         components = [(1 - soft[0], mean, std), soft]
     weights, means, stds = (np.stack(values, axis=1) for values in zip(*components, strict=True))
     return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
-def look_alikes(class_id: ndarray, slope_deg: ndarray, classes: tuple[TerrainClass, ...]) -> Parameters:
+def look_alikes(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Parameters:
     """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
 
     They are shown together, and which of them takes which ground is drawn anew in each map, so that each

@@ -88,10 +88,9 @@ def draw_places(places: PlacesRule, grid: Grid, key: int, indices: ndarray) -> t
     return chosen[:, 0], chosen[:, 1]
 
 
-def _inside(places: PlacesRule, grid: Grid) -> tuple[ndarray, ndarray]:
-    """The first step inside the margin along x and y, and the number of steps inside, each of shape [2]."""
-    extent = np.asarray(grid.extent_m)
+def _inside(places: PlacesRule, grid: Grid) -> tuple[float, ndarray]:
+    """The first step inside the margin along x and along y, and the number of steps inside each, shape [2]."""
     first = np.ceil(places.margin_m * _STEPS_A_M)
     # The map's own upper edges are off the map, so the last step lies under the margin's edge.
-    end = np.ceil((extent - places.margin_m) * _STEPS_A_M)
-    return np.full(2, first), end - first
+    end = np.ceil(np.subtract(grid.extent_m, places.margin_m) * _STEPS_A_M)
+    return first, end - first

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy import ndarray
 
 from benchnav.core.copula import LONGEST_CORRELATION
@@ -20,7 +19,7 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.settings import changed, load_yaml, plain, read, read_yaml
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import TerrainClass, look_alike_classes
+from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
 from benchnav.datagen.recipe.places import PlacesRule, check_places
 from benchnav.datagen.recipe.scenario import PRESETS, RECIPES, Scenario, load_presets, resolve
@@ -86,7 +85,7 @@ class Recipe:
     environments: int
     occupancy: tuple[float, ...]
     class_periods_m: tuple[float, ...]
-    classes: tuple[TerrainClass, ...]
+    classes: ClassTable
     scenarios: dict[str, Scenario]
     splits: dict[str, Split]
     stuck_threshold: float = 0.3
@@ -135,9 +134,7 @@ class Recipe:
 
     @cached_property
     def units(self) -> tuple[AlikeClasses, ...]:
-        """Classes that are shown together: in synthesis 2 those of one colour, in the table's order."""
-        if self.synthesis == 1:
-            return tuple((number,) for number in range(len(self.classes)))
+        """Classes that are shown together in synthesis 2: those of one colour, in the table's order."""
         return tuple(dict.fromkeys(look_alike_classes(self.classes)))
 
     @cached_property
@@ -188,7 +185,7 @@ def load_recipe(source: str | Path, overrides: Sequence[str] = ()) -> Recipe:
         f"a shipped recipe ({', '.join(shipped)}) or the path of a YAML file, got {str(source)!r}.",
     )
     data = read_yaml(path)
-    own = _with_class_table(data) if overrides else data
+    own = _with_class_table(data)
     for text in overrides:
         name, equals, value = text.partition("=")
         expect(equals and all(name.split(".")), f"an override such as splits.train.maps=50, got {text!r}.")
@@ -214,7 +211,7 @@ def shipped_recipes() -> list[str]:
 
 def shipped_sizes(recipe: str) -> dict[str, int]:
     """Maps by split of a shipped recipe, read without all that is to be checked of it."""
-    splits = yaml.safe_load((RECIPES / f"{recipe}.yaml").read_text())["splits"]
+    splits = read_yaml(RECIPES / f"{recipe}.yaml")["splits"]
     return {split: entry["maps"] for split, entry in splits.items()}
 
 
@@ -253,8 +250,10 @@ def check_name(kind: str, name: str) -> None:
     Raises:
         ConfigError: with `kind` in its message.
     """
-    fits = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest"
-    expect(fits, f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.")
+    expect(
+        re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) and name != "manifest",
+        f"{kind} of letters, digits, '.', '_' and '-', got {name!r}.",
+    )
 
 
 def _check_ends(recipe: Recipe) -> None:
@@ -279,7 +278,7 @@ def _check_ends(recipe: Recipe) -> None:
 def _check_scenarios(recipe: Recipe) -> None:
     extent_x, extent_y = recipe.grid.extent_m
     for name, scenario in recipe.scenarios.items():
-        most = scenario.crater_count[1] if recipe.synthesis == 1 else recipe.craters(scenario)[1]
+        _, most = recipe.craters(scenario)
         expect(
             most == 0 or 2 * scenario.crater_radius_m[1] <= min(extent_x, extent_y),
             f"`crater_radius_m` of scenario {name!r} to fit a map of {extent_x:g} m × {extent_y:g} m, "
@@ -297,7 +296,7 @@ def _check_environments(recipe: Recipe) -> None:
     shares, classes, periods = recipe.occupancy, recipe.classes, recipe.class_periods_m
     expect(1 <= len(classes) <= UNLABELLED, f"1–{UNLABELLED} classes in `classes`, got {len(classes)}.")
     expect(
-        np.isclose(sum(shares), 1, atol=1e-6) and all(0 < share <= 1 for share in shares),
+        np.isclose(sum(shares), 1, atol=1e-6) and min(shares) > 0,
         f"`occupancy` as shares > 0 summing to 1, got {list(shares)}.",
     )
     expect(
@@ -317,8 +316,10 @@ def _check_splits(recipe: Recipe) -> None:
     for name, split in recipe.splits.items():
         for part in name.split("/"):
             check_name("split name", part)
-        inside = any(other.startswith(f"{name}/") for other in recipe.splits)
-        expect(not inside, f"splits side by side, got one inside {name!r}.")
+        expect(
+            not any(other.startswith(f"{name}/") for other in recipe.splits),
+            f"splits side by side, got one inside {name!r}.",
+        )
         expect(
             split.scenario in recipe.scenarios,
             f"`scenario` of split {name!r} to be one of {sorted(recipe.scenarios)}, got {split.scenario!r}.",
@@ -326,18 +327,18 @@ def _check_splits(recipe: Recipe) -> None:
 
 
 def _check_look_alikes(recipe: Recipe) -> None:
-    names, groups, shown = [item.name for item in recipe.classes], recipe.units, len(recipe.occupancy)
+    names, shown = [item.name for item in recipe.classes], len(recipe.occupancy)
     flat = np.zeros((len(names), 1, 1))
     order = np.arange(len(names)).reshape(flat.shape)
     means = latent.expected_of(latent.truth(order, flat, recipe.classes)).ravel()
-    for first, second in (pair for group in groups for pair in combinations(group, 2)):
+    for first, second in (pair for group in recipe.units for pair in combinations(group, 2)):
         expect(
             abs(means[first] - means[second]) >= _LEAST_GAP,
             f"classes of one colour to differ by at least {_LEAST_GAP:g} in E[λ] on flat ground, "
             f"got {means[first]:.3f} for {names[first]!r} and {means[second]:.3f} for {names[second]!r}. "
             "Change an `offset` or a `colour`.",
         )
-    for unit in never_shown(groups, shown):
+    for unit in never_shown(recipe.units, shown):
         raise ConfigError(
             f"Expected classes that can be shown {shown} at a time, one for each share in `occupancy`, those of one "
             "colour together; got no choice of others that goes with "

@@ -1,9 +1,10 @@
-"""Rough ground: fractal elevation and craters.
+"""Rough ground: fractal elevation and craters, and its slope by Horn's method.
 
 Batched NumPy in float64: NumPy's Fourier transform gives the same numbers on every machine, those
 that PyTorch links to do not. Letters in shapes: B maps, H×W cells.
 
-Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) for the proportions of craters.
+Sources: paper III-A; Yokokohji et al. (2004) for fractal terrain; Pike (1977) for the proportions of craters;
+Horn (1981), "Hill shading and the reflectance map", for slope.
 """
 
 import numpy as np
@@ -11,8 +12,10 @@ from numpy import ndarray
 
 from benchnav.core import rng
 
+Shape = tuple[int, int]  # (H, W)
 
-def fractal(key: int, indices: ndarray, shape: tuple[int, int], roughness: float) -> ndarray:
+
+def fractal(key: int, indices: ndarray, shape: Shape, roughness: float) -> ndarray:
     """Synthesises fractal surfaces from a power-law spectrum.
 
     Args:
@@ -34,7 +37,7 @@ def fractal(key: int, indices: ndarray, shape: tuple[int, int], roughness: float
 def open_fractal(
     key: int,
     indices: ndarray,
-    shape: tuple[int, int],
+    shape: Shape,
     roughness: float,
     reference_cells: int,
 ) -> ndarray:
@@ -68,7 +71,7 @@ def open_fractal(
     return (surface[:, : shape[0], : shape[1]] - low[:, None, None]) / relief[:, None, None]
 
 
-def _frequencies(shape: tuple[int, int]) -> ndarray:
+def _frequencies(shape: Shape) -> ndarray:
     """Of the half spectrum of (H, W) cells, in cycles a cell, shape [H, W // 2 + 1]."""
     return np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
 
@@ -121,7 +124,7 @@ def place_craters(
 def crater_elevation(
     centres_m: ndarray,
     radii_m: ndarray,
-    shape: tuple[int, int],
+    shape: Shape,
     resolution_m: float,
     depth_ratio: float,
 ) -> ndarray:
@@ -149,3 +152,44 @@ def crater_elevation(
         rim = 0.2 * depth * np.maximum(ratio, 1) ** -3.0
         added += np.where(ratio < 1, bowl, rim)
     return added
+
+
+def horn_gradient(framed_m: ndarray, resolution_m: float) -> tuple[ndarray, ndarray]:
+    """Estimates ∂z/∂x and ∂z/∂y by Horn's third-order finite differences.
+
+    Args:
+        framed_m: elevation with the ground one cell beyond the map, shape [B, H + 2, W + 2]; where that is NaN, not
+            known, the surface is continued linearly, so that planes are exact everywhere. See `framed`.
+        resolution_m: cell width.
+
+    Returns:
+        Two arrays of shape [B, H, W], metres a metre.
+    """
+    z = framed_m.copy()
+    # Where the frame is not known, the plane through the two cells next to it.
+    for lines in (z.transpose(2, 0, 1), z.transpose(1, 0, 2)):  # columns, then rows
+        for edge, next_to, beyond in ((0, 1, 2), (-1, -2, -3)):
+            lines[edge] = np.where(np.isnan(lines[edge]), 2 * lines[next_to] - lines[beyond], lines[edge])
+    pairs_y, pairs_x = z[:, 1:] + z[:, :-1], z[:, :, 1:] + z[:, :, :-1]
+    smooth_y, smooth_x = pairs_y[:, 1:] + pairs_y[:, :-1], pairs_x[:, :, 1:] + pairs_x[:, :, :-1]
+    along_x = smooth_y[:, :, 2:] - smooth_y[:, :, :-2]
+    along_y = smooth_x[:, 2:] - smooth_x[:, :-2]
+    return along_x / (8 * resolution_m), along_y / (8 * resolution_m)
+
+
+def inclination_deg(along_x: ndarray, along_y: ndarray) -> ndarray:
+    """Angle between the ground and the horizontal.
+
+    Args:
+        along_x: ∂z/∂x, any shape.
+        along_y: ∂z/∂y, shape of `along_x`.
+
+    Returns:
+        Degrees in [0, 90), shape of `along_x`.
+    """
+    return np.arctan(np.sqrt(along_x * along_x + along_y * along_y)) * (180 / np.pi)
+
+
+def framed(elevation_m: ndarray) -> ndarray:
+    """Frames maps [B, H, W] with one cell of ground that is not known, NaN, shape [B, H + 2, W + 2]."""
+    return np.pad(elevation_m, ((0, 0), (1, 1), (1, 1)), constant_values=np.nan)

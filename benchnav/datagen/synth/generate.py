@@ -14,10 +14,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
-from benchnav.datagen.schema import FIELDS, Maps, quantise
+from benchnav.datagen.schema import FIELDS, Maps, join_maps, quantise
 from benchnav.datagen.synth import appearance, elevation
-from benchnav.datagen.synth.fractal_noise import fractal_perlin
-from benchnav.datagen.synth.slope import framed, framed_gradient, inclination_deg
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
@@ -39,14 +37,10 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
         ConfigError: a split asks for solvable maps and the recipe yields none for some index.
     """
     indices = np.asarray(indices, dtype=np.int64)
-    size = max(1, min(_PIECE, _PIECE_CELLS // (recipe.height * recipe.width)))
-    pieces = [
-        _generate_piece(recipe, split, indices[i : i + size]) for i in range(0, max(len(indices), 1), size)
-    ]
-    return {
-        name: np.concatenate([piece[name] for piece in pieces]).astype(field.dtype, copy=False)
-        for name, field in FIELDS.items()
-    }
+    size = min(_PIECE, recipe.grid.maps_in(_PIECE_CELLS))
+    starts = range(0, max(len(indices), 1), size)
+    maps = join_maps([_generate_piece(recipe, split, indices[start : start + size]) for start in starts])
+    return {name: maps[name].astype(field.dtype, copy=False) for name, field in FIELDS.items()}
 
 
 def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
@@ -92,7 +86,9 @@ def class_map(recipe: Recipe, split: str, indices: ndarray, attempt: int = 0) ->
         Class indices, shape [B, H, W].
     """
     periods = [period / recipe.resolution_m for period in recipe.class_periods_m]
-    noise = fractal_perlin(recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods)
+    noise = appearance.fractal_perlin(
+        recipe.seed, (split, "class", attempt), indices, recipe.grid.shape, periods
+    )
     # Which class takes which band differs from map to map, so no two classes are neighbours always.
     order_key = rng.stream_key(recipe.seed, split, "class order", attempt)
     order = rng.permutation(order_key, indices, len(recipe.occupancy))
@@ -127,8 +123,8 @@ def complete(
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
     ground = quantise(framed_m, 13)
-    gradient = framed_gradient(ground, recipe.resolution_m)
-    slope = quantise(inclination_deg(*gradient), 10)
+    gradient = elevation.horn_gradient(ground, recipe.resolution_m)
+    slope = quantise(elevation.inclination_deg(*gradient), 10)
     azimuth, lift = rng.uniform(key("light", attempt), indices, (2,)).T
     light = appearance.light_direction(2 * np.pi * azimuth, _within(scenario.light_height, lift))
     noise_key, shape = key("traversability", attempt), recipe.grid.shape
@@ -138,7 +134,7 @@ def complete(
         cells = recipe.correlation_m / recipe.resolution_m
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
     realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
-    brightness = appearance.lambert(*gradient, light, scenario.ambient)
+    brightness = appearance.shade(*gradient, light, scenario.ambient)
     colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
@@ -161,13 +157,11 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
     """Draws maps that may or may not be solvable; see `complete`."""
     key = partial(rng.stream_key, recipe.seed, split)
     grid, scenario = recipe.grid, recipe.scenarios[recipe.splits[split].scenario]
+    surface = key("elevation", attempt), indices, grid.shape, scenario.roughness
     if recipe.synthesis == 1:
-        ground = elevation.fractal(key("elevation", attempt), indices, grid.shape, scenario.roughness)
+        ground = elevation.fractal(*surface)
     else:
-        cells = max(3, round(REFERENCE_M / recipe.resolution_m))
-        ground = elevation.open_fractal(
-            key("elevation", attempt), indices, grid.shape, scenario.roughness, cells
-        )
+        ground = elevation.open_fractal(*surface, max(3, round(REFERENCE_M / recipe.resolution_m)))
     relief, crowding = rng.uniform(key("relief", attempt), indices, (2,)).T
     ground *= _within(scenario.relief_m, relief)[:, None, None]
     low, high = recipe.craters(scenario)
@@ -180,7 +174,7 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
         )
     class_id = class_map(recipe, split, indices, attempt)
-    return complete(recipe, split, indices, class_id, framed(ground), attempt)
+    return complete(recipe, split, indices, class_id, elevation.framed(ground), attempt)
 
 
 def _within(limits: tuple[float, float], share: ndarray) -> ndarray:

@@ -7,7 +7,6 @@ Every file is written under another name first. `run.json` is sealed, and holds 
 that an edit of either is found.
 """
 
-import hashlib
 import json
 import secrets
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,6 +21,7 @@ import pyarrow.parquet as pq
 
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import one_line
+from benchnav.core.sources import digest_of_path
 from benchnav.core.store import Shard, replacing, seal, unseal, write_text
 from benchnav.eval.experiment.condition import Condition, condition_from
 from benchnav.eval.experiment.suite import RECORDS
@@ -103,11 +103,6 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
     write_text(folder / RUN, seal(about))
 
 
-def _digest_of_file(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def caveats(about: Mapping[str, Any]) -> list[str]:
     """What readers of a run's tables should know: its warnings, and the pairs that it left out.
 
@@ -140,7 +135,7 @@ def read_table(folder: Path, name: str) -> pd.DataFrame:
             "finish it."
         )
     with damaged(path, "Remove it and give the run's command again."):
-        if run.about.get("tables", {}).get(name) != _digest_of_file(path):
+        if run.about.get("tables", {}).get(name) != digest_of_path(path):
             raise DamageError("it was changed after benchnav wrote it")
         return pd.read_parquet(path)
 
@@ -262,7 +257,7 @@ def finish_run(folder: Path, finished: Sequence[tuple[Unit, Finished]], reused: 
     with replacing(folder / EPISODES) as partial:
         pq.write_table(table, partial)
     codes = {code_digest(one.about["code"]): one.about["code"] for _, one in finished}
-    known = {"codes": codes, "reused": reused, "tables": {EPISODES: _digest_of_file(folder / EPISODES)}}
+    known = {"codes": codes, "reused": reused, "tables": {EPISODES: digest_of_path(folder / EPISODES)}}
     if {name: about.get(name) for name in known} != known:
         write_run(folder, {**about, **known})
 

@@ -10,7 +10,7 @@ import pytest
 
 from benchnav.core.errors import BenchnavError
 from benchnav.datagen.dem.importer import import_dem
-from benchnav.datagen.dem.survey import Rasters
+from benchnav.datagen.dem.raster import Rasters
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.reader import TerrainDataset
 from tests.factories import tiny_recipe
@@ -20,7 +20,7 @@ rasterio = pytest.importorskip("rasterio")
 WEST, SOUTH = 500_000.0, 3_999_900.0
 STEP = 2.0**-13  # of stored elevation
 # 12 m × 8 m: not square, so that swapped axes show.
-RECIPE = replace(tiny_recipe(), height=16, width=24, start_m=(2.2, 2.2), goal_m=(9.2, 5.2))
+RECIPE = replace(tiny_recipe(), id="real-v1", height=16, width=24, start_m=(2.2, 2.2), goal_m=(9.2, 5.2))
 COUNTER = itertools.count()
 NAMES = [kind.name for kind in RECIPE.classes]
 
@@ -58,10 +58,10 @@ def rough(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 def run(dem: Path | str, out: Path, settings: dict[str, Any]) -> list[tuple[int, int]]:
     """Imports rasters by the settings of `Rasters` and of `import_dem`."""
-    settings = {"recipe": RECIPE, "dataset_id": "real-v1"} | settings
+    settings = {"recipe": RECIPE} | settings
     files = {name: str(settings.pop(name, "")) for name in ("classes", "photo", "traversability")}
     plain = {name: settings.pop(name) for name in ("class_ids", "random_classes") if name in settings}
-    return list(import_dem(Rasters(dem=str(dem), **files, **plain), out, **settings))
+    return list(import_dem(str(dem), out, rasters=Rasters(**files, **plain), **settings))
 
 
 def read(dem: Path | str, folder: Path | None = None, suffix: str = ".h5", **settings: Any) -> TerrainDataset:

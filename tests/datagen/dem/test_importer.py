@@ -3,6 +3,7 @@
 import itertools
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ from benchnav.core.errors import BenchnavError, ConfigError, DatasetError
 from benchnav.datagen.dem import importer
 from benchnav.datagen.dem.importer import import_dem
 from benchnav.datagen.dem.raster import Layer
-from benchnav.datagen.dem.survey import Rasters
 from benchnav.datagen.files.check import find_faults
 from benchnav.datagen.files.merge import merge
 from benchnav.datagen.files.reader import TerrainDataset
@@ -102,14 +102,14 @@ def test_a_raster_is_never_read_whole(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_an_import_that_stops_leaves_nothing_and_one_that_was_killed_is_cleared_away(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", rough(16 * 8, 24 * 8))
     for name in ("out.h5", "out"):
-        steps = import_dem(Rasters(dem=str(dem)), tmp_path / name, RECIPE, dataset_id="real-v1")
+        steps = import_dem(str(dem), tmp_path / name, RECIPE)
         assert next(steps) == (8, 64)
         steps.close()
         assert [path.name for path in tmp_path.iterdir()] == ["dem.tif"]
         left = tmp_path / f".{name}.building.partial"
         left.mkdir()
         (left / "test+real-00000000-00000008.h5").touch()
-        list(import_dem(Rasters(dem=str(dem)), tmp_path / name, RECIPE, dataset_id="real-v1"))
+        list(import_dem(str(dem), tmp_path / name, RECIPE))
         assert find_faults(tmp_path / name) == []
         assert {path.name for path in tmp_path.iterdir()} == {"dem.tif", name}
         (tmp_path / name).rename(tmp_path.parent / f"{tmp_path.name}-{name}")
@@ -117,10 +117,10 @@ def test_an_import_that_stops_leaves_nothing_and_one_that_was_killed_is_cleared_
 
 def test_only_one_import_writes_a_file(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", rough(32, 48))
-    first = import_dem(Rasters(dem=str(dem)), tmp_path / "out.h5", RECIPE, dataset_id="real-v1")
+    first = import_dem(str(dem), tmp_path / "out.h5", RECIPE)
     next(first)
     with pytest.raises(BenchnavError, match="Another run"):
-        next(import_dem(Rasters(dem=str(dem)), tmp_path / "out.h5", RECIPE, dataset_id="real-v1"))
+        next(import_dem(str(dem), tmp_path / "out.h5", RECIPE))
     list(first)
     assert find_faults(tmp_path / "out.h5") == []
 
@@ -150,15 +150,16 @@ def test_a_folder_of_shards_holds_what_a_file_does(tmp_path: Path, monkeypatch: 
 
 def test_a_folder_is_replaced_only_where_it_is_a_dataset(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
-    out, rasters = tmp_path / "out", Rasters(dem=str(dem))
-    list(import_dem(rasters, out, RECIPE, dataset_id="one"))
+    out = tmp_path / "out"
+    one, two = (replace(RECIPE, id=name) for name in ("one", "two"))
+    list(import_dem(str(dem), out, one))
     with pytest.raises(BenchnavError, match="--overwrite"):
-        next(import_dem(rasters, out, RECIPE, dataset_id="two"))
-    list(import_dem(rasters, out, RECIPE, dataset_id="two", overwrite=True))
+        next(import_dem(str(dem), out, two))
+    list(import_dem(str(dem), out, two, overwrite=True))
     assert TerrainDataset(out).id == "two"
     (out / "mine.txt").touch()
     with pytest.raises(BenchnavError, match=r"mine\.txt"):
-        next(import_dem(rasters, out, RECIPE, dataset_id="one", overwrite=True))
+        next(import_dem(str(dem), out, one, overwrite=True))
     assert TerrainDataset(out).id == "two"
     assert {path.name for path in tmp_path.iterdir()} == {"dem.tif", "out"}
 
@@ -362,12 +363,13 @@ def test_unknown_classes_are_listed(tmp_path: Path) -> None:
 def test_settings_and_targets_are_checked(tmp_path: Path) -> None:
     dem = write(tmp_path / "dem.tif", FLAT)
     assert "letters" in refusal(dem, shares={"a b": 1.0})
-    assert "letters" in refusal(dem, dataset_id="a/b")
+    with pytest.raises(ConfigError, match="letters"):
+        replace(RECIPE, id="a/b")
     assert "'nope'" in refusal(dem, scenario="nope")
     (tmp_path / "out.h5").write_text("mine")
     assert "exists" in refusal(dem)
     assert (tmp_path / "out.h5").read_text() == "mine"
-    list(import_dem(Rasters(dem=str(dem)), tmp_path / "out.h5", RECIPE, dataset_id="real-v1", overwrite=True))
+    list(import_dem(str(dem), tmp_path / "out.h5", RECIPE, overwrite=True))
     assert TerrainDataset(tmp_path / "out.h5").splits["test/real"]["maps"] == 1
 
 
@@ -377,7 +379,7 @@ def test_without_rasterio_the_message_says_how_to_get_it(
     dem = write(tmp_path / "dem.tif", FLAT)
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(ConfigError, match=r"Expected rasterio.*pip install 'benchnav\[geo\]'"):
-        next(import_dem(Rasters(dem=str(dem)), tmp_path / "out.h5", RECIPE, dataset_id="real-v1"))
+        next(import_dem(str(dem), tmp_path / "out.h5", RECIPE))
 
 
 def level(*shape: int) -> np.ndarray:

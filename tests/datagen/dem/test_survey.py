@@ -11,7 +11,7 @@ import pytest
 from benchnav.datagen.dem.survey import provenance
 from benchnav.datagen.schema import UNLABELLED, quantise
 from benchnav.datagen.synth.appearance import light_direction, shade
-from benchnav.datagen.synth.slope import horn_gradient, inclination_deg
+from benchnav.datagen.synth.elevation import framed, horn_gradient, inclination_deg
 from tests.datagen.dem.rasters import (
     FLAT,
     NAMES,
@@ -85,7 +85,7 @@ def test_slopes_are_those_of_the_whole_ground_at_seams_too(
     frame = 1 if resampling == "cubic" else 0  # else the raster ends where the maps begin
     cells = (56, 56) if frame else (60, 60)
     ground = quantise(reprojected(dem, source, resampling, cells, frame), 13)
-    slopes = inclination_deg(*horn_gradient(ground[None], 0.5))[0]
+    slopes = inclination_deg(*horn_gradient(framed(ground[None]), 0.5))[0]
     for index, number in enumerate(source["kept"]):
         row, column = (int(2 * metres) + frame for metres in tile_place(source, number))
         own = (slice(row, row + 16), slice(column, column + 24))
@@ -105,7 +105,7 @@ def test_an_oblique_hill_is_shaded_as_in_the_raster(tmp_path: Path) -> None:
     azimuth, zenith = np.radians(295), np.radians(50)
     hillshade = np.cos(zenith) * np.cos(slope) + np.sin(zenith) * np.sin(slope) * np.cos(azimuth - downhill)
     light = light_direction(np.array([np.pi / 2 - azimuth]), np.array([np.cos(zenith)]))
-    ours = shade(stored.astype(np.float64), 0.5, light, 0)[0]
+    ours = shade(*horn_gradient(framed(stored.astype(np.float64)), 0.5), light, 0)[0]
     inside = (slice(1, -1), slice(1, -1))
     assert np.ptp(hillshade) > 0.5
     np.testing.assert_allclose(ours[inside], np.maximum(hillshade[::-1], 0)[inside], atol=0.05)

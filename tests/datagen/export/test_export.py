@@ -19,8 +19,7 @@ import yaml
 from benchnav.core.errors import ConfigError, DatasetError
 from benchnav.datagen import cli, schema
 from benchnav.datagen.export import parquet
-from benchnav.datagen.export.croissant import Publication, is_ours
-from benchnav.datagen.export.export import export
+from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files import reader
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
@@ -419,8 +418,7 @@ def test_a_killed_export_leaves_nothing_under_its_name(dataset_path: Path, tmp_p
     killed = f"""
 import os
 from pathlib import Path
-from benchnav.datagen.export.croissant import Publication, is_ours
-from benchnav.datagen.export.export import export
+from benchnav.datagen.export.export import Publication, export, is_ours
 from benchnav.datagen.files.reader import TerrainDataset
 for done, total in export(TerrainDataset({str(dataset_path)!r}), Path({str(tmp_path / "out")!r}), Publication()):
     if done:

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from benchnav.datagen.recipe.latent import latent_mean, latent_std
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.datagen.synth import appearance
-from benchnav.datagen.synth.fractal_noise import fractal_perlin
+from benchnav.datagen.synth.appearance import fractal_perlin
+from benchnav.datagen.synth.elevation import framed, horn_gradient
 
 
 @given(st.lists(st.floats(0.05, 1), min_size=1, max_size=6), st.integers(0, 5))
@@ -32,16 +33,14 @@ def test_perlin_noise_is_smooth_and_zero_at_its_lattice() -> None:
 def test_shading_is_lamberts_law() -> None:
     _, x = np.mgrid[:5, :5] * 0.5
     slope = np.tan(np.radians(20))
-    plane = (slope * x)[None]
+    plane = horn_gradient(framed((slope * x)[None]), 0.5)
     light = appearance.light_direction(np.array([np.pi]), np.array([np.cos(np.radians(20))]))
     # Light along the plane's normal: full brightness. Overhead: cos 20°. Behind: ambient alone.
-    np.testing.assert_allclose(appearance.shade(plane, 0.5, light, 0.1), 1)
+    np.testing.assert_allclose(appearance.shade(*plane, light, 0.1), 1)
     overhead = np.array([[0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(
-        appearance.shade(plane, 0.5, overhead, 0.1), 0.1 + 0.9 * np.cos(np.radians(20))
-    )
+    np.testing.assert_allclose(appearance.shade(*plane, overhead, 0.1), 0.1 + 0.9 * np.cos(np.radians(20)))
     grazing = np.array([[1.0, 0.0, 0.0]])
-    np.testing.assert_allclose(appearance.shade(plane, 0.5, grazing, 0.1), 0.1)
+    np.testing.assert_allclose(appearance.shade(*plane, grazing, 0.1), 0.1)
 
 
 def test_paint_scales_the_class_colour() -> None:
