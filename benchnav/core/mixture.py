@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.cvar import Cells, added, conditional_value_at_risk, mean, value_at_risk
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 
 Value = TypeVar("Value", bound=Any)
 
@@ -136,8 +136,7 @@ class TraversabilityMixture:
         Returns:
             In [floor, 1], at most the mean of max(λ, floor); shape [*B, H, W].
         """
-        if not 0 < floor <= 1:
-            raise ConfigError(f"Expected a least speed in (0, 1], got {floor}.")
+        expect(0 < floor <= 1, f"a least speed in (0, 1], got {floor}.")
         return self._in_pieces(lambda cells: _harmonic_mean(cells, floor))
 
     def from_normal(self, normal: Tensor) -> Tensor:
@@ -315,6 +314,5 @@ def _probability(z: Tensor) -> Tensor:
 
 
 def _tail(level: float) -> float:
-    if not 0 <= level < 1:
-        raise ConfigError(f"Expected `level` in [0, 1), got {level}. CVaR at level 0 is the mean.")
+    expect(0 <= level < 1, f"`level` in [0, 1), got {level}. CVaR at level 0 is the mean.")
     return 1 - float(level)

@@ -63,7 +63,7 @@ class FusedModel(ModelFamily):
         if soft := self.table.soft:
             owners = soft.weight.nonzero().flatten()
             group += tuple(owners.tolist())
-            share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
+            share, mean, std = (values.to(weights).view(-1, 1, 1) for values in soft)
             second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
             pairs = zip((weights * (1 - share), means, stds), second, strict=True)
             weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from benchnav.core import registry
-from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.errors import CheckpointError, ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
@@ -86,11 +86,11 @@ def load_model(source: Source) -> TraversabilityModel:
         if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
             refuse_unfinished(part, checkpoint.parts)
         return open_checkpoint(checkpoint)
-    if is_family(registry.find("model", part.part).target):
-        raise ConfigError(
-            f"Expected a model, got {part.part!r}, which is a family of models. "
-            "Name a checkpoint of it, by its path if it bears the same name."
-        )
+    expect(
+        not is_family(registry.find("model", part.part).target),
+        f"a model, got {part.part!r}, which is a family of models. "
+        "Name a checkpoint of it, by its path if it bears the same name.",
+    )
     return registry.make("model", part)
 
 
@@ -226,8 +226,7 @@ def _as_part(source: Source) -> registry.Part | Path:
     if (":" in part.part or part.part.endswith(".py")) and not (Path(part.part) / CONFIG).is_file():
         return part
     folder = find_checkpoint(part.part)
-    if part.options:
-        raise ConfigError(f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
+    expect(not part.options, f"no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
     return folder
 
 

@@ -29,7 +29,7 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 
 from benchnav.core import rng
 from benchnav.core.device import CPU, exact_convolutions
-from benchnav.core.errors import ConfigError, DatasetError, quiet
+from benchnav.core.errors import ConfigError, DatasetError, expect, quiet
 from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.checkpoint import CLASSIFIER
@@ -148,8 +148,8 @@ class TerrainClassifier(TrainableNetwork):
         """As `TrainableNetwork.from_tensors`; `config` may have a `temperature` too."""
         settings = {"temperature": 1.0, **config}
         temperature = settings.pop("temperature")
-        if not isinstance(temperature, int | float) or not 0 < temperature < math.inf:
-            raise ConfigError(f"Expected a `temperature` > 0, got {temperature!r}.")
+        fits = isinstance(temperature, int | float) and 0 < temperature < math.inf
+        expect(fits, f"a `temperature` > 0, got {temperature!r}.")
         model = super().from_tensors(settings, class_count, tensors)
         model.temperature = float(temperature)
         return model
@@ -264,11 +264,11 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
     _check_names(config)
     known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
     own = known["decoder_channels"].default if "decoder_channels" in known else None
-    if config.decoder_channels and not isinstance(own, tuple):
-        raise ConfigError(
-            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
-            f"got {list(config.decoder_channels)}. Leave them out."
-        )
+    expect(
+        isinstance(own, tuple) or not config.decoder_channels,
+        f"no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
+        f"got {list(config.decoder_channels)}. Leave them out.",
+    )
     # What is not asked for is left to the architecture; at a lesser depth it would have too many channels.
     size: dict[str, Any] = {"decoder_channels": config.decoder_channels} if config.decoder_channels else {}
     if config.encoder_depth < DEEPEST:

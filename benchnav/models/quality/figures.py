@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -29,7 +30,8 @@ from benchnav.core.figures import (
     styled,
 )
 from benchnav.datagen.recipe.classes import TerrainClass
-from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
+from benchnav.datagen.recipe.latent import expected_of
+from benchnav.datagen.recipe.latent import truth as true_distribution
 from benchnav.models.quality.measure import ClassQuality, TraversabilityQuality
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
@@ -42,18 +44,17 @@ _RARE = 1e-3
 _NEAR = 0.01  # to the ideal; finer differences fill no panel
 
 # Title, the quantity of ClassQuality or TraversabilityQuality, and its ideal where that is not an end.
-_CLASS_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
+_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
     ("Accuracy", "accuracy", None),
     ("Calibration error (ECE)", "ece", None),
     ("Mean entropy [nats]", "entropy", None),
     ("AUROC of uncertainty", "entropy_auroc", None),
-)
-_LATENT_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
     ("RMSE of E[λ]", "rmse_expected", None),
     ("CRPS of λ", "crps", None),
     ("In the 90 % interval", "coverage", 0.9),
     ("Under VaR at 0.9", "tail_rate", 0.1),
 )
+_OF_CLASSES = 4  # the first so many
 
 
 @styled()
@@ -189,7 +190,7 @@ def severity_figure(
         for severity, split in series
     )
     measured = table.dropna(axis=1)
-    quantities = [*_CLASS_SEVERITY * ("accuracy" in measured), *_LATENT_SEVERITY]
+    quantities = _SEVERITY if "accuracy" in measured else _SEVERITY[_OF_CLASSES:]
     figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
     for (panel,), (_, name, ideal) in zip(panels, quantities, strict=True):
         for place, (scenario, own) in enumerate(table.groupby("scenario", sort=False)):
@@ -231,19 +232,21 @@ def latent_figure(
     """
     titles = [item.name.replace("_", " ") for item in classes]
     figure, panels = _grid(titles, 5, 1.55, 0.5 if len(titles) > 4 else 1.0, share_y=True)
-    slopes = table_slopes().numpy()
-    shown = slopes <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))
-    parts = [table.mean, table.std, table.noise_std]
-    parts += [table.soft.weight, table.soft.mean, table.soft.std] if table.soft else []
-    means, stds, noise, *soft = (values.double().cpu().numpy() for values in parts)
-    x = slopes[shown]
+    x = table_slopes().numpy()
+    x = x[x <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))]
+    class_id, slopes = np.broadcast_arrays(np.arange(len(classes))[:, None, None], x)
+    mixture = table.own(torch.tensor(class_id), torch.tensor(slopes))
+    weights, means, stds = predicted = tuple(
+        values.numpy() for values in (mixture.weights, mixture.means, mixture.stds)
+    )
+    true = true_distribution(class_id, slopes, tuple(classes))
+    expected, true_expected = expected_of(predicted), expected_of(true)
+    noise = table.noise_std.double().cpu().numpy()
     for number, ((panel,), item) in enumerate(zip(panels, classes, strict=True)):
-        mean, std = means[number, shown], stds[number, shown]
+        mean, std = means[number, 0, 0], stds[number, 0, 0]
         latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
         panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
-        second = [values[number] for values in soft]
-        expected = _expected(mean, std, *second)
-        panel.plot(x, expected, color=ORANGE, lw=1.1, label="predicted E[λ]")
+        panel.plot(x, expected[number, 0], color=ORANGE, lw=1.1, label="predicted E[λ]")
         for spread, colour, alpha, label in (
             (std, SKY, 0.3, "± 2σ with noise"),
             (latent, BLUE, 0.45, "± 2σ of the latent function"),
@@ -252,14 +255,11 @@ def latent_figure(
             panel.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, label=label)
         words = f"σ {noise[number]:.3f}"
         if truth:
-            true = latent_mean(np.full(len(x), number), x, tuple(classes))
-            panel.plot(x, true, color="black", lw=0.9, ls="--", label="true latent function")
-            true_soft = (item.soft.weight, item.soft.mean, item.soft.std) if item.soft else ()
-            expected = _expected(true, np.full_like(x, item.noise), *true_soft)
-            panel.plot(x, expected, color="black", lw=1, ls=":", label="true E[λ]")
+            panel.plot(x, true[1][number, 0, 0], color="black", lw=0.9, ls="--", label="true latent function")
+            panel.plot(x, true_expected[number, 0], color="black", lw=1, ls=":", label="true E[λ]")
             words += f" ({item.noise:.3f})"
-        if soft and second[0]:
-            panel.axhline(second[1], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
+        if weights[number, 0, 0, 0] < 1:
+            panel.axhline(means[number, 1, 0, 0], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
         for share, shade, label in (
             (_RARE, 0.12, "steeper: 1 cell in 1000"),
             (0.0, 0.25, "steeper: no cell of the class"),
@@ -272,15 +272,6 @@ def latent_figure(
     figure.supylabel("traversability")
     _explain(figure)
     return figure
-
-
-def _expected(mean: np.ndarray, std: np.ndarray, *soft: float) -> np.ndarray:
-    """E[λ] of ground; of that with soft spots, these have a weight, a mean and a standard deviation."""
-    firm = expected_traversability(mean, std)
-    if not soft:
-        return firm
-    weight, soft_mean, soft_std = soft
-    return (1 - weight) * firm + weight * expected_traversability(np.array([soft_mean]), np.array([soft_std]))
 
 
 def _steeper_than(cells: Sequence[int], share: float) -> float:

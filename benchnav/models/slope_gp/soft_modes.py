@@ -16,12 +16,11 @@ bins of λ, C classes.
 """
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchnav.core.mixture import map_tensors
 from benchnav.models.slope_gp.cells import INSIDE_BINS, SlopeSums, levels
 from benchnav.models.slope_gp.table import SoftModes
 
@@ -38,8 +37,7 @@ _MOST_ODDS = 200.0  # beyond, shares would be too small for quick arithmetic
 _SETTLED = 1e-8  # nats a cell and step
 
 
-@dataclass(frozen=True)
-class _Modes:
+class _Modes(NamedTuple):
     """Parameters of S fits: f of shape [S, B], all others of shape [S, 1]; weight 0 for a single mode."""
 
     main: Tensor
@@ -47,10 +45,6 @@ class _Modes:
     weight: Tensor
     mean: Tensor
     std: Tensor
-
-    def select(self, which: int) -> "_Modes":
-        """Keeps one fit."""
-        return map_tensors(self, lambda values: values[which : which + 1])
 
 
 def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, Tensor]:
@@ -113,7 +107,8 @@ def _find_in_class(counts: Tensor) -> _Modes | None:
     weights, stds = torch.full_like(places, _FIRST_WEIGHT), torch.full_like(places, _FIRST_STD)
     second = _Modes(single.main, single.main_std, weights, places, stds)
     starts, fits = _maximise(cells, second, _FIRST_STEPS)
-    double, double_fit = _maximise(cells, starts.select(int(fits.argmax())), _MOST_STEPS)
+    best = _Modes(*(values[fits.argmax()].unsqueeze(0) for values in starts))
+    double, double_fit = _maximise(cells, best, _MOST_STEPS)
     gain, weight = float(double_fit - single_fit), float(double.weight)
     least = max(LEAST_GAIN * total, (_FREE_PARAMETERS * math.log(total) + _STRONG) / 2)
     if weight <= LEAST_WEIGHT or gain <= least:
@@ -157,7 +152,7 @@ def _improve(cells: Tensor, modes: _Modes, share: Tensor) -> _Modes:
     gap = squares - 2 * main * total + main**2 * count
     main_std = _deviation(gap.sum(1, keepdim=True) / count.sum(1, keepdim=True))
     if not bool(modes.weight.any()):
-        return replace(modes, main=main, main_std=main_std)
+        return modes._replace(main=main, main_std=main_std)
     count, total, squares = _moments(soft.sum(1, keepdim=True), modes.mean, modes.std)
     some = count.clamp(min=1e-9)
     mean = total / some

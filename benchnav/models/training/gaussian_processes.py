@@ -130,7 +130,7 @@ def _fit_and_say(
     """Trains the GPs, and names the classes that were found to have a second mode."""
     model = fit_gps(config, sums, device)
     if soft := model.soft:
-        modes = zip(class_names, soft.weight.tolist(), soft.mean.tolist(), soft.std.tolist(), strict=True)
+        modes = zip(class_names, *(values.tolist() for values in soft), strict=True)
         found = [
             f"{name} {share:.1%} of N({mean:.3f}, {std:.3f})" for name, share, mean, std in modes if share
         ]

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from lightning.pytorch.callbacks import EarlyStopping
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import one_line
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
@@ -68,8 +68,7 @@ def train_networks(
         gp: of the GPs, if any.
         members: how many classifiers there are to be.
     """
-    if members < 1:
-        raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
+    expect(members >= 1, f"`members` ≥ 1, got {members}.")
     check_seed(how.seed, members)
     dataset, trainer = open_dataset(data), dict(how.trainer or {})
     # The length of training is the network's own setting, wherever it is said.
@@ -154,20 +153,19 @@ def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOp
         chosen = options.chosen(max_epochs=config.max_epochs)
         trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
     every = trainer.check_val_every_n_epoch or 0
-    if every > config.max_epochs:
-        raise ConfigError(
-            f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
-            f"got {every}."
-        )
+    expect(
+        every <= config.max_epochs,
+        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, got {every}.",
+    )
     counts = {split: dataset.map_count(split) for split in (TRAIN, VALID)}
     batches = {split: -(-maps // config.batch_size) for split, maps in counts.items()}
     for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
         limit = getattr(trainer, name)
-        if (batches[split] * limit if isinstance(limit, float) else limit) < 1:
-            raise ConfigError(
-                f"Expected `trainer.{name}` that leaves a batch of the {batches[split]} of split {split}, got {limit}. "
-                "Leave it out to take all."
-            )
+        expect(
+            (batches[split] * limit if isinstance(limit, float) else limit) >= 1,
+            f"`trainer.{name}` that leaves a batch of the {batches[split]} of split {split}, got {limit}. "
+            "Leave it out to take all.",
+        )
     together = min(2, counts[TRAIN] // batches[TRAIN])
     batch = read_maps(dataset, TRAIN, kind.fields).read(range(together))
     try:
