@@ -253,7 +253,7 @@ class TraversabilityMixture:
         )
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
-        weights, means, stds = (t.to(torch.float64) for t in (self.weights, self.means, self.stds))
+        weights, means, stds = (values.double() for values in (self.weights, self.means, self.stds))
         return weights / weights.sum(-3, keepdim=True), means, stds.clamp(min=_SMALLEST_STD)
 
     def _uncensored_cdf(self, value: Tensor) -> Tensor:

@@ -55,10 +55,10 @@ class ModelFamily(TraversabilityModel):
     @classmethod
     @abstractmethod
     def from_checkpoint(cls, checkpoint: "Checkpoint") -> "ModelFamily":
-        """Rebuilds a model.
+        """Rebuilds a model; what it raises ends in one line, where `load_model` calls it.
 
         Raises:
-            CheckpointError: a part is missing, or its tensors do not fit its settings.
+            CheckpointError: a part is missing.
         """
 
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 import benchnav
-from benchnav.core.errors import BenchnavError, CheckpointError
+from benchnav.core.errors import CheckpointError
 from benchnav.core.store import (
     building,
     output_path,
@@ -47,23 +47,6 @@ CLASSIFIER, GP = "classifier", "gp"
 
 _KEPT = ("config", "seed", "metrics", "half_precision", "versions", "trainer")  # of a part, as they are
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
-
-
-@contextmanager
-def refitting() -> Iterator[None]:
-    """Says of a model that is rebuilt from a checkpoint that its tensors do not fit its settings.
-
-    Raises:
-        CheckpointError: they do not.
-    """
-    try:
-        yield
-    except CheckpointError:
-        raise
-    except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
-        ) from error
 
 
 def _versions() -> dict[str, str]:
@@ -307,12 +290,12 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def _to_store(tensors: Mapping[str, Tensor], half: bool) -> dict[str, Tensor]:
-    # Kernels alone: running variances and biases are few, and may leave float16's range.
-    kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    return {
-        name: value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
-        for name, value in kept.items()
-    }
+    stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    for name, value in stored.items():
+        # Kernels alone: running variances and biases are few, and may leave float16's range.
+        if half and value.is_floating_point() and value.ndim >= 2:
+            stored[name] = value.half()
+    return stored
 
 
 def _read_part(path: Path, data: Mapping[str, str], sha256: str, **entry: Any) -> Part:

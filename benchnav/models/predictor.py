@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from benchnav.core import registry
-from benchnav.core.errors import CheckpointError, ConfigError, expect
+from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
@@ -109,7 +109,14 @@ def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
             f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
             f"{checkpoint.model!r}. Install the package that registers it."
         )
-    return family.from_checkpoint(checkpoint)
+    try:
+        return family.from_checkpoint(checkpoint)
+    except CheckpointError:
+        raise
+    except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
+        ) from error
 
 
 def find_checkpoint(source: str | Path) -> Path:

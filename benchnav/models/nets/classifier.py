@@ -32,7 +32,7 @@ from benchnav.core.device import CPU, exact_convolutions
 from benchnav.core.errors import ConfigError, DatasetError, expect, quiet
 from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.checkpoint import CLASSIFIER
+from benchnav.models.checkpoint import CLASSIFIER, Checkpoint, member_names
 from benchnav.models.config import DEEPEST, ClassifierConfig
 from benchnav.models.nets.trainable import NO_SCALE, MapScale, TrainableNetwork
 
@@ -153,6 +153,16 @@ class TerrainClassifier(TrainableNetwork):
         model = super().from_tensors(settings, class_count, tensors)
         model.temperature = float(temperature)
         return model
+
+
+def classifiers_of(checkpoint: Checkpoint) -> list[TerrainClassifier]:
+    """Rebuilds the classifiers of a checkpoint, in order.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    parts, classes = map(checkpoint.part, member_names(checkpoint)), len(checkpoint.class_names)
+    return [TerrainClassifier.from_tensors(part.config, classes, part.tensors) for part in parts]
 
 
 def fit_temperature(logits: Tensor, class_id: Tensor) -> float:

@@ -17,7 +17,7 @@ from torchmetrics import MeanSquaredError
 from benchnav.core.mixture import TraversabilityMixture, component_log_prob
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
-from benchnav.models.checkpoint import Checkpoint, refitting
+from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import NO_SCALE, MapScale, TrainableNetwork
@@ -175,8 +175,7 @@ class MixtureDensityModel(ModelFamily):
         """Rebuilds the model from a checkpoint with a part `mdn`.
 
         Raises:
-            CheckpointError: the part is missing, or its tensors do not fit its settings.
+            CheckpointError: the part is missing.
         """
         part = checkpoint.part(MDN)
-        with refitting():
-            return cls(MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors))
+        return cls(MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors))

@@ -334,7 +334,7 @@ def _score_cells(
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
     errors = (expected - terrain.truth.at(known).mean())[0, labelled[known]].double().square()
-    sums = {
+    sums: dict[str, Any] = {
         "cells": cells,
         "squares": (expected - observed).double().square().sum(),
         "nll": -mixture.log_prob(observed).double().sum(),

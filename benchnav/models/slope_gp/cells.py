@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -29,7 +29,7 @@ from pandas.api.types import is_numeric_dtype
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import DatasetError, expect
 from benchnav.core.mixture import map_tensors
 from benchnav.core.settings import hint
 from benchnav.core.terrain import Terrain
@@ -91,8 +91,8 @@ def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, 
     cells = Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
     for name, most in (("class_id", class_count - 1), ("slope_deg", 90), ("traversability", 1)):
         column = getattr(cells, name)
-        if not bool(((column >= 0) & (column <= most)).all()):
-            raise ConfigError(f"Expected `{name}` within [0, {most}], got values outside it.")
+        fits = bool(((column >= 0) & (column <= most)).all())
+        expect(fits, f"`{name}` within [0, {most}], got values outside it.")
     return cells
 
 
@@ -294,8 +294,7 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = T
     return {**errors, "nll": surprise / max(1, seen)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class SlipLogs:
+class SlipLogs(NamedTuple):
     """What is learned from of a slip log.
 
     Args:
@@ -344,11 +343,8 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
         )
     class_names, class_id = _read_classes(rows["class"], observed, path, class_names)
     slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
-    return SlipLogs(
-        class_names=class_names,
-        cells=Cells(class_id=class_id, slope_deg=slope, traversability=value),
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
-    )
+    cells = Cells(class_id=class_id, slope_deg=slope, traversability=value)
+    return SlipLogs(class_names, cells, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def _read(path: Path) -> pd.DataFrame:

@@ -129,10 +129,10 @@ class MapSampler(Sampler[MapKey]):
         """Yields the batches of the epoch."""
         order, epoch = np.arange(self.maps), np.array([self.epoch])
         if self.shuffle:
-            order = rng.permutation(self._key("order"), epoch, self.maps)[0]
-        drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
+            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, self.maps)[0]
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (self.maps,))[0]
         symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        drawn = rng.uniform(self._key("jitter"), epoch, (self.maps, 3))[0]
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (self.maps, 3))[0]
         factors = 1 + self.jitter * (2 * drawn - 1)
         first, step = self.share
         pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
@@ -140,9 +140,6 @@ class MapSampler(Sampler[MapKey]):
             start = min(first, len(batch[0]) - 1)  # no process is left without a map
             index, which, how = (torch.from_numpy(values[start::step]) for values in batch)
             yield index, which, how
-
-    def _key(self, what: str) -> int:
-        return rng.stream_key(self.seed, "models", f"map {what}")
 
 
 class MapData(lightning.LightningDataModule):
@@ -178,7 +175,10 @@ class MapData(lightning.LightningDataModule):
         """Opens the splits."""
         super().__init__()
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
-        self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
+        read = ("rgb", *fields)
+        self.train, self.valid = (
+            MapDataset(dataset.path, split, read, in_memory) for split in (TRAIN, VALID)
+        )
 
     def scale(self) -> MapScale:
         """What the training maps' colours and slopes are scaled by; 1 of slopes that are not read."""
@@ -256,10 +256,3 @@ def check_maps(dataset: TerrainDataset, field: str) -> None:
 def training_digest(dataset: TerrainDataset) -> str:
     """Digest of what of a dataset is trained on, and of what its maps mean."""
     return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))
-
-
-def read_maps(
-    dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",), in_memory: bool = False
-) -> MapDataset:
-    """The colours and other fields of a split, read as they are asked for, or at once."""
-    return MapDataset(dataset.path, split, ("rgb", *fields), in_memory)

@@ -17,19 +17,18 @@ from benchnav.models.checkpoint import (
     Part,
     as_stored,
     member_name,
-    member_names,
     training_folder,
 )
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, NetworkConfig, TrainOptions, check_seed
-from benchnav.models.nets.classifier import TerrainClassifier, fit_pool_temperature
+from benchnav.models.nets.classifier import TerrainClassifier, classifiers_of, fit_pool_temperature
 from benchnav.models.nets.mdn import MixtureDensityNetwork
 from benchnav.models.training.data import (
     TRAIN,
     VALID,
     MapData,
+    MapDataset,
     check_maps,
     open_dataset,
-    read_maps,
     training_digest,
 )
 from benchnav.models.training.fit import (
@@ -167,7 +166,7 @@ def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOp
             "Leave it out to take all.",
         )
     together = min(2, counts[TRAIN] // batches[TRAIN])
-    batch = read_maps(dataset, TRAIN, kind.fields).read(range(together))
+    batch = MapDataset(dataset.path, TRAIN, ("rgb", *kind.fields)).read(range(together))
     try:
         with torch.no_grad():
             network.train().assess(batch)
@@ -195,18 +194,16 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
             seed=seed,
             metrics=metrics,
             data_id=dataset.id,
-            data_digest=training_digest(dataset),
+            data_digest=target.digest,
             half_precision=options.half_precision,
             trainer=options.trainer_settings,
         )
         target.add(part, trained)
-    parts = member_names(target.checkpoint)
-    if not isinstance(config, ClassifierConfig) or len(parts) == 1 or not is_first_process():
+    if not isinstance(config, ClassifierConfig) or not is_first_process():
         return
-    members = [
-        TerrainClassifier.from_tensors(part.config, len(target.checkpoint.class_names), part.tensors)
-        for part in map(target.checkpoint.part, parts)
-    ]
-    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), options.seed, options.place)
+    members = classifiers_of(target.checkpoint)
+    if len(members) == 1:
+        return
+    temperature = fit_pool_temperature(members, MapDataset(dataset.path, VALID), options.seed, options.place)
     say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)
