@@ -29,7 +29,7 @@ from pandas.api.types import is_numeric_dtype
 from torch import Tensor
 
 from benchnav.core import rng
-from benchnav.core.errors import DatasetError, expect
+from benchnav.core.errors import DatasetError
 from benchnav.core.mixture import map_tensors
 from benchnav.core.settings import hint
 from benchnav.core.terrain import Terrain
@@ -74,26 +74,17 @@ class Cells:
         return map_tensors(self, lambda values: values[which])
 
 
-def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, class_count: int) -> Cells:
+def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor) -> Cells:
     """Takes out the cells whose slope and traversability were observed and whose class is known.
 
     Args:
         class_id: integers in [0, C), 255 where not known, any shape.
         slope_deg: slopes in [0, 90], NaN where not observed, shape of `class_id`.
         traversability: λ in [0, 1], NaN where not observed, shape of `class_id`.
-        class_count: C.
-
-    Raises:
-        ConfigError: they hold values out of range.
     """
     ids, slopes, values = (column.flatten() for column in (class_id, slope_deg, traversability))
     seen = ~(slopes.isnan() | values.isnan()) & (ids != UNLABELLED)
-    cells = Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
-    for name, most in (("class_id", class_count - 1), ("slope_deg", 90), ("traversability", 1)):
-        column = getattr(cells, name)
-        fits = bool(((column >= 0) & (column <= most)).all())
-        expect(fits, f"`{name}` within [0, {most}], got values outside it.")
-    return cells
+    return Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
 
 
 def read_cells(dataset: TerrainDataset, split: str, chunk_cells: int = CHUNK_CELLS) -> Iterator[Cells]:
@@ -109,8 +100,7 @@ def read_cells(dataset: TerrainDataset, split: str, chunk_cells: int = CHUNK_CEL
     """
     names = ("class_id", "slope_deg", "traversability")
     for _, maps in dataset.chunks(split, names, chunk_cells):
-        class_id, slope_deg, traversability = (torch.from_numpy(maps[name]) for name in names)
-        yield observed_cells(class_id, slope_deg, traversability, len(dataset.recipe.classes))
+        yield observed_cells(*(torch.from_numpy(maps[name]) for name in names))
 
 
 def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
@@ -328,21 +318,22 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
             f"Expected columns {', '.join(COLUMNS)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(str(name) for name in rows.columns) or 'none'}."
         )
-    numbers = {name: _read_numbers(rows[name], name, most, path) for name, most in _LIMITS.items()}
-    observed = ~np.logical_or(*(np.isnan(column) for column in numbers.values()))
-    if not observed.any():
+    for name, most in _LIMITS.items():
+        rows[name] = _read_numbers(rows[name], name, most, path)
+    observed = rows.dropna(subset=list(_LIMITS))
+    if observed.empty:
         raise DatasetError(
             f"Expected rows with a slope and a traversability in {path}, got none among {len(rows)}. "
             "Log places that the robot has driven over."
         )
-    steepest = numbers["slope_deg"][observed].max()
-    if 0 < steepest <= np.pi / 2 and observed.sum() >= _ENOUGH:
+    steepest = observed["slope_deg"].max()
+    if 0 < steepest <= np.pi / 2 and len(observed) >= _ENOUGH:
         raise DatasetError(
-            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {observed.sum()} rows, as of "
+            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {len(observed)} rows, as of "
             "radians. Multiply radians by 57.2958. Ground that level in degrees looks the same: log steeper too."
         )
-    class_names, class_id = _read_classes(rows["class"], observed, path, class_names)
-    slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
+    class_names, class_id = _read_classes(observed["class"], path, class_names)
+    slope, value = (torch.from_numpy(observed[name].to_numpy(np.float32)) for name in _LIMITS)
     cells = Cells(class_id=class_id, slope_deg=slope, traversability=value)
     return SlipLogs(class_names, cells, hashlib.sha256(path.read_bytes()).hexdigest())
 
@@ -350,7 +341,7 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
 def _read(path: Path) -> pd.DataFrame:
     try:
         if path.suffix == ".parquet":
-            return pd.read_parquet(path)
+            return pd.read_parquet(path).reset_index(drop=True)
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # As text: a class may be called NA, and a bad number is to be found in its row.
@@ -384,17 +375,15 @@ def _read_numbers(column: pd.Series, name: str, most: float, path: Path) -> np.n
     return values
 
 
-def _read_classes(
-    column: pd.Series, observed: np.ndarray, path: Path, names: tuple[str, ...]
-) -> tuple[tuple[str, ...], Tensor]:
-    """Gives the class table, that of the log where it has no names yet, and the id of each observed row."""
-    text = column.astype("string").str.strip().fillna("").to_numpy(str)
-    absent = np.flatnonzero(observed & (text == ""))
+def _read_classes(column: pd.Series, path: Path, names: tuple[str, ...]) -> tuple[tuple[str, ...], Tensor]:
+    """Gives the class table, that of the log where it has no names yet, and the id of each row."""
+    text = column.astype("string").str.strip().fillna("")
+    absent = text.index[text == ""]
     if len(absent):
         raise DatasetError(
             f"Expected a `class` in every row of {path}, got none in row {absent[0] + 1} below the header."
         )
-    found = text[observed]
+    found = text.to_numpy(str)
     # pandas writes ids so where some are missing: 0.0
     if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
         ids = found.astype(float)
