@@ -9,7 +9,7 @@ Letters in shapes: K components.
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -18,6 +18,7 @@ from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, ex
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -28,9 +29,6 @@ from benchnav.models.checkpoint import (
     read_config,
     refuse_unfinished,
 )
-
-if TYPE_CHECKING:
-    from benchnav.datagen.recipe.recipe import Recipe
 
 
 class Oracle(PrivilegedModel):
@@ -203,7 +201,7 @@ def trained_on(source: Source) -> dict[str, str]:
     return found
 
 
-def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: "Recipe", name: str = "the model") -> str:
+def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name: str = "the model") -> str:
     """Tells in one line when a model knows another class table than that of the data.
 
     Args:

@@ -217,7 +217,6 @@ def sample_logits(
     Raises:
         DatasetError: there is no such cell.
     """
-    cells = maps.shape[0] * maps.shape[1]
     kept = max(1, _MOST_CELLS // len(maps))
     key = rng.stream_key(seed, "models", "temperature")
     found, classifier = [], classifier.to(device)
@@ -225,7 +224,8 @@ def sample_logits(
         for indices, some in maps.chunks(device):
             logits, class_id = classifier(some["rgb"]).float().flatten(2), some["class_id"].flatten(1).long()
             for place, which in enumerate(indices):
-                order = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0]).to(device)
+                cells = rng.permutation(key, np.array([which]), class_id.shape[1])[0]
+                order = torch.from_numpy(cells).to(device)
                 drawn = order[class_id[place, order] != UNLABELLED][:kept]
                 found.append((logits[place][:, drawn].T.clone(), class_id[place, drawn]))
     logits, class_id = (torch.cat(parts) for parts in zip(*found, strict=True))

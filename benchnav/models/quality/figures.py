@@ -146,12 +146,13 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     for (panel,), quality in panels:
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
-        low, high = (bound / level for bound in binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
+        density = counts / level
+        low, high = np.array(binom.interval(0.9, counts.sum(), 1 / PIT_BINS)) / level
         for first, last, colour, label in (
             (0, tail, ORANGE, "observed, under VaR at 0.9"),
             (tail, PIT_BINS, SKY, "observed"),
         ):
-            heights, ends = counts[first:last] / level, edges[first : last + 1]
+            heights, ends = density[first:last], edges[first : last + 1]
             panel.stairs(heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0, label=label)
             panel.stairs(heights, ends, baseline=None, color=colour, lw=1)
         panel.axhline(1, color="black", lw=0.7, label="calibrated")
@@ -164,7 +165,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
             f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
             size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
         )  # fmt: skip
-        lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
+        lowest, highest = min(0.95, *density), max(1.05, *density)
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
         panel.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])

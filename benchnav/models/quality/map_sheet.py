@@ -86,14 +86,13 @@ def read_sheet(
         if model.class_names:
             classes = mixture.class_probabilities(len(model.class_names))
             layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
+            layers["entropy"] = predictive_entropy(classes)
         layers |= {
             "expected_true" if known else "observed": true,
             "expected": mixture.mean(),
             "error" if known else "error_observed": mixture.mean() - true,
             "width": mixture.var(0.05) - mixture.var(0.95),
         }
-        if model.class_names:
-            layers["entropy"] = predictive_entropy(classes)
         members = model.member_probabilities(terrain.observe())
         if members is not None and len(members) > 1:
             layers["information"] = mutual_information(members)

@@ -121,8 +121,9 @@ def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
     out = (counts * share).long()
     key = rng.stream_key(seed, "models", "held-out cells")
     held = torch.zeros(len(cells), dtype=torch.bool)
+    drawn = rng.uniform(key, np.arange(len(counts)))
     for c, (count, few) in enumerate(zip(counts.tolist(), out.tolist(), strict=True)):
-        first = int(rng.uniform(key, np.array([c]))[0] * (count - few + 1))
+        first = int(drawn[c] * (count - few + 1))
         held[(cells.class_id == c).nonzero().flatten()[first : first + few]] = True
     return cells.select(~held), cells.select(held)
 

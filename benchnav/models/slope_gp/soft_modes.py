@@ -91,16 +91,14 @@ def _find_in_class(counts: Tensor) -> _Modes | None:
     flat = _Modes(mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD)
     single, single_fit = _maximise(cells, flat, _MOST_STEPS)
     places = torch.tensor(_STARTS, dtype=torch.float64).unsqueeze(1)
-    weights, stds = torch.full_like(places, _FIRST_WEIGHT), torch.full_like(places, _FIRST_STD)
-    second = _Modes(single.main, single.main_std, weights, places, stds)
-    starts, fits = _maximise(cells, second, _FIRST_STEPS)
+    small = single._replace(
+        weight=torch.full_like(places, _FIRST_WEIGHT), mean=places, std=torch.full_like(places, _FIRST_STD)
+    )
+    starts, fits = _maximise(cells, small, _FIRST_STEPS)
     best = _Modes(*(values[fits.argmax()].unsqueeze(0) for values in starts))
     double, double_fit = _maximise(cells, best, _MOST_STEPS)
-    gain, weight = float(double_fit - single_fit), float(double.weight)
     least = max(LEAST_GAIN * total, (_FREE_PARAMETERS * math.log(total) + _STRONG) / 2)
-    if weight <= LEAST_WEIGHT or gain <= least:
-        return None
-    return double
+    return double if double.weight > LEAST_WEIGHT and double_fit - single_fit > least else None
 
 
 def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Tensor]:

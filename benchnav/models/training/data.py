@@ -20,7 +20,7 @@ from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.nets.trainable import MapScale
 
@@ -35,11 +35,6 @@ Batch = dict[str, Tensor]
 
 class MapDataset(TerrainMaps):
     """Maps by field, `rgb` (uint8, [b, 3, H, W]) among them; indexed by a whole batch at a time."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """H and W."""
-        return self.dataset.grid.shape
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W].
@@ -57,12 +52,10 @@ class MapDataset(TerrainMaps):
         }
         return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
 
-    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[list[int], Batch]]:
+    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
         """All maps as they are, in order, some at a time, with their indices; on a device."""
-        height, width = self.shape
-        for chunk in torch.arange(len(self)).split(max(1, CHUNK_CELLS // (height * width))):
-            indices = chunk.tolist()
-            yield indices, {name: values.to(device) for name, values in self.read(indices).items()}
+        for indices, maps in self.dataset.chunks(self.split, self.fields):
+            yield indices, {name: torch.from_numpy(values).to(device) for name, values in maps.items()}
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
@@ -199,7 +192,7 @@ class MapData(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
-        height, width = self.train.shape
+        height, width = self.train.dataset.grid.shape
         symmetries = _SYMMETRIES if height == width else _SYMMETRIES_OF_RECTANGLE
         return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
 
