@@ -199,7 +199,7 @@ class TraversabilityMixture:
         if self.group in (None, tuple(range(count))):
             return self.weights
         weights = self.weights.movedim(-3, 0)
-        total = torch.zeros_like(weights[:1]).repeat(count, *(1,) * (weights.ndim - 1))
+        total = weights.new_zeros(count, *weights.shape[1:])
         total.index_add_(0, torch.tensor(self.group, device=weights.device), weights)
         return total.movedim(0, -3)
 

@@ -45,7 +45,7 @@ CONFIG = "config.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
-_KEPT = ("config", "seed", "metrics", "half_precision", "versions", "trainer")  # of a part, as they are
+_APART = ("tensors", "data_id", "data_digest")  # of a part; all else is written as it is
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
 
 
@@ -195,8 +195,6 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         names, pooled = config["class_names"], float(config.get("pool_temperature", 1.0))
         if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
             raise ValueError("class_names are no names of different classes")
-        if config["class_count"] != len(names):
-            raise ValueError("class_count is not the number of class_names")
         if not 0 < pooled < float("inf"):
             raise ValueError(f"pool_temperature is {pooled}")
         return Checkpoint(
@@ -273,7 +271,7 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         content = safetensors.torch.save(_to_store(part.tensors, part.half_precision))
         with replacing(folder / f"{name}.safetensors") as partial:
             partial.write_bytes(content)
-        kept = {name: value for name, value in vars(part).items() if name in _KEPT and value is not None}
+        kept = {name: value for name, value in vars(part).items() if name not in _APART and value is not None}
         digest = hashlib.sha256(content).hexdigest()
         parts[name] = {**kept, "data": {"id": part.data_id, "digest": part.data_digest}, "sha256": digest}
     pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}

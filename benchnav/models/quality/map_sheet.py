@@ -5,8 +5,7 @@ maps, H×W cells.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -45,8 +44,7 @@ _LAYERS: dict[str, tuple[str, str, str]] = {
 _SHOWN_SHARE = 0.995
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapSheet:
+class MapSheet(NamedTuple):
     """What a sheet shows.
 
     Args:
@@ -96,12 +94,8 @@ def read_sheet(
         members = model.member_probabilities(terrain.observe())
         if members is not None and len(members) > 1:
             layers["information"] = mutual_information(members)
-    return MapSheet(
-        split=split,
-        indices=tuple(indices),
-        extent_m=terrain.grid.extent_m,
-        layers={name: layer.cpu().numpy() for name, layer in layers.items()},
-    )
+    arrays = {name: layer.cpu().numpy() for name, layer in layers.items()}
+    return MapSheet(split, tuple(indices), terrain.grid.extent_m, arrays)
 
 
 def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -> dict[str, dict[str, Any]]:

@@ -41,11 +41,10 @@ CHUNK_CELLS = 2**18
 BIN_DEG = 0.25
 INSIDE_BINS = 256
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
-COLUMNS = ("class", "slope_deg", "traversability")
-
 _BINS = round(90 / BIN_DEG) + 1
 _VALUES = INSIDE_BINS + 2
 _LIMITS = {"slope_deg": 90, "traversability": 1}
+COLUMNS = ("class", *_LIMITS)
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 _ENOUGH = 20  # rows of which some would be steeper than 1.6° if slopes were in degrees
 _MOST_CLASSES = 256  # class ids are stored in a byte

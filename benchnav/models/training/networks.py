@@ -156,16 +156,15 @@ def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOp
         every <= config.max_epochs,
         f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, got {every}.",
     )
-    counts = {split: dataset.map_count(split) for split in (TRAIN, VALID)}
-    batches = {split: -(-maps // config.batch_size) for split, maps in counts.items()}
     for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
-        limit = getattr(trainer, name)
+        limit, batches = getattr(trainer, name), -(-dataset.map_count(split) // config.batch_size)
         expect(
-            (batches[split] * limit if isinstance(limit, float) else limit) >= 1,
-            f"`trainer.{name}` that leaves a batch of the {batches[split]} of split {split}, got {limit}. "
+            (batches * limit if isinstance(limit, float) else limit) >= 1,
+            f"`trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
             "Leave it out to take all.",
         )
-    together = min(2, counts[TRAIN] // batches[TRAIN])
+    maps = dataset.map_count(TRAIN)
+    together = min(2, maps // -(-maps // config.batch_size))
     batch = MapDataset(dataset.path, TRAIN, ("rgb", *kind.fields)).read(range(together))
     try:
         with torch.no_grad():
