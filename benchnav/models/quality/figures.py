@@ -104,8 +104,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
     figure, pairs = _grid(shown, 3, 2.6, 0.35, heights=(3, 1))
     edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
     for (upper, lower), quality in pairs:
-        curve = quality.reliability
-        cells, confidence, accuracy = map(np.array, (curve.cells, curve.confidence, curve.accuracy))
+        cells, confidence, accuracy = map(np.array, quality.reliability.values())
         share, filled = cells / cells.sum(), cells > 0
         often = share >= _RARE
         few = filled & ~often

@@ -46,21 +46,6 @@ from benchnav.models.quality.scores import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reliability:
-    """How often the most likely class is right, by its probability, in equal bins of [0, 1].
-
-    Args:
-        cells: how many cells have their most likely class in each bin.
-        confidence: its mean probability; 0 in an empty bin.
-        accuracy: how often it is right; 0 in an empty bin.
-    """
-
-    cells: tuple[int, ...]
-    confidence: tuple[float, ...]
-    accuracy: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class ClassQuality:
     """Quality of class probabilities.
 
@@ -78,7 +63,8 @@ class ClassQuality:
             not a number where all or none are wrong.
         mutual_information_auroc: the same of mutual information.
         confusion: cells by true class (row) and most likely class (column), [C][C].
-        reliability: the curve that the ECE sums up.
+        reliability: the curve that the ECE sums up: in 15 equal bins of the probability of the most likely class how
+            many `cells` there are, their mean `confidence`, and the `accuracy`, both 0 in an empty bin.
         slope_cells: cells by true class and whole degree of slope, [C][90].
         look_alikes: with classes that look alike merged; None where no two do.
     """
@@ -93,7 +79,7 @@ class ClassQuality:
     entropy_auroc: float
     mutual_information_auroc: float
     confusion: tuple[tuple[int, ...], ...]
-    reliability: Reliability
+    reliability: dict[str, tuple[float, ...]]
     slope_cells: tuple[tuple[int, ...], ...]
     look_alikes: LookAlikeQuality | None = None
 
@@ -304,9 +290,11 @@ class _ClassTally:
             entropy_auroc=entropy_auroc,
             mutual_information_auroc=information_auroc,
             confusion=tuple(map(tuple, self.confusion.tolist())),
-            reliability=Reliability(
-                cells=tuple(map(int, cells)), confidence=tuple(confidence), accuracy=tuple(right)
-            ),
+            reliability={
+                "cells": tuple(map(int, cells)),
+                "confidence": tuple(confidence),
+                "accuracy": tuple(right),
+            },
             slope_cells=tuple(map(tuple, self.slope_cells.tolist())),
             look_alikes=self.look_alikes.quality() if self.look_alikes.groups else None,
         )

@@ -92,7 +92,7 @@ class SlopeTable:
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the tables by name, for a checkpoint."""
-        tables = {"mean": self.mean, "std": self.std, "noise_std": self.noise_std}
+        tables = {name: values for name, values in vars(self).items() if name != "soft"}
         soft = self.soft._asdict() if self.soft else {}
         return tables | {f"soft_{name}": values for name, values in soft.items()}
 
