@@ -146,8 +146,8 @@ class TerrainClassifier(TrainableNetwork):
     @classmethod
     def from_tensors(cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]) -> Self:
         """As `TrainableNetwork.from_tensors`; `config` may have a `temperature` too."""
-        settings = {"temperature": 1.0, **config}
-        temperature = settings.pop("temperature")
+        settings = dict(config)
+        temperature = settings.pop("temperature", 1.0)
         fits = isinstance(temperature, int | float) and 0 < temperature < math.inf
         expect(fits, f"a `temperature` > 0, got {temperature!r}.")
         model = super().from_tensors(settings, class_count, tensors)

@@ -1,5 +1,6 @@
 """The command `benchnav-train evaluate`: whether a model's probabilities can be trusted."""
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -121,7 +122,7 @@ def evaluate(
 def _check_targets(out: str, json: str, overwrite: bool) -> None:
     """Refuses what cannot be written to before any work is done."""
     from benchnav.core.errors import expect
-    from benchnav.core.store import output_path, refuse_taken, sole_writer
+    from benchnav.core.store import output_path, refuse_taken
 
     target, folder = output_path(json), output_path(out)
     expect(
@@ -131,8 +132,12 @@ def _check_targets(out: str, json: str, overwrite: bool) -> None:
     if out:
         refuse_taken(folder, overwrite, _foreign)
     for path in [target] * bool(json) + [folder / REPORT] * bool(out):
-        with sole_writer(path, str(path)):  # which leaves nothing behind
-            pass
+        nearest = next(parent for parent in path.absolute().parents if parent.exists())
+        try:
+            with tempfile.TemporaryFile(dir=nearest):
+                pass
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _foreign(folder: Path) -> str:
