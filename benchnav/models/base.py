@@ -6,7 +6,7 @@ Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, 
 
 import inspect
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import Any, TypeGuard
 
 from torch import Tensor
 
@@ -14,9 +14,7 @@ from benchnav.core.device import exact_convolutions
 from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
-
-if TYPE_CHECKING:
-    from benchnav.models.checkpoint import Checkpoint
+from benchnav.models.checkpoint import Checkpoint
 
 
 class TraversabilityModel(ABC):
@@ -54,11 +52,11 @@ class ModelFamily(TraversabilityModel):
 
     @classmethod
     @abstractmethod
-    def from_checkpoint(cls, checkpoint: "Checkpoint") -> "ModelFamily":
-        """Rebuilds a model.
+    def from_checkpoint(cls, checkpoint: Checkpoint) -> "ModelFamily":
+        """Rebuilds a model; what it raises ends in one line, where `load_model` calls it.
 
         Raises:
-            CheckpointError: a part is missing, or its tensors do not fit its settings.
+            CheckpointError: a part is missing.
         """
 
 

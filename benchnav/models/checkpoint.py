@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 import benchnav
-from benchnav.core.errors import BenchnavError, CheckpointError
+from benchnav.core.errors import CheckpointError
 from benchnav.core.store import (
     building,
     output_path,
@@ -45,25 +45,8 @@ CONFIG = "config.json"
 FUSED = "fused"
 CLASSIFIER, GP = "classifier", "gp"
 
-_KEPT = ("config", "seed", "metrics", "half_precision", "versions", "trainer")  # of a part, as they are
+_APART = ("tensors", "data_id", "data_digest")  # of a part; all else is written as it is
 _PACKAGES = ("torch", "lightning", "gpytorch", "segmentation-models-pytorch", "numpy")
-
-
-@contextmanager
-def refitting() -> Iterator[None]:
-    """Says of a model that is rebuilt from a checkpoint that its tensors do not fit its settings.
-
-    Raises:
-        CheckpointError: they do not.
-    """
-    try:
-        yield
-    except CheckpointError:
-        raise
-    except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
-        ) from error
 
 
 def _versions() -> dict[str, str]:
@@ -212,8 +195,6 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         names, pooled = config["class_names"], float(config.get("pool_temperature", 1.0))
         if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
             raise ValueError("class_names are no names of different classes")
-        if config["class_count"] != len(names):
-            raise ValueError("class_count is not the number of class_names")
         if not 0 < pooled < float("inf"):
             raise ValueError(f"pool_temperature is {pooled}")
         return Checkpoint(
@@ -290,7 +271,7 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
         content = safetensors.torch.save(_to_store(part.tensors, part.half_precision))
         with replacing(folder / f"{name}.safetensors") as partial:
             partial.write_bytes(content)
-        kept = {name: value for name, value in vars(part).items() if name in _KEPT and value is not None}
+        kept = {name: value for name, value in vars(part).items() if name not in _APART and value is not None}
         digest = hashlib.sha256(content).hexdigest()
         parts[name] = {**kept, "data": {"id": part.data_id, "digest": part.data_digest}, "sha256": digest}
     pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
@@ -307,12 +288,12 @@ def _write(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def _to_store(tensors: Mapping[str, Tensor], half: bool) -> dict[str, Tensor]:
-    # Kernels alone: running variances and biases are few, and may leave float16's range.
-    kept = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    return {
-        name: value.half() if half and value.is_floating_point() and value.ndim >= 2 else value.clone()
-        for name, value in kept.items()
-    }
+    stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    for name, value in stored.items():
+        # Kernels alone: running variances and biases are few, and may leave float16's range.
+        if half and value.is_floating_point() and value.ndim >= 2:
+            stored[name] = value.half()
+    return stored
 
 
 def _read_part(path: Path, data: Mapping[str, str], sha256: str, **entry: Any) -> Part:

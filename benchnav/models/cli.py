@@ -56,9 +56,10 @@ def train_gp(
         device: Where they are trained; auto takes CUDA where there is a GPU.
         overwrite: Replace GPs, or a checkpoint of other classes, that are there.
     """
+    from benchnav.models.training.fit import FitOptions
     from benchnav.models.training.gaussian_processes import train_gps
 
-    train_gps(data, out, gp, TrainOptions(seed=seed, device=device, overwrite=overwrite))
+    train_gps(data, out, gp, FitOptions(seed=seed, device=device, overwrite=overwrite))
 
 
 def train_all(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from benchnav.core.command import Device
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 
 DEEPEST = 5  # stages of the encoders of segmentation-models-pytorch
 
@@ -191,13 +191,11 @@ def check_seed(seed: int, count: int = 1) -> None:
     Raises:
         ConfigError: one of them is not in 0–2⁶³ − 1.
     """
-    if not 0 <= seed <= _SEEDS - count:
-        raise ConfigError(f"Expected `seed` in 0–{_SEEDS - count}, got {seed}.")
+    expect(0 <= seed <= _SEEDS - count, f"`seed` in 0–{_SEEDS - count}, got {seed}.")
 
 
 def _check(config: object, fits: bool, name: str, expected: str) -> None:
-    if not fits:
-        raise ConfigError(f"Expected `{name}` {expected}, got {getattr(config, name)!r}.")
+    expect(fits, f"`{name}` {expected}, got {getattr(config, name)!r}.")
 
 
 def _check_least(config: object, least: int, *names: str) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
-from benchnav.models.checkpoint import GP, Checkpoint, member_names, refitting
+from benchnav.models.checkpoint import GP, Checkpoint
 from benchnav.models.slope_gp.table import SlopeTable
 
 CHUNK_CELLS = 2**17
@@ -63,7 +63,7 @@ class FusedModel(ModelFamily):
         if soft := self.table.soft:
             owners = soft.weight.nonzero().flatten()
             group += tuple(owners.tolist())
-            share, mean, std = (v.to(weights).view(-1, 1, 1) for v in (soft.weight, soft.mean, soft.std))
+            share, mean, std = (values.to(weights).view(-1, 1, 1) for values in soft)
             second = (weights * share, mean.expand_as(weights), std.expand_as(weights))
             pairs = zip((weights * (1 - share), means, stds), second, strict=True)
             weights, means, stds = (torch.cat([main, other[:, owners]], 1) for main, other in pairs)
@@ -92,18 +92,12 @@ class FusedModel(ModelFamily):
         """Rebuilds the model from a checkpoint with GPs and one classifier or more.
 
         Raises:
-            CheckpointError: a half is missing, or its tensors do not fit its settings.
+            CheckpointError: a half is missing.
         """
-        from benchnav.models.nets.classifier import TerrainClassifier
+        from benchnav.models.nets.classifier import classifiers_of
 
-        names = checkpoint.class_names
-        members = [checkpoint.part(name) for name in member_names(checkpoint)]
-        tensors = checkpoint.part(GP).tensors
-        with refitting():
-            classifiers = [
-                TerrainClassifier.from_tensors(part.config, len(names), part.tensors) for part in members
-            ]
-            return cls(classifiers, SlopeTable.from_tensors(tensors), names, checkpoint.pool_temperature)
+        table = SlopeTable.from_tensors(checkpoint.part(GP).tensors)
+        return cls(classifiers_of(checkpoint), table, checkpoint.class_names, checkpoint.pool_temperature)
 
 
 def sharpen(probabilities: Tensor, temperature: float) -> Tensor:

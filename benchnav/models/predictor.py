@@ -9,15 +9,16 @@ Letters in shapes: K components.
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from benchnav.core import registry
-from benchnav.core.errors import CheckpointError, ConfigError
+from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
+from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -28,9 +29,6 @@ from benchnav.models.checkpoint import (
     read_config,
     refuse_unfinished,
 )
-
-if TYPE_CHECKING:
-    from benchnav.datagen.recipe.recipe import Recipe
 
 
 class Oracle(PrivilegedModel):
@@ -86,11 +84,11 @@ def load_model(source: Source) -> TraversabilityModel:
         if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
             refuse_unfinished(part, checkpoint.parts)
         return open_checkpoint(checkpoint)
-    if is_family(registry.find("model", part.part).target):
-        raise ConfigError(
-            f"Expected a model, got {part.part!r}, which is a family of models. "
-            "Name a checkpoint of it, by its path if it bears the same name."
-        )
+    expect(
+        not is_family(registry.find("model", part.part).target),
+        f"a model, got {part.part!r}, which is a family of models. "
+        "Name a checkpoint of it, by its path if it bears the same name.",
+    )
     return registry.make("model", part)
 
 
@@ -109,7 +107,14 @@ def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
             f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
             f"{checkpoint.model!r}. Install the package that registers it."
         )
-    return family.from_checkpoint(checkpoint)
+    try:
+        return family.from_checkpoint(checkpoint)
+    except CheckpointError:
+        raise
+    except (BenchnavError, KeyError, RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"Expected tensors that fit the checkpoint's settings, got: {str(error)[:300]}. Train the model again."
+        ) from error
 
 
 def find_checkpoint(source: str | Path) -> Path:
@@ -196,7 +201,7 @@ def trained_on(source: Source) -> dict[str, str]:
     return found
 
 
-def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: "Recipe", name: str = "the model") -> str:
+def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name: str = "the model") -> str:
     """Tells in one line when a model knows another class table than that of the data.
 
     Args:
@@ -226,8 +231,7 @@ def _as_part(source: Source) -> registry.Part | Path:
     if (":" in part.part or part.part.endswith(".py")) and not (Path(part.part) / CONFIG).is_file():
         return part
     folder = find_checkpoint(part.part)
-    if part.options:
-        raise ConfigError(f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
+    expect(not part.options, f"no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
     return folder
 
 

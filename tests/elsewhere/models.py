@@ -30,7 +30,7 @@ from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
-from benchnav.models.training.data import VALID, MapDataset, read_maps
+from benchnav.models.training.data import VALID, MapDataset
 from benchnav.models.training.fit import FitOptions
 from benchnav.models.training.networks import fit_network
 from tests.elsewhere.device import elsewhere, waits
@@ -91,7 +91,7 @@ def test_a_model_is_measured_on_another_device_as_here(
 def test_temperatures_are_fitted_on_another_device_as_here(
     dataset: TerrainDataset, checkpoint_path: Path
 ) -> None:
-    maps, members = read_maps(dataset, VALID), pair(checkpoint_path).classifiers
+    maps, members = MapDataset(dataset.path, VALID), pair(checkpoint_path).classifiers
     here = fit_temperature(*sample_logits(members[0], maps, 3)), fit_pool_temperature(members, maps, 3)
     with elsewhere() as device:
         logits, class_id = sample_logits(members[0], maps, 3, device)
@@ -107,7 +107,10 @@ def test_networks_are_measured_in_training_on_another_device_as_here(
     dataset: TerrainDataset, checkpoint_path: Path
 ) -> None:
     classifier, mdn = pair(checkpoint_path).classifiers[0], network()
-    maps, all_maps = read_maps(dataset, VALID), read_maps(dataset, VALID, ("slope_deg", "traversability"))
+    maps, all_maps = (
+        MapDataset(dataset.path, VALID),
+        MapDataset(dataset.path, VALID, ("rgb", "slope_deg", "traversability")),
+    )
     here = classifier.measure(maps) | mdn.measure(all_maps)
     with elsewhere() as device:
         there = classifier.to(device).measure(maps) | mdn.to(device).measure(all_maps)

@@ -21,9 +21,8 @@ from benchnav.models.base import predict
 from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.config import ClassifierConfig
-from benchnav.models.fused import FusedModel
 from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.predictor import find_checkpoint, load_model
+from benchnav.models.predictor import find_checkpoint, load_model, open_checkpoint
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
 from benchnav.testing.model import check_model
 from tests.models.stub import true_table
@@ -190,10 +189,10 @@ def test_tensors_that_do_not_fit_their_settings_are_refused(folder: Path) -> Non
         {"max_epochs": "many"},
     ):
         with pytest.raises(CheckpointError, match="Train the model again"):
-            FusedModel.from_checkpoint(there.with_part("classifier", replace(part, config=config)))
+            open_checkpoint(there.with_part("classifier", replace(part, config=config)))
     fewer = replace(there, class_names=there.class_names[:3])
     with pytest.raises(CheckpointError, match="fit the checkpoint"):
-        FusedModel.from_checkpoint(fewer)
+        open_checkpoint(fewer)
 
 
 def test_no_weights_are_downloaded_for_a_pretrained_checkpoint(folder: Path) -> None:

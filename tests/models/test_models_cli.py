@@ -21,7 +21,7 @@ from benchnav.models.nets.classifier import (
 )
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
-from benchnav.models.training.data import read_maps
+from benchnav.models.training.data import MapDataset
 from tests.models.support import make_dataset
 
 QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
@@ -208,7 +208,7 @@ def test_a_log_with_few_rows_of_a_class_is_told_in_one_line(
         told = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
         assert len(told) == (name == "few")
         if told:
-            assert "few.csv has fewer than 10 rows of some classes (mud 1, sand 1)" in told[0]
+            assert "few.csv has fewer than 10 rows of 2 of 3 classes (mud 1, sand 1)" in told[0]
 
 
 def test_a_damaged_checkpoint_is_replaced_by_gps_of_a_log_where_that_is_asked_for(
@@ -238,7 +238,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
     command = ["gp", "--data", tmp_path / "logs.csv", "--out", folder, *QUICK_GP]
     assert call(monkeypatch, *command, "--overwrite") == 0
     first, *rest = capfd.readouterr().err.splitlines()
-    assert f"no rows of 2 of 10 classes ({names[0]}, {names[1]}); their GPs become the prior" in first
+    assert f"fewer than 10 rows of 2 of 10 classes ({names[0]} 0, {names[1]} 0); their GPs" in first
     assert f"what {folder} had learned of them is dropped" in first
     assert not any("warning" in line for line in rest)
 
@@ -246,7 +246,7 @@ def test_classes_without_rows_are_told_before_what_was_learned_of_them_is_droppe
     save_checkpoint(tmp_path / "alone", replace(there, parts={"classifier": there.part("classifier")}))
     assert call(monkeypatch, *command[:4], tmp_path / "alone", *QUICK_GP) == 0
     err = capfd.readouterr().err
-    assert "no rows of 2 of 10 classes" in err
+    assert "rows of 2 of 10 classes" in err
     assert "dropped" not in err
 
 
@@ -321,7 +321,7 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    folder, valid = tmp_path / "c", read_maps(dataset, "valid")
+    folder, valid = tmp_path / "c", MapDataset(dataset.path, "valid")
     small = ["--classifier.encoder_depth", "3", "--classifier.decoder_channels", "[16, 16, 8]", "--seed", "4"]
     command = ["all", "--data", dataset.path, "--out", folder, *QUICK_GP, *QUICK_CLASSIFIER, *small]
     found = []
@@ -352,7 +352,7 @@ def test_what_is_stored_is_what_was_measured_and_calibrated(
     where = ["--data", dataset.path, "--out", tmp_path / "c"]
     small = ["--classifier.encoder_depth", "3", "--half_precision", str(half_precision).lower()]
     assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER, *small) == 0
-    part, valid = load_checkpoint(tmp_path / "c").part("classifier"), read_maps(dataset, "valid")
+    part, valid = load_checkpoint(tmp_path / "c").part("classifier"), MapDataset(dataset.path, "valid")
     assert part.half_precision == half_precision
     plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, 10, part.tensors)
     assert part.config["temperature"] == fit_temperature(*sample_logits(plain, valid))

@@ -29,10 +29,10 @@ from torchmetrics.classification import MulticlassAccuracy, MulticlassJaccardInd
 
 from benchnav.core import rng
 from benchnav.core.device import CPU, exact_convolutions
-from benchnav.core.errors import ConfigError, DatasetError, quiet
+from benchnav.core.errors import ConfigError, DatasetError, expect, quiet
 from benchnav.core.settings import hint, one_line
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.checkpoint import CLASSIFIER
+from benchnav.models.checkpoint import CLASSIFIER, Checkpoint, member_names
 from benchnav.models.config import DEEPEST, ClassifierConfig
 from benchnav.models.nets.trainable import NO_SCALE, MapScale, TrainableNetwork
 
@@ -146,13 +146,23 @@ class TerrainClassifier(TrainableNetwork):
     @classmethod
     def from_tensors(cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]) -> Self:
         """As `TrainableNetwork.from_tensors`; `config` may have a `temperature` too."""
-        settings = {"temperature": 1.0, **config}
-        temperature = settings.pop("temperature")
-        if not isinstance(temperature, int | float) or not 0 < temperature < math.inf:
-            raise ConfigError(f"Expected a `temperature` > 0, got {temperature!r}.")
+        settings = dict(config)
+        temperature = settings.pop("temperature", 1.0)
+        fits = isinstance(temperature, int | float) and 0 < temperature < math.inf
+        expect(fits, f"a `temperature` > 0, got {temperature!r}.")
         model = super().from_tensors(settings, class_count, tensors)
         model.temperature = float(temperature)
         return model
+
+
+def classifiers_of(checkpoint: Checkpoint) -> list[TerrainClassifier]:
+    """Rebuilds the classifiers of a checkpoint, in order.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    parts, classes = map(checkpoint.part, member_names(checkpoint)), len(checkpoint.class_names)
+    return [TerrainClassifier.from_tensors(part.config, classes, part.tensors) for part in parts]
 
 
 def fit_temperature(logits: Tensor, class_id: Tensor) -> float:
@@ -207,7 +217,6 @@ def sample_logits(
     Raises:
         DatasetError: there is no such cell.
     """
-    cells = maps.shape[0] * maps.shape[1]
     kept = max(1, _MOST_CELLS // len(maps))
     key = rng.stream_key(seed, "models", "temperature")
     found, classifier = [], classifier.to(device)
@@ -215,7 +224,8 @@ def sample_logits(
         for indices, some in maps.chunks(device):
             logits, class_id = classifier(some["rgb"]).float().flatten(2), some["class_id"].flatten(1).long()
             for place, which in enumerate(indices):
-                order = torch.from_numpy(rng.permutation(key, np.array([which]), cells)[0]).to(device)
+                cells = rng.permutation(key, np.array([which]), class_id.shape[1])[0]
+                order = torch.from_numpy(cells).to(device)
                 drawn = order[class_id[place, order] != UNLABELLED][:kept]
                 found.append((logits[place][:, drawn].T.clone(), class_id[place, drawn]))
     logits, class_id = (torch.cat(parts) for parts in zip(*found, strict=True))
@@ -264,11 +274,11 @@ def build_network(config: ClassifierConfig, class_count: int, seed: int) -> nn.M
     _check_names(config)
     known = inspect.signature(smp.MODEL_ARCHITECTURES_MAPPING[config.architecture]).parameters
     own = known["decoder_channels"].default if "decoder_channels" in known else None
-    if config.decoder_channels and not isinstance(own, tuple):
-        raise ConfigError(
-            f"Expected no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
-            f"got {list(config.decoder_channels)}. Leave them out."
-        )
+    expect(
+        isinstance(own, tuple) or not config.decoder_channels,
+        f"no `decoder_channels` for architecture {config.architecture}, which has no such setting, "
+        f"got {list(config.decoder_channels)}. Leave them out.",
+    )
     # What is not asked for is left to the architecture; at a lesser depth it would have too many channels.
     size: dict[str, Any] = {"decoder_channels": config.decoder_channels} if config.decoder_channels else {}
     if config.encoder_depth < DEEPEST:

@@ -8,7 +8,6 @@ limited dependent variables". Letters in shapes: B maps, H×W cells, K component
 """
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +16,7 @@ from torchmetrics import MeanSquaredError
 from benchnav.core.mixture import TraversabilityMixture, component_log_prob
 from benchnav.core.terrain import Observation
 from benchnav.models.base import ModelFamily
-from benchnav.models.checkpoint import Checkpoint, refitting
+from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.nets.trainable import NO_SCALE, MapScale, TrainableNetwork
@@ -28,26 +27,6 @@ LEAST_STD = 0.01
 _FIRST_STD, _FIRST_SPREAD = 0.2, 0.1
 _FEATURES = 32
 _CHUNK_CELLS = 2**17
-
-
-class LogNormalCDF(torch.autograd.Function):
-    """log Φ(z) with the gradient φ/Φ as √(2/π) / erfcx(−z/√2).
-
-    That of `torch.special.log_ndtr` takes the difference of two squares: in float32 it is 5 % off at
-    z = −10³ and of no use from −10⁴ on, and a component of small width that lies far off gets there.
-    """
-
-    @staticmethod
-    def forward(context: Any, z: Tensor) -> Tensor:
-        """log Φ(z), shape of `z`."""
-        context.save_for_backward(z)
-        return torch.special.log_ndtr(z)
-
-    @staticmethod
-    def backward(context: Any, *gradients: Tensor) -> Tensor:
-        """Gradient by z."""
-        (z,) = context.saved_tensors
-        return gradients[0] * math.sqrt(2 / math.pi) / torch.special.erfcx(-z / math.sqrt(2))
 
 
 def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Tensor) -> Tensor:
@@ -67,7 +46,7 @@ def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Ten
     seen = observed.isfinite()
     # A cell left out needs some value that is finite: NaN times 0 would reach the gradients.
     at = torch.where(seen, observed, 0.5).unsqueeze(1)
-    component = component_log_prob(means, stds, at, LogNormalCDF.apply)
+    component = component_log_prob(means, stds, at)
     total = torch.logsumexp(component + log_weights, dim=1)
     return -torch.where(seen, total, 0.0).sum() / seen.sum().clamp(min=1)
 
@@ -175,8 +154,7 @@ class MixtureDensityModel(ModelFamily):
         """Rebuilds the model from a checkpoint with a part `mdn`.
 
         Raises:
-            CheckpointError: the part is missing, or its tensors do not fit its settings.
+            CheckpointError: the part is missing.
         """
         part = checkpoint.part(MDN)
-        with refitting():
-            return cls(MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors))
+        return cls(MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors))

@@ -36,19 +36,17 @@ def evaluate(
     """
     from benchnav import __version__
     from benchnav.core.command import show_progress
-    from benchnav.core.errors import ConfigError
+    from benchnav.core.errors import expect
     from benchnav.core.store import write_text
     from benchnav.core.tables import print_table
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
-    if maps < 0:
-        raise ConfigError(f"Expected `maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
+    expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
     _check_targets(out, json, overwrite)
     dataset = TerrainDataset(find_dataset(data))
-    if splits == []:
-        raise ConfigError(f"Expected `splits` among {', '.join(dataset.splits)}, got none.")
+    expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
 
     from benchnav.core.device import find_device
     from benchnav.core.figures import save_twice
@@ -123,14 +121,14 @@ def evaluate(
 
 def _check_targets(out: str, json: str, overwrite: bool) -> None:
     """Refuses what cannot be written to before any work is done."""
-    from benchnav.core.errors import ConfigError
+    from benchnav.core.errors import expect
     from benchnav.core.store import output_path, refuse_taken
 
     target, folder = output_path(json), output_path(out)
-    if json and (not target.parent.is_dir() or target.is_dir()):
-        raise ConfigError(
-            f"Expected `json` to be a file in a folder that exists, got {json}. Make {target.parent} first."
-        )
+    expect(
+        not json or (target.parent.is_dir() and not target.is_dir()),
+        f"`json` to be a file in a folder that exists, got {json}. Make {target.parent} first.",
+    )
     if out:
         refuse_taken(folder, overwrite, _foreign)
     for path in [target] * bool(json) + [folder / REPORT] * bool(out):

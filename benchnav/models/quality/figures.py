@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -29,7 +30,8 @@ from benchnav.core.figures import (
     styled,
 )
 from benchnav.datagen.recipe.classes import TerrainClass
-from benchnav.datagen.recipe.latent import expected_traversability, latent_mean
+from benchnav.datagen.recipe.latent import expected_of
+from benchnav.datagen.recipe.latent import truth as true_distribution
 from benchnav.models.quality.measure import ClassQuality, TraversabilityQuality
 from benchnav.models.quality.scores import CONFIDENCE_BINS, LEVEL, PIT_BINS
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
@@ -41,19 +43,19 @@ _BAND = "0.82"
 _RARE = 1e-3
 _NEAR = 0.01  # to the ideal; finer differences fill no panel
 
-# Title, the quantity of ClassQuality or TraversabilityQuality, and its ideal where that is not an end.
-_CLASS_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
-    ("Accuracy", "accuracy", None),
-    ("Calibration error (ECE)", "ece", None),
-    ("Mean entropy [nats]", "entropy", None),
-    ("AUROC of uncertainty", "entropy_auroc", None),
+# Title, and the quantity of ClassQuality or TraversabilityQuality.
+_SEVERITY = (
+    ("Accuracy", "accuracy"),
+    ("Calibration error (ECE)", "ece"),
+    ("Mean entropy [nats]", "entropy"),
+    ("AUROC of uncertainty", "entropy_auroc"),
+    ("RMSE of E[λ]", "rmse_expected"),
+    ("CRPS of λ", "crps"),
+    ("In the 90 % interval", "coverage"),
+    ("Under VaR at 0.9", "tail_rate"),
 )
-_LATENT_SEVERITY: tuple[tuple[str, str, float | None], ...] = (
-    ("RMSE of E[λ]", "rmse_expected", None),
-    ("CRPS of λ", "crps", None),
-    ("In the 90 % interval", "coverage", 0.9),
-    ("Under VaR at 0.9", "tail_rate", 0.1),
-)
+_IDEALS = {"coverage": 0.9, "tail_rate": 0.1}  # that are not an end
+_OF_CLASSES = 4  # the first so many
 
 
 @styled()
@@ -65,19 +67,18 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
         names: of the C classes.
     """
     most = 3 if len(qualities) > 2 else 2
-    titles = [f"{split}: accuracy {quality.accuracy:.3f}" for split, quality in qualities.items()]
-    ragged = len(titles) > most and len(titles) % most  # panels that end above hold the names of columns too
+    shown = [(f"{split}: accuracy {quality.accuracy:.3f}", quality) for split, quality in qualities.items()]
+    ragged = len(shown) > most and len(shown) % most  # panels that end above hold the names of columns too
     high = 2.2 if most == 3 else 3.1
-    figure, panels = _grid(titles, most, high, 1.25 if ragged else 0.7, share_y=True)
+    figure, panels = _grid(shown, most, high, 1.25 if ragged else 0.7, share_y=True)
     labels = [name.replace("_", " ") for name in names]
     palette = matplotlib.colormaps["Blues"].with_extremes(bad="0.85")
-    for (panel,), quality in zip(panels, qualities.values(), strict=True):
+    for (panel,), quality in panels:
         counts = np.array(quality.confusion, dtype=np.float64)
         with np.errstate(invalid="ignore"):
             shares = 100 * counts / counts.sum(1, keepdims=True)
         image = panel.imshow(shares, cmap=palette, vmin=0, vmax=100)
-        shown = np.argwhere(shares >= 0.5) if len(names) <= _MOST_NUMBERED else ()
-        for row, column in shown:
+        for row, column in np.argwhere(shares >= 0.5) if len(names) <= _MOST_NUMBERED else ():
             share = shares[row, column]
             colour = "white" if share > 55 else "black"
             panel.text(column, row, f"{share:.0f}", size=_SMALL, color=colour, ha="center", va="center")
@@ -87,7 +88,7 @@ def confusion_figure(qualities: Mapping[str, ClassQuality], names: Sequence[str]
     figure.supxlabel("most likely class")
     figure.supylabel("true class")
     # Beside the upper right panel, and as high as its square, which is less than the room that it is given.
-    beside = panels[min(len(panels), most) - 1][0].inset_axes((1.04, 0, 0.05, 1))
+    beside = panels[min(len(panels), most) - 1][0][0].inset_axes((1.04, 0, 0.05, 1))
     figure.colorbar(image, cax=beside, label="share of the true class [%]")
     return figure
 
@@ -99,12 +100,11 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
     Args:
         qualities: by split.
     """
-    titles = [f"{split}: ECE {quality.ece:.3f}" for split, quality in qualities.items()]
-    figure, pairs = _grid(titles, 3, 2.6, 0.35, heights=(3, 1))
+    shown = [(f"{split}: ECE {quality.ece:.3f}", quality) for split, quality in qualities.items()]
+    figure, pairs = _grid(shown, 3, 2.6, 0.35, heights=(3, 1))
     edges = np.linspace(0, 1, CONFIDENCE_BINS + 1)
-    for (upper, lower), quality in zip(pairs, qualities.values(), strict=True):
-        curve = quality.reliability
-        cells, confidence, accuracy = map(np.array, (curve.cells, curve.confidence, curve.accuracy))
+    for (upper, lower), quality in pairs:
+        cells, confidence, accuracy = map(np.array, quality.reliability.values())
         share, filled = cells / cells.sum(), cells > 0
         often = share >= _RARE
         few = filled & ~often
@@ -120,7 +120,7 @@ def reliability_figure(qualities: Mapping[str, ClassQuality]) -> Figure:
         lower.bar(edges[:-1], share, 1 / CONFIDENCE_BINS, align="edge", color=SKY, ec="white", lw=0.4)
         lower.set(ylim=(0, 1), yticks=[0, 1])
         lower.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-    for upper, lower in pairs[::3]:
+    for (upper, lower), _ in pairs[::3]:
         upper.set_ylabel("how often right")
         lower.set_ylabel("cells")
     figure.align_ylabels()
@@ -139,18 +139,19 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
     Args:
         qualities: by split.
     """
-    figure, panels = _grid(list(qualities), 3, 1.75, 0.45 if len(qualities) > 2 else 0.65)
+    figure, panels = _grid(list(qualities.items()), 3, 1.75, 0.45 if len(qualities) > 2 else 0.65)
     edges = np.linspace(0, 1, PIT_BINS + 1)
     tail = round((1 - LEVEL) * PIT_BINS)
-    for (panel,), quality in zip(panels, qualities.values(), strict=True):
+    for (panel,), quality in panels:
         counts = np.array(quality.pit)
         level = counts.sum() / PIT_BINS
-        low, high = (bound / level for bound in binom.interval(0.9, counts.sum(), 1 / PIT_BINS))
+        density = counts / level
+        low, high = np.array(binom.interval(0.9, counts.sum(), 1 / PIT_BINS)) / level
         for first, last, colour, label in (
             (0, tail, ORANGE, "observed, under VaR at 0.9"),
             (tail, PIT_BINS, SKY, "observed"),
         ):
-            heights, ends = counts[first:last] / level, edges[first : last + 1]
+            heights, ends = density[first:last], edges[first : last + 1]
             panel.stairs(heights, ends, baseline=1, fill=True, color=colour, alpha=0.75, lw=0, label=label)
             panel.stairs(heights, ends, baseline=None, color=colour, lw=1)
         panel.axhline(1, color="black", lw=0.7, label="calibrated")
@@ -163,7 +164,7 @@ def pit_figure(qualities: Mapping[str, TraversabilityQuality]) -> Figure:
             f"in 5–95 %: {quality.coverage:.3f} (ideally 0.9)\nunder VaR: {quality.tail_rate:.3f} (ideally 0.1)",
             size=TEXT, ha="center", va="top", transform=panel.transAxes, linespacing=1.3,
         )  # fmt: skip
-        lowest, highest = min(0.95, *(counts / level)), max(1.05, *(counts / level))
+        lowest, highest = min(0.95, *density), max(1.05, *density)
         room = highest - lowest
         panel.set(xlim=(0, 1), ylim=(lowest - 0.1 * room, highest + 0.5 * room), xticks=[0, 0.5, 1])
         panel.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
@@ -189,9 +190,9 @@ def severity_figure(
         for severity, split in series
     )
     measured = table.dropna(axis=1)
-    quantities = [*_CLASS_SEVERITY * ("accuracy" in measured), *_LATENT_SEVERITY]
-    figure, panels = _grid([title for title, *_ in quantities], 4, 1.65, 0.45)
-    for (panel,), (_, name, ideal) in zip(panels, quantities, strict=True):
+    quantities = _SEVERITY if "accuracy" in measured else _SEVERITY[_OF_CLASSES:]
+    figure, panels = _grid(quantities, 4, 1.65, 0.45)
+    for (panel,), name in panels:
         for place, (scenario, own) in enumerate(table.groupby("scenario", sort=False)):
             look: dict[str, Any] = {
                 "color": LINE_COLOURS[place % len(LINE_COLOURS)], "marker": MARKERS[place % len(MARKERS)],
@@ -203,7 +204,7 @@ def severity_figure(
                 others = own["mutual_information_auroc"]
                 panel.plot(own["severity"], others, ls=":", mfc="white", **look, label=words)
         panel.margins(x=0.05, y=0.12)
-        if ideal is not None:
+        if ideal := _IDEALS.get(name):
             panel.axhline(ideal, color="0.4", lw=0.8, ls="--", label="calibrated")
             low, high = panel.get_ylim()
             panel.set_ylim(min(low, ideal - _NEAR), max(high, ideal + _NEAR))
@@ -229,21 +230,21 @@ def latent_figure(
         slope_cells: measured cells by true class and whole degree of slope, [C][90].
         truth: whether they are.
     """
-    titles = [item.name.replace("_", " ") for item in classes]
-    figure, panels = _grid(titles, 5, 1.55, 0.5 if len(titles) > 4 else 1.0, share_y=True)
-    slopes = table_slopes().numpy()
-    shown = slopes <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))
-    parts = [table.mean, table.std, table.noise_std]
-    parts += [table.soft.weight, table.soft.mean, table.soft.std] if table.soft else []
-    means, stds, noise, *soft = (values.double().cpu().numpy() for values in parts)
-    x = slopes[shown]
-    for number, ((panel,), item) in enumerate(zip(panels, classes, strict=True)):
-        mean, std = means[number, shown], stds[number, shown]
+    shown = [(item.name.replace("_", " "), item) for item in classes]
+    figure, panels = _grid(shown, 5, 1.55, 0.5 if len(shown) > 4 else 1.0, share_y=True)
+    x = table_slopes().numpy()
+    x = x[x <= max(10.0, 1.15 * max(_steeper_than(cells, 0) for cells in slope_cells))]
+    class_id, slopes = np.broadcast_arrays(np.arange(len(classes))[:, None, None], x)
+    mixture = table.own(torch.tensor(class_id), torch.tensor(slopes))
+    weights, means, stds = (v.numpy() for v in (mixture.weights, mixture.means, mixture.stds))
+    true = true_distribution(class_id, slopes, tuple(classes))
+    expected, true_expected = expected_of((weights, means, stds)), expected_of(true)
+    noise = table.noise_std.double().cpu().numpy()
+    for number, ((panel,), item) in enumerate(panels):
+        mean, std = means[number, 0, 0], stds[number, 0, 0]
         latent = np.sqrt(np.maximum(std**2 - noise[number] ** 2, 0))
         panel.plot(x, mean, color=BLUE, lw=1.1, label="GP mean")
-        second = [values[number] for values in soft]
-        expected = _expected(mean, std, *second)
-        panel.plot(x, expected, color=ORANGE, lw=1.1, label="predicted E[λ]")
+        panel.plot(x, expected[number, 0], color=ORANGE, lw=1.1, label="predicted E[λ]")
         for spread, colour, alpha, label in (
             (std, SKY, 0.3, "± 2σ with noise"),
             (latent, BLUE, 0.45, "± 2σ of the latent function"),
@@ -252,14 +253,11 @@ def latent_figure(
             panel.fill_between(x, low, high, color=colour, alpha=alpha, lw=0, label=label)
         words = f"σ {noise[number]:.3f}"
         if truth:
-            true = latent_mean(np.full(len(x), number), x, tuple(classes))
-            panel.plot(x, true, color="black", lw=0.9, ls="--", label="true latent function")
-            true_soft = (item.soft.weight, item.soft.mean, item.soft.std) if item.soft else ()
-            expected = _expected(true, np.full_like(x, item.noise), *true_soft)
-            panel.plot(x, expected, color="black", lw=1, ls=":", label="true E[λ]")
+            panel.plot(x, true[1][number, 0, 0], color="black", lw=0.9, ls="--", label="true latent function")
+            panel.plot(x, true_expected[number, 0], color="black", lw=1, ls=":", label="true E[λ]")
             words += f" ({item.noise:.3f})"
-        if soft and second[0]:
-            panel.axhline(second[1], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
+        if weights[number, 0, 0, 0] < 1:
+            panel.axhline(means[number, 1, 0, 0], color=BLUE, lw=0.9, ls="-.", label="mean of soft spots")
         for share, shade, label in (
             (_RARE, 0.12, "steeper: 1 cell in 1000"),
             (0.0, 0.25, "steeper: no cell of the class"),
@@ -267,20 +265,11 @@ def latent_figure(
             steeper = _steeper_than(slope_cells[number], share)
             panel.axvspan(steeper, 90, color="0.4", alpha=shade, lw=0, label=label)
         panel.text(0.05, 0.05, words, size=TEXT, transform=panel.transAxes)
-    panels[0][0].set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
+        panel.set(xlim=(0, x[-1]), ylim=(-0.45, 1.45), yticks=[0, 0.5, 1])
     figure.supxlabel(f"slope [°]  (σ: noise{', in brackets the true one' if truth else ''})")
     figure.supylabel("traversability")
     _explain(figure)
     return figure
-
-
-def _expected(mean: np.ndarray, std: np.ndarray, *soft: float) -> np.ndarray:
-    """E[λ] of ground; of that with soft spots, these have a weight, a mean and a standard deviation."""
-    firm = expected_traversability(mean, std)
-    if not soft:
-        return firm
-    weight, soft_mean, soft_std = soft
-    return (1 - weight) * firm + weight * expected_traversability(np.array([soft_mean]), np.array([soft_std]))
 
 
 def _steeper_than(cells: Sequence[int], share: float) -> float:
@@ -290,29 +279,29 @@ def _steeper_than(cells: Sequence[int], share: float) -> float:
 
 
 def _grid(
-    titles: Sequence[str],
+    shown: Sequence[tuple[str, Any]],
     most: int,
     high: float,
     rest: float,
     heights: Sequence[float] = (1,),
     share_y: bool = False,
-) -> tuple[Figure, list[list[Axes]]]:
-    """A figure of titled places, at most so many side by side, each so high, and with room for the rest.
+) -> tuple[Figure, list[tuple[list[Axes], Any]]]:
+    """A figure of places for things by title, at most so many side by side, each so high, and with room for the rest.
 
-    A place holds panels under each other, whose heights are as given. The figure has the width that its places need,
-    and that of its legend.
+    Beside each place stands what it is to show. A place holds panels under each other, whose heights are as given. The
+    figure has the width that its places need, and that of its legend.
     """
-    columns = min(len(titles), most)
-    rows = -(-len(titles) // columns)
+    columns = min(len(shown), most)
+    rows = -(-len(shown) // columns)
     width = max(TWO_COLUMNS_IN * (columns / most), _LEAST_WIDTH)
     figure = Figure(figsize=(width, rows * high + rest), layout="constrained")
     places = stack_panels(
-        figure, len(titles), columns, len(heights), sharex=True, sharey=share_y,
+        figure, len(shown), columns, len(heights), sharex=True, sharey=share_y,
         height_ratios=[*heights] * rows,
     )  # fmt: skip
-    for (panel, *_), title in zip(places, titles, strict=True):
+    for (panel, *_), (title, _) in zip(places, shown, strict=True):
         panel.set_title(title, parse_math=False)
-    return figure, places
+    return figure, [(place, item) for place, (_, item) in zip(places, shown, strict=True)]
 
 
 def _explain(figure: Figure, most: int = 4) -> None:

@@ -5,8 +5,7 @@ maps, H×W cells.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -45,8 +44,7 @@ _LAYERS: dict[str, tuple[str, str, str]] = {
 _SHOWN_SHARE = 0.995
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapSheet:
+class MapSheet(NamedTuple):
     """What a sheet shows.
 
     Args:
@@ -86,23 +84,18 @@ def read_sheet(
         if model.class_names:
             classes = mixture.class_probabilities(len(model.class_names))
             layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
+            layers["entropy"] = predictive_entropy(classes)
         layers |= {
             "expected_true" if known else "observed": true,
             "expected": mixture.mean(),
             "error" if known else "error_observed": mixture.mean() - true,
             "width": mixture.var(0.05) - mixture.var(0.95),
         }
-        if model.class_names:
-            layers["entropy"] = predictive_entropy(classes)
         members = model.member_probabilities(terrain.observe())
         if members is not None and len(members) > 1:
             layers["information"] = mutual_information(members)
-    return MapSheet(
-        split=split,
-        indices=tuple(indices),
-        extent_m=terrain.grid.extent_m,
-        layers={name: layer.cpu().numpy() for name, layer in layers.items()},
-    )
+    arrays = {name: layer.cpu().numpy() for name, layer in layers.items()}
+    return MapSheet(split, tuple(indices), terrain.grid.extent_m, arrays)
 
 
 def shared_scales(sheets: Sequence[MapSheet], classes: Sequence[TerrainClass]) -> dict[str, dict[str, Any]]:

@@ -6,6 +6,7 @@ cells of all maps.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -45,21 +46,6 @@ from benchnav.models.quality.scores import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reliability:
-    """How often the most likely class is right, by its probability, in equal bins of [0, 1].
-
-    Args:
-        cells: how many cells have their most likely class in each bin.
-        confidence: its mean probability; 0 in an empty bin.
-        accuracy: how often it is right; 0 in an empty bin.
-    """
-
-    cells: tuple[int, ...]
-    confidence: tuple[float, ...]
-    accuracy: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class ClassQuality:
     """Quality of class probabilities.
 
@@ -77,7 +63,8 @@ class ClassQuality:
             not a number where all or none are wrong.
         mutual_information_auroc: the same of mutual information.
         confusion: cells by true class (row) and most likely class (column), [C][C].
-        reliability: the curve that the ECE sums up.
+        reliability: the curve that the ECE sums up: in 15 equal bins of the probability of the most likely class how
+            many `cells` there are, their mean `confidence`, and the `accuracy`, both 0 in an empty bin.
         slope_cells: cells by true class and whole degree of slope, [C][90].
         look_alikes: with classes that look alike merged; None where no two do.
     """
@@ -92,7 +79,7 @@ class ClassQuality:
     entropy_auroc: float
     mutual_information_auroc: float
     confusion: tuple[tuple[int, ...], ...]
-    reliability: Reliability
+    reliability: dict[str, tuple[float, ...]]
     slope_cells: tuple[tuple[int, ...], ...]
     look_alikes: LookAlikeQuality | None = None
 
@@ -209,34 +196,32 @@ def measure(
         alike: of each class those that look like it, itself among them; empty where none do.
         truth: whether the maps' true distribution of λ is known.
     """
-    maps, sums = 0, torch.zeros(8, dtype=torch.float64)
-    histogram = torch.zeros(PIT_BINS, dtype=torch.int64)
-    count = len(model.class_names)
-    tally = None
+    maps, histogram = 0, torch.zeros(PIT_BINS, dtype=torch.int64)
+    sums: dict[str, float] = defaultdict(float)
+    tally = _ClassTally(len(model.class_names), alike)
     for terrain in chunks:
         mixture, members = _predict(model, terrain)
         scores, transformed = _score_cells(mixture, terrain, generator, isinstance(model, PrivilegedModel))
-        sums += scores
+        for name, score in scores.items():
+            sums[name] += score
         histogram += pit_counts(transformed)
         maps += len(terrain)
-        if count:
-            tally = tally or _ClassTally(count, terrain.rgb.device, alike)
-            tally.add(mixture.class_probabilities(count), members, terrain.class_id, terrain.slope_deg)
-    if not sums[0]:
+        if tally.count:
+            tally.add(mixture.class_probabilities(tally.count), members, terrain.class_id, terrain.slope_deg)
+    cells = sums["cells"]
+    if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
-    squared_observed, nll, score, covered, in_tail = (sums[1:6] / sums[0]).tolist()
+    means: Any = {name: sums[name] / cells for name in ("nll", "crps", "coverage", "tail_rate")}
+    known = truth and sums["labelled"]
     return Quality(
         maps=maps,
         traversability=TraversabilityQuality(
-            rmse_observed=squared_observed**0.5,
-            rmse_expected=float(sums[6] / sums[7]) ** 0.5 if truth else math.nan,
-            nll=nll,
-            crps=score,
-            coverage=covered,
-            tail_rate=in_tail,
+            rmse_observed=(sums["squares"] / cells) ** 0.5,
+            rmse_expected=(sums["expected_squares"] / known) ** 0.5 if known else math.nan,
+            **means,
             pit=tuple(histogram.tolist()),
         ),
-        classes=(tally.quality(),) if tally and tally.confusion.any() else (),
+        classes=(tally.quality(),) if tally.confusion.any() else (),
     )
 
 
@@ -254,19 +239,16 @@ class _ClassTally:
     """Counts of a model's class probabilities over maps, in the cells whose class is known.
 
     Args:
-        count: number of classes C.
-        device: where the maps are.
+        count: number of classes C, 0 of a model without any.
         alike: of each class those that look like it, itself among them; empty where none do.
     """
 
-    def __init__(self, count: int, device: torch.device, alike: Sequence[tuple[int, ...]]) -> None:
+    def __init__(self, count: int, alike: Sequence[tuple[int, ...]]) -> None:
         self.count, self.brier = count, 0.0
-        self.confusion = torch.zeros(count, count, dtype=torch.int64, device=device)
-        self.slope_cells = torch.zeros(count, 90, dtype=torch.int64, device=device)
-        self.reliability = ReliabilityCurve(device)
-        self.entropy = ErrorRanking(device)
-        self.information = ErrorRanking(device)
-        self.look_alikes = LookAlikeTally(alike, device) if any(len(own) > 1 for own in alike) else None
+        self.confusion = torch.zeros(count, count, dtype=torch.int64)
+        self.slope_cells = torch.zeros(count, 90, dtype=torch.int64)
+        self.reliability, self.look_alikes = ReliabilityCurve(), LookAlikeTally(alike)
+        self.entropy, self.information = ErrorRanking(), ErrorRanking()
 
     def add(self, probabilities: Tensor, members: Tensor, class_id: Tensor, slope_deg: Tensor) -> None:
         """Adds maps: probabilities [B, C, H, W], of members [M, B, C, H, W], true classes and slopes [B, H, W]."""
@@ -279,7 +261,7 @@ class _ClassTally:
             class_id, slope_deg = (layer[labelled][None, None] for layer in (class_id, slope_deg))
         found = probabilities.argmax(1)
         wrong = found != class_id
-        self.confusion += multiclass_confusion_matrix(found, class_id, self.count)
+        self.confusion += multiclass_confusion_matrix(found, class_id, self.count).cpu()
         self.brier += float(brier_score(probabilities, class_id).double().sum())
         self.reliability.update(probabilities, class_id)
         self.entropy.update(predictive_entropy(probabilities), wrong)
@@ -287,8 +269,8 @@ class _ClassTally:
             self.information.update(mutual_information(members), wrong)
         degree = slope_deg.floor().long().clamp(0, 89)
         counted = torch.bincount((90 * class_id + degree).flatten(), minlength=self.slope_cells.numel())
-        self.slope_cells += counted.view_as(self.slope_cells)
-        if self.look_alikes:
+        self.slope_cells += counted.view_as(self.slope_cells).cpu()
+        if self.look_alikes.groups:
             self.look_alikes.add(probabilities, class_id)
 
     def quality(self) -> ClassQuality:
@@ -308,11 +290,13 @@ class _ClassTally:
             entropy_auroc=entropy_auroc,
             mutual_information_auroc=information_auroc,
             confusion=tuple(map(tuple, self.confusion.tolist())),
-            reliability=Reliability(
-                cells=tuple(map(int, cells)), confidence=tuple(confidence), accuracy=tuple(right)
-            ),
+            reliability={
+                "cells": tuple(map(int, cells)),
+                "confidence": tuple(confidence),
+                "accuracy": tuple(right),
+            },
             slope_cells=tuple(map(tuple, self.slope_cells.tolist())),
-            look_alikes=self.look_alikes.quality() if self.look_alikes else None,
+            look_alikes=self.look_alikes.quality() if self.look_alikes.groups else None,
         )
 
 
@@ -323,33 +307,32 @@ def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
 
 def _score_cells(
     mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator, privileged: bool
-) -> tuple[Tensor, Tensor]:
-    """What is summed over cells, float64, shape [8] on the CPU; and every PIT.
+) -> tuple[dict[str, float], Tensor]:
+    """What is summed over cells, by name; and every PIT.
 
-    The sums: cells, squared errors, NLL, CRPS, covered cells, cells in the tail, squared errors of E[λ], and the cells
-    of which these are. Cells whose λ was not observed are left out; of a privileged model, which says nothing where no
-    class is known, those without a class as well.
+    `expected_squares` are the squared errors of E[λ], of the `labelled` cells. Cells whose λ was not observed are left
+    out; of a privileged model, which says nothing where no class is known, those without a class as well.
     """
     labelled = terrain.class_id != UNLABELLED
     known = ~terrain.traversability.isnan()
     known = known & labelled if privileged else known
     if not bool(known.any()):
-        return torch.zeros(8, dtype=torch.float64), torch.zeros(0)
+        return {}, torch.zeros(0)
     mixture, observed = mixture.at(known), terrain.traversability[known].unsqueeze(0)
     expected, transformed = mixture.mean(), pit(mixture, observed, generator)
     cells = transformed.numel()
     errors = (expected - terrain.truth.at(known).mean())[0, labelled[known]].double().square()
-    sums: list[Any] = [
-        cells,
-        (expected - observed).double().square().sum(),
-        -mixture.log_prob(observed).double().sum(),
-        crps(mixture, observed).double().sum(),
-        coverage(transformed) * cells,
-        tail_rate(transformed) * cells,
-        errors.sum(),
-        errors.numel(),
-    ]
-    return torch.tensor([float(value) for value in sums], dtype=torch.float64), transformed
+    sums: dict[str, Any] = {
+        "cells": cells,
+        "squares": (expected - observed).double().square().sum(),
+        "nll": -mixture.log_prob(observed).double().sum(),
+        "crps": crps(mixture, observed).double().sum(),
+        "coverage": coverage(transformed) * cells,
+        "tail_rate": tail_rate(transformed) * cells,
+        "expected_squares": errors.sum(),
+        "labelled": errors.numel(),
+    }
+    return {name: float(value) for name, value in sums.items()}, transformed
 
 
 def nearest_colour(rgb: Tensor, colours: Tensor) -> Tensor:

@@ -182,7 +182,11 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
         headings=("split\n", "maps\n", *(COLUMNS[name][0] for name in names)),
         numbers=True,
         rows=tuple(
-            (split, str(qualities[split].maps), *map(_decimal, row))
+            (
+                split,
+                str(qualities[split].maps),
+                *(NOTHING if math.isnan(value) else f"{value:.4f}" for value in row),
+            )
             for split, row in zip(qualities, table[names].to_numpy(), strict=True)
         ),
         explained=(("split", "the maps that were measured; their number is under maps."), *explained),
@@ -211,17 +215,14 @@ def quality_csv(qualities: Mapping[str, Quality]) -> str:
 
     `std` stands at severity 0 with no scenario, as it begins every series.
     """
-    places = {
-        split: (scenario if severity else "", severity)
-        for scenario, series in find_series(qualities).items()
-        for severity, split in series
+    rows: dict[str, dict[str, Any]] = {
+        split: {"split": split, "scenario": "", "maps": quality.maps, **numbers(quality)}
+        for split, quality in qualities.items()
     }
-    rows = []
-    for split, quality in qualities.items():
-        scenario, severity = places.get(split, ("", math.nan))
-        place = {"split": split, "scenario": scenario, "severity": severity, "maps": quality.maps}
-        rows.append({**place, **numbers(quality)})
-    table = pd.DataFrame(rows, columns=["split", "scenario", "severity", "maps", *COLUMNS])
+    for scenario, series in find_series(qualities).items():
+        for severity, split in series:
+            rows[split] |= {"scenario": scenario if severity else "", "severity": severity}
+    table = pd.DataFrame(rows.values(), columns=["split", "scenario", "severity", "maps", *COLUMNS])
     if table[LOOK_ALIKES[0]].isna().all():
         table = table.drop(columns=list(LOOK_ALIKES))
     return table.replace((math.inf, -math.inf), math.nan).to_csv(index=False, float_format="%.6g")
@@ -362,10 +363,6 @@ def _everything(quality: Quality) -> dict[str, Any]:
         values |= asdict(item)
         values |= values.pop("look_alikes") or {}
     return values | asdict(quality.traversability)
-
-
-def _decimal(value: float) -> str:
-    return NOTHING if math.isnan(value) else f"{value:.4f}"
 
 
 def caption(figure: str, splits: Iterable[str]) -> tuple[str, str]:

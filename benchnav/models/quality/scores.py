@@ -30,7 +30,6 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.classification import multiclass_confusion_matrix
 
-from benchnav.core.device import CPU
 from benchnav.core.mixture import TraversabilityMixture
 
 LEVEL = 0.9
@@ -161,19 +160,19 @@ class ReliabilityCurve:
     Unlike torchmetrics' calibration error it keeps sums a bin rather than every cell.
     """
 
-    def __init__(self, device: torch.device = CPU) -> None:
+    def __init__(self) -> None:
         """Starts with no cells."""
-        self.sums = torch.zeros(3, CONFIDENCE_BINS, dtype=torch.float64, device=device)
+        self.sums = torch.zeros(3, CONFIDENCE_BINS, dtype=torch.float64)
 
     def update(self, probabilities: Tensor, class_id: Tensor) -> None:
         """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
         confidence, found = probabilities.max(1)
         terms = torch.stack([torch.ones_like(confidence), confidence, found == class_id]).double().flatten(1)
-        self.sums.index_add_(1, _bin(confidence, CONFIDENCE_BINS), terms)
+        self.sums.index_add_(1, _bin(confidence, CONFIDENCE_BINS).cpu(), terms.cpu())
 
     def compute(self) -> Tensor:
-        """Cells, mean confidence and accuracy of each bin, float64, shape [3, 15] on the CPU; 0 in empty bins."""
-        cells, confidence, right = self.sums.cpu()
+        """Cells, mean confidence and accuracy of each bin, float64, shape [3, 15]; 0 in empty bins."""
+        cells, confidence, right = self.sums
         filled = cells.clamp(min=1)
         return torch.stack([cells, confidence / filled, right / filled])
 
@@ -236,9 +235,9 @@ class ErrorRanking:
     need 262 144 thresholds for the same, all of which it goes through for each batch.
     """
 
-    def __init__(self, device: torch.device = CPU) -> None:
+    def __init__(self) -> None:
         """Starts with no cells."""
-        self.counts = torch.zeros(2, _PLACES, dtype=torch.int64, device=device)
+        self.counts = torch.zeros(2, _PLACES, dtype=torch.int64)
         self.total = 0.0
 
     def update(self, score: Tensor, wrong: Tensor) -> None:
@@ -246,7 +245,7 @@ class ErrorRanking:
         # The bits of a float ≥ 0, read as an integer, are in the order of the floats.
         place = score.float().clamp(min=0).abs().view(torch.int32).long() >> _DROPPED_BITS
         counted = torch.bincount((place + wrong * _PLACES).flatten(), minlength=2 * _PLACES)
-        self.counts += counted.view(2, _PLACES)
+        self.counts += counted.view(2, _PLACES).cpu()
         self.total += float(score.double().sum())
 
     def compute(self) -> tuple[float, float]:
@@ -283,25 +282,25 @@ class LookAlikeTally:
     """Counts of class probabilities over maps, look-alikes merged.
 
     Args:
-        alike: of each class those that look like it, itself among them.
-        device: where the maps are.
+        alike: of each class those that look like it, itself among them; empty where none do.
     """
 
-    def __init__(self, alike: Sequence[tuple[int, ...]], device: torch.device) -> None:
+    def __init__(self, alike: Sequence[tuple[int, ...]]) -> None:
         """Starts with no cells."""
         self.groups = sorted({own for own in alike if len(own) > 1})
         names = sorted({min(own) for own in alike})
-        self.merged = torch.tensor([names.index(min(own)) for own in alike], device=device)
+        self.merged = torch.tensor([names.index(min(own)) for own in alike])
         self.size = max(2, len(names))  # of fewer there are no scores
-        self.confusion = torch.zeros(self.size, self.size, dtype=torch.int64, device=device)
-        self.curve = ReliabilityCurve(device)
+        self.confusion = torch.zeros(self.size, self.size, dtype=torch.int64)
+        self.curve = ReliabilityCurve()
         self.distance, self.cells = 0.0, 0
 
     def add(self, probabilities: Tensor, class_id: Tensor) -> None:
         """Adds maps: class probabilities [B, C, H, W] and true classes [B, H, W]."""
+        kinds = self.merged.to(class_id.device)
         merged = torch.zeros_like(probabilities[:, :1]).repeat(1, self.size, 1, 1)
-        merged.index_add_(1, self.merged, probabilities)
-        self.confusion += multiclass_confusion_matrix(merged.argmax(1), self.merged[class_id], self.size)
+        merged.index_add_(1, kinds, probabilities)
+        self.confusion += multiclass_confusion_matrix(merged.argmax(1), kinds[class_id], self.size).cpu()
         for group in self.groups:
             match = class_id.unsqueeze(-1) == torch.tensor(group, device=class_id.device)  # [B, H, W, G]
             here = match.any(-1)

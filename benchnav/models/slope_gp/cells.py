@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,7 @@ from torch import Tensor
 
 from benchnav.core import rng
 from benchnav.core.batch import map_tensors
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.core.settings import hint
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
@@ -41,11 +41,10 @@ CHUNK_CELLS = 2**18
 BIN_DEG = 0.25
 INSIDE_BINS = 256
 ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
-COLUMNS = ("class", "slope_deg", "traversability")
-
 _BINS = round(90 / BIN_DEG) + 1
 _VALUES = INSIDE_BINS + 2
 _LIMITS = {"slope_deg": 90, "traversability": 1}
+COLUMNS = ("class", *_LIMITS)
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 _ENOUGH = 20  # rows of which some would be steeper than 1.6° if slopes were in degrees
 _MOST_CLASSES = 256  # class ids are stored in a byte
@@ -74,26 +73,17 @@ class Cells:
         return map_tensors(self, lambda values: values[which])
 
 
-def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor, class_count: int) -> Cells:
+def observed_cells(class_id: Tensor, slope_deg: Tensor, traversability: Tensor) -> Cells:
     """Takes out the cells whose slope and traversability were observed and whose class is known.
 
     Args:
         class_id: integers in [0, C), 255 where not known, any shape.
         slope_deg: slopes in [0, 90], NaN where not observed, shape of `class_id`.
         traversability: λ in [0, 1], NaN where not observed, shape of `class_id`.
-        class_count: C.
-
-    Raises:
-        ConfigError: they hold values out of range.
     """
     ids, slopes, values = (column.flatten() for column in (class_id, slope_deg, traversability))
     seen = ~(slopes.isnan() | values.isnan()) & (ids != UNLABELLED)
-    cells = Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
-    for name, most in (("class_id", class_count - 1), ("slope_deg", 90), ("traversability", 1)):
-        column = getattr(cells, name)
-        if not bool(((column >= 0) & (column <= most)).all()):
-            raise ConfigError(f"Expected `{name}` within [0, {most}], got values outside it.")
-    return cells
+    return Cells(class_id=ids[seen].long(), slope_deg=slopes[seen], traversability=values[seen])
 
 
 def read_cells(dataset: TerrainDataset, split: str, chunk_cells: int = CHUNK_CELLS) -> Iterator[Cells]:
@@ -109,8 +99,7 @@ def read_cells(dataset: TerrainDataset, split: str, chunk_cells: int = CHUNK_CEL
     """
     names = ("class_id", "slope_deg", "traversability")
     for _, maps in dataset.chunks(split, names, chunk_cells):
-        class_id, slope_deg, traversability = (torch.from_numpy(maps[name]) for name in names)
-        yield observed_cells(class_id, slope_deg, traversability, len(dataset.recipe.classes))
+        yield observed_cells(*(torch.from_numpy(maps[name]) for name in names))
 
 
 def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
@@ -131,8 +120,9 @@ def hold_out(cells: Cells, share: float, seed: int = 0) -> tuple[Cells, Cells]:
     out = (counts * share).long()
     key = rng.stream_key(seed, "models", "held-out cells")
     held = torch.zeros(len(cells), dtype=torch.bool)
+    drawn = rng.uniform(key, np.arange(len(counts)))
     for c, (count, few) in enumerate(zip(counts.tolist(), out.tolist(), strict=True)):
-        first = int(rng.uniform(key, np.array([c]))[0] * (count - few + 1))
+        first = int(drawn[c] * (count - few + 1))
         held[(cells.class_id == c).nonzero().flatten()[first : first + few]] = True
     return cells.select(~held), cells.select(held)
 
@@ -294,8 +284,7 @@ def measure_latent(table: SlopeTable, chunks: Iterable[Terrain], truth: bool = T
     return {**errors, "nll": surprise / max(1, seen)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class SlipLogs:
+class SlipLogs(NamedTuple):
     """What is learned from of a slip log.
 
     Args:
@@ -329,32 +318,30 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
             f"Expected columns {', '.join(COLUMNS)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(str(name) for name in rows.columns) or 'none'}."
         )
-    numbers = {name: _read_numbers(rows[name], name, most, path) for name, most in _LIMITS.items()}
-    observed = ~np.logical_or(*(np.isnan(column) for column in numbers.values()))
-    if not observed.any():
+    for name, most in _LIMITS.items():
+        rows[name] = _read_numbers(rows[name], name, most, path)
+    observed = rows.dropna(subset=list(_LIMITS))
+    if observed.empty:
         raise DatasetError(
             f"Expected rows with a slope and a traversability in {path}, got none among {len(rows)}. "
             "Log places that the robot has driven over."
         )
-    steepest = numbers["slope_deg"][observed].max()
-    if 0 < steepest <= np.pi / 2 and observed.sum() >= _ENOUGH:
+    steepest = observed["slope_deg"].max()
+    if 0 < steepest <= np.pi / 2 and len(observed) >= _ENOUGH:
         raise DatasetError(
-            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {observed.sum()} rows, as of "
+            f"Expected `slope_deg` in degrees in {path}, got at most {steepest:.4g} in {len(observed)} rows, as of "
             "radians. Multiply radians by 57.2958. Ground that level in degrees looks the same: log steeper too."
         )
-    class_names, class_id = _read_classes(rows["class"], observed, path, class_names)
-    slope, value = (torch.from_numpy(column[observed].astype(np.float32)) for column in numbers.values())
-    return SlipLogs(
-        class_names=class_names,
-        cells=Cells(class_id=class_id, slope_deg=slope, traversability=value),
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
-    )
+    class_names, class_id = _read_classes(observed["class"], path, class_names)
+    slope, value = (torch.from_numpy(observed[name].to_numpy(np.float32)) for name in _LIMITS)
+    cells = Cells(class_id=class_id, slope_deg=slope, traversability=value)
+    return SlipLogs(class_names, cells, hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def _read(path: Path) -> pd.DataFrame:
     try:
         if path.suffix == ".parquet":
-            return pd.read_parquet(path)
+            return pd.read_parquet(path).reset_index(drop=True)
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # As text: a class may be called NA, and a bad number is to be found in its row.
@@ -388,17 +375,15 @@ def _read_numbers(column: pd.Series, name: str, most: float, path: Path) -> np.n
     return values
 
 
-def _read_classes(
-    column: pd.Series, observed: np.ndarray, path: Path, names: tuple[str, ...]
-) -> tuple[tuple[str, ...], Tensor]:
-    """Gives the class table, that of the log where it has no names yet, and the id of each observed row."""
-    text = column.astype("string").str.strip().fillna("").to_numpy(str)
-    absent = np.flatnonzero(observed & (text == ""))
+def _read_classes(column: pd.Series, path: Path, names: tuple[str, ...]) -> tuple[tuple[str, ...], Tensor]:
+    """Gives the class table, that of the log where it has no names yet, and the id of each row."""
+    text = column.astype("string").str.strip().fillna("")
+    absent = text.index[text == ""]
     if len(absent):
         raise DatasetError(
             f"Expected a `class` in every row of {path}, got none in row {absent[0] + 1} below the header."
         )
-    found = text[observed]
+    found = text.to_numpy(str)
     # pandas writes ids so where some are missing: 0.0
     if all(re.fullmatch(r"\d+(\.\d*)?", name, re.ASCII) for name in found):
         ids = found.astype(float)

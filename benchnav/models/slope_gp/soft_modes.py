@@ -16,17 +16,17 @@ bins of λ, C classes.
 """
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import map_tensors
 from benchnav.models.slope_gp.cells import INSIDE_BINS, SlopeSums, levels
 from benchnav.models.slope_gp.table import SoftModes
 
 LEAST_CELLS, LEAST_WEIGHT, LEAST_GAIN = 100, 0.01, 2e-3
 
+_INSIDE = levels()[1:-1]  # λ of the bins inside (0, 1)
 _FREE_PARAMETERS = 3  # that a second mode adds
 _STRONG = 10.0  # difference of BIC from which evidence is called very strong
 _STARTS = (0.05, 0.35, 0.65, 0.95)  # means that a second mode is looked for from
@@ -38,8 +38,7 @@ _MOST_ODDS = 200.0  # beyond, shares would be too small for quick arithmetic
 _SETTLED = 1e-8  # nats a cell and step
 
 
-@dataclass(frozen=True)
-class _Modes:
+class _Modes(NamedTuple):
     """Parameters of S fits: f of shape [S, B], all others of shape [S, 1]; weight 0 for a single mode."""
 
     main: Tensor
@@ -48,51 +47,33 @@ class _Modes:
     mean: Tensor
     std: Tensor
 
-    def select(self, which: int) -> "_Modes":
-        """Keeps one fit."""
-        return map_tensors(self, lambda values: values[which : which + 1])
 
-
-def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, Tensor]:
+def find_soft_modes(sums: SlopeSums) -> tuple[SoftModes | None, dict[str, Tensor]]:
     """Looks for a second mode of each class.
 
     Args:
         sums: of the observed cells of C classes.
 
     Returns:
-        The second modes, None where no class has one; and the share of the cells in the main mode, by
-        class and bins as in `sums.cells`, float64, 1 throughout for a class without a second.
+        The second modes, None where no class has one; and the sums that the censored likelihood takes, over the
+        cells of the main modes: as `SlopeSums.bins`, and what that gives for a class without a second mode.
     """
-    classes = len(sums.cells)
+    classes, bins = len(sums.cells), sums.bins(censored=True)
     weight, mean, std = torch.zeros(classes), torch.zeros(classes), torch.ones(classes)
     share = torch.ones(sums.cells.shape, dtype=torch.float64)
     for c, counts in enumerate(sums.cells):
         if modes := _find_in_class(counts):
             share[c, : modes.main.shape[1]] -= _soft_share(modes)[1][0]
             weight[c], mean[c], std[c] = modes.weight, modes.mean, modes.std
-    soft = SoftModes(weight=weight, mean=mean, std=std) if bool(weight.any()) else None
-    return soft, share
-
-
-def main_bins(sums: SlopeSums, soft: SoftModes, share: Tensor) -> dict[str, Tensor]:
-    """Gives the sums that the censored likelihood takes, over the cells of the main modes.
-
-    Args:
-        sums: of the observed cells.
-        soft: the second modes.
-        share: of the cells in the main mode, by class and bins as in `sums.cells`.
-
-    Returns:
-        As `SlopeSums.bins`; of a class without a second mode what that gives.
-    """
-    bins = sums.bins(censored=True)
-    has_two, size, level = soft.weight > 0, bins["zeros"].shape[1], levels()[1:-1]
+    has_two, size = weight > 0, bins["zeros"].shape[1]
+    if not bool(has_two.any()):
+        return None, bins
     kept = (sums.cells[has_two] * share[has_two])[:, :size]
     inside = kept[..., 1:-1]
     bins["zeros"][has_two], bins["ones"][has_two] = kept[..., 0], kept[..., -1]
     bins["inside"][has_two] = inside.sum(-1)
-    bins["total"][has_two], bins["squares"][has_two] = inside @ level, inside @ level**2
-    return bins
+    bins["total"][has_two], bins["squares"][has_two] = inside @ _INSIDE, inside @ _INSIDE**2
+    return SoftModes(weight, mean, std), bins
 
 
 def _find_in_class(counts: Tensor) -> _Modes | None:
@@ -110,15 +91,14 @@ def _find_in_class(counts: Tensor) -> _Modes | None:
     flat = _Modes(mean.expand(1, size), spread.view(1, 1), none, none, none + _FIRST_STD)
     single, single_fit = _maximise(cells, flat, _MOST_STEPS)
     places = torch.tensor(_STARTS, dtype=torch.float64).unsqueeze(1)
-    weights, stds = torch.full_like(places, _FIRST_WEIGHT), torch.full_like(places, _FIRST_STD)
-    second = _Modes(single.main, single.main_std, weights, places, stds)
-    starts, fits = _maximise(cells, second, _FIRST_STEPS)
-    double, double_fit = _maximise(cells, starts.select(int(fits.argmax())), _MOST_STEPS)
-    gain, weight = float(double_fit - single_fit), float(double.weight)
+    small = single._replace(
+        weight=torch.full_like(places, _FIRST_WEIGHT), mean=places, std=torch.full_like(places, _FIRST_STD)
+    )
+    starts, fits = _maximise(cells, small, _FIRST_STEPS)
+    best = _Modes(*(values[fits.argmax()].unsqueeze(0) for values in starts))
+    double, double_fit = _maximise(cells, best, _MOST_STEPS)
     least = max(LEAST_GAIN * total, (_FREE_PARAMETERS * math.log(total) + _STRONG) / 2)
-    if weight <= LEAST_WEIGHT or gain <= least:
-        return None
-    return double
+    return double if double.weight > LEAST_WEIGHT and double_fit - single_fit > least else None
 
 
 def _maximise(cells: Tensor, modes: _Modes, most_steps: int) -> tuple[_Modes, Tensor]:
@@ -143,7 +123,7 @@ def _soft_share(modes: _Modes) -> tuple[Tensor, Tensor]:
 
 def _log_prob(mean: Tensor, std: Tensor) -> Tensor:
     """Of the bins of λ under clipped normal distributions: shape [S, B, V] from means [S, B] and deviations [S, 1]."""
-    z = (levels()[1:-1] - mean.unsqueeze(-1)) / std.unsqueeze(-1)
+    z = (_INSIDE - mean.unsqueeze(-1)) / std.unsqueeze(-1)
     inside = -0.5 * z**2 - (std * math.sqrt(2 * math.pi) * INSIDE_BINS).log().unsqueeze(-1)
     at_0, at_1 = torch.special.log_ndtr(-mean / std), torch.special.log_ndtr((mean - 1) / std)
     return torch.cat([at_0.unsqueeze(-1), inside, at_1.unsqueeze(-1)], -1)
@@ -157,7 +137,7 @@ def _improve(cells: Tensor, modes: _Modes, share: Tensor) -> _Modes:
     gap = squares - 2 * main * total + main**2 * count
     main_std = _deviation(gap.sum(1, keepdim=True) / count.sum(1, keepdim=True))
     if not bool(modes.weight.any()):
-        return replace(modes, main=main, main_std=main_std)
+        return modes._replace(main=main, main_std=main_std)
     count, total, squares = _moments(soft.sum(1, keepdim=True), modes.mean, modes.std)
     some = count.clamp(min=1e-9)
     mean = total / some
@@ -180,8 +160,8 @@ def _moments(cells: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor, 
     Returns:
         Each of shape [S, B].
     """
-    level, inside = levels()[1:-1], cells[..., 1:-1]
-    total, squares = inside @ level, inside @ level**2
+    inside = cells[..., 1:-1]
+    total, squares = inside @ _INSIDE, inside @ _INSIDE**2
     for clipped, edge, sign in ((cells[..., 0], -mean / std, -1), (cells[..., -1], (mean - 1) / std, 1)):
         # Of a normal variable beyond the edge (Tobin): h = φ/Φ, mean m ± s·h, variance s²(1 − e·h − h²).
         hazard = torch.exp(-0.5 * edge**2 - torch.special.log_ndtr(edge)) / math.sqrt(2 * math.pi)

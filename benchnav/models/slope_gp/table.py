@@ -7,11 +7,12 @@ classes, G nodes, *B any leading dimensions, H×W cells.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import expect
 from benchnav.core.mixture import TraversabilityMixture
 
 STEP_DEG = 0.1
@@ -23,8 +24,7 @@ def table_slopes() -> Tensor:
     return torch.linspace(0, STEEPEST_DEG, round(STEEPEST_DEG / STEP_DEG) + 1, dtype=torch.float64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SoftModes:
+class SoftModes(NamedTuple):
     """A second mode of each class's traversability, the same at any slope.
 
     Args:
@@ -57,10 +57,8 @@ class SlopeTable:
     def __post_init__(self) -> None:
         """Checks shapes and values."""
         is_finite = all(bool(values.isfinite().all()) for values in self.to_tensors().values())
-        if not is_finite or not bool((self.std > 0).all()) or self.mean.shape[1:] != table_slopes().shape:
-            raise ConfigError(
-                f"Expected finite tables of {len(table_slopes())} slopes and `std` > 0, got others."
-            )
+        fits = is_finite and bool((self.std > 0).all()) and self.mean.shape[1:] == table_slopes().shape
+        expect(fits, f"finite tables of {len(table_slopes())} slopes and `std` > 0, got others.")
 
     def lookup(self, slope_deg: Tensor) -> tuple[Tensor, Tensor]:
         """Reads every class at each cell's slope; of a class with a second mode the main one.
@@ -87,15 +85,15 @@ class SlopeTable:
         mean, std = self._read(class_id, slope_deg)
         components: list[tuple[Tensor, ...]] = [(torch.ones_like(mean), mean, std)]
         if soft := self.soft:
-            weight, *others = (v.to(slope_deg)[class_id] for v in (soft.weight, soft.mean, soft.std))
+            weight, *others = (values.to(slope_deg)[class_id] for values in soft)
             components = [(1 - weight, mean, std), (weight, *others)]
         weights, means, stds = (torch.stack(values, -3) for values in zip(*components, strict=True))
         return TraversabilityMixture(weights, means, stds, (0,) * len(components))
 
     def to_tensors(self) -> dict[str, Tensor]:
         """Gives the tables by name, for a checkpoint."""
-        soft = vars(self.soft) if self.soft else {}
-        tables = {"mean": self.mean, "std": self.std, "noise_std": self.noise_std}
+        tables = {name: values for name, values in vars(self).items() if name != "soft"}
+        soft = self.soft._asdict() if self.soft else {}
         return tables | {f"soft_{name}": values for name, values in soft.items()}
 
     @classmethod
@@ -108,7 +106,7 @@ class SlopeTable:
         """
         soft = None
         if "soft_weight" in tensors:
-            soft = SoftModes(**{name: tensors[f"soft_{name}"] for name in ("weight", "mean", "std")})
+            soft = SoftModes(*(tensors[f"soft_{name}"] for name in SoftModes._fields))
         return cls(mean=tensors["mean"], std=tensors["std"], noise_std=tensors["noise_std"], soft=soft)
 
     def _read(self, classes: Tensor | slice, slope_deg: Tensor) -> tuple[Tensor, Tensor]:

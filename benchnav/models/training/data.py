@@ -20,7 +20,7 @@ from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.maps import TerrainMaps
-from benchnav.datagen.files.reader import CHUNK_CELLS, TerrainDataset, find_dataset
+from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.nets.trainable import MapScale
 
@@ -35,11 +35,6 @@ Batch = dict[str, Tensor]
 
 class MapDataset(TerrainMaps):
     """Maps by field, `rgb` (uint8, [b, 3, H, W]) among them; indexed by a whole batch at a time."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """H and W."""
-        return self.dataset.grid.shape
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W].
@@ -57,12 +52,10 @@ class MapDataset(TerrainMaps):
         }
         return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
 
-    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[list[int], Batch]]:
+    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
         """All maps as they are, in order, some at a time, with their indices; on a device."""
-        height, width = self.shape
-        for chunk in torch.arange(len(self)).split(max(1, CHUNK_CELLS // (height * width))):
-            indices = chunk.tolist()
-            yield indices, {name: values.to(device) for name, values in self.read(indices).items()}
+        for indices, maps in self.dataset.chunks(self.split, self.fields):
+            yield indices, {name: torch.from_numpy(values).to(device) for name, values in maps.items()}
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
@@ -129,10 +122,10 @@ class MapSampler(Sampler[MapKey]):
         """Yields the batches of the epoch."""
         order, epoch = np.arange(self.maps), np.array([self.epoch])
         if self.shuffle:
-            order = rng.permutation(self._key("order"), epoch, self.maps)[0]
-        drawn = rng.uniform(self._key("symmetry"), epoch, (self.maps,))[0]
+            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, self.maps)[0]
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (self.maps,))[0]
         symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        drawn = rng.uniform(self._key("jitter"), epoch, (self.maps, 3))[0]
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (self.maps, 3))[0]
         factors = 1 + self.jitter * (2 * drawn - 1)
         first, step = self.share
         pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
@@ -140,9 +133,6 @@ class MapSampler(Sampler[MapKey]):
             start = min(first, len(batch[0]) - 1)  # no process is left without a map
             index, which, how = (torch.from_numpy(values[start::step]) for values in batch)
             yield index, which, how
-
-    def _key(self, what: str) -> int:
-        return rng.stream_key(self.seed, "models", f"map {what}")
 
 
 class MapData(lightning.LightningDataModule):
@@ -178,7 +168,10 @@ class MapData(lightning.LightningDataModule):
         """Opens the splits."""
         super().__init__()
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
-        self.train, self.valid = (read_maps(dataset, split, fields, in_memory) for split in (TRAIN, VALID))
+        read = ("rgb", *fields)
+        self.train, self.valid = (
+            MapDataset(dataset.path, split, read, in_memory) for split in (TRAIN, VALID)
+        )
 
     def scale(self) -> MapScale:
         """What the training maps' colours and slopes are scaled by; 1 of slopes that are not read."""
@@ -199,7 +192,7 @@ class MapData(lightning.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
-        height, width = self.train.shape
+        height, width = self.train.dataset.grid.shape
         symmetries = _SYMMETRIES if height == width else _SYMMETRIES_OF_RECTANGLE
         return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
 
@@ -256,10 +249,3 @@ def check_maps(dataset: TerrainDataset, field: str) -> None:
 def training_digest(dataset: TerrainDataset) -> str:
     """Digest of what of a dataset is trained on, and of what its maps mean."""
     return ",".join(f"{name}:{dataset.split_digest(name)}" for name in (TRAIN, VALID))
-
-
-def read_maps(
-    dataset: TerrainDataset, split: str, fields: tuple[str, ...] = ("class_id",), in_memory: bool = False
-) -> MapDataset:
-    """The colours and other fields of a split, read as they are asked for, or at once."""
-    return MapDataset(dataset.path, split, ("rgb", *fields), in_memory)

@@ -30,8 +30,8 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from benchnav.core.command import tell
 from benchnav.core.device import find_device
-from benchnav.core.errors import CheckpointError, ConfigError, quiet
-from benchnav.core.settings import one_line
+from benchnav.core.errors import CheckpointError, ConfigError, expect, quiet
+from benchnav.core.settings import check_known, one_line
 from benchnav.core.store import replacing, sole_writer, write_text
 from benchnav.models.config import TrainOptions
 
@@ -65,19 +65,18 @@ class FitOptions(TrainOptions):
 
     def __post_init__(self) -> None:
         """Checks the settings by name."""
-        if self.workers < 0:
-            raise ConfigError(f"Expected `workers` ≥ 0, got {self.workers}.")
+        expect(self.workers >= 0, f"`workers` ≥ 0, got {self.workers}.")
         asked = self.trainer or {}
-        if "accelerator" in asked:
-            raise ConfigError("Expected no `trainer.accelerator`, which is now `device`: auto, cpu or cuda.")
-        known = sorted(_DEFAULTS.keys() - _OWN)
-        if unknown := sorted(asked.keys() - known):
-            raise ConfigError(f"Expected settings of `trainer` among {', '.join(known)}, got {unknown[0]!r}.")
+        expect(
+            "accelerator" not in asked, "no `trainer.accelerator`, which is now `device`: auto, cpu or cuda."
+        )
+        for name in asked:
+            check_known("settings of `trainer`", name, sorted(_DEFAULTS.keys() - _OWN))
         devices, processors = asked.get("devices", 1), os.cpu_count() or 1
-        if self.place.type == "cpu" and isinstance(devices, int) and not 1 <= devices <= processors:
-            raise ConfigError(
-                f"Expected `trainer.devices` in 1–{processors}, as many as there are processors, got {devices}."
-            )
+        expect(
+            self.place.type != "cpu" or not isinstance(devices, int) or 1 <= devices <= processors,
+            f"`trainer.devices` in 1–{processors}, as many as there are processors, got {devices}.",
+        )
 
     @property
     def place(self) -> torch.device:

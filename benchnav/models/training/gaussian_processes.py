@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 from benchnav.core.command import Device, tell
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import GP, Checkpoint, Part
-from benchnav.models.config import LatentGPConfig, TrainOptions, check_seed
+from benchnav.models.config import LatentGPConfig, check_seed
 from benchnav.models.slope_gp.cells import (
     ENDINGS,
     SlopeSums,
@@ -22,7 +22,7 @@ from benchnav.models.slope_gp.cells import (
     sum_split,
 )
 from benchnav.models.slope_gp.gp import LatentGPs
-from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
+from benchnav.models.slope_gp.soft_modes import find_soft_modes
 from benchnav.models.training.data import TRAIN, VALID, open_dataset, training_digest
 from benchnav.models.training.fit import FitOptions, fit, say
 from benchnav.models.training.target import existing, fresh_checkpoint, open_target
@@ -43,10 +43,10 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu") -> 
         The GPs, on the CPU.
     """
     censored = config.likelihood == "censored"
-    soft, bins = None, sums.bins(censored)
     if config.second_component and censored:
-        soft, share = find_soft_modes(sums)
-        bins = main_bins(sums, soft, share) if soft else bins
+        soft, bins = find_soft_modes(sums)
+    else:
+        soft, bins = None, sums.bins(censored)
     model = LatentGPs(config, sums.steepest_deg, soft)
     # All cells are in each batch. A generator of its own keeps the loader from drawing on PyTorch's global one.
     batches: Any = [bins] * config.epoch_steps
@@ -56,7 +56,7 @@ def fit_gps(config: LatentGPConfig, sums: SlopeSums, device: Device = "cpu") -> 
     return model.cpu().eval()
 
 
-def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions) -> None:
+def train_gps(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on a dataset or on slip logs, into a checkpoint.
 
     Args:
@@ -66,13 +66,12 @@ def train_gps(data: str, out: str, config: LatentGPConfig, options: TrainOptions
         options: how to train.
     """
     check_seed(options.seed)
-    how = FitOptions(**vars(options))
     if data.endswith(ENDINGS):
-        _train_on_logs(data, out, config, how)
+        _train_on_logs(data, out, config, options)
         return
     dataset = open_dataset(data)
-    target = open_target(out, fresh_checkpoint(dataset), [GP], training_digest(dataset), how)
-    target.add(GP, train_gps_on_maps(config, dataset, how))
+    target = open_target(out, fresh_checkpoint(dataset), [GP], training_digest(dataset), options)
+    target.add(GP, train_gps_on_maps(config, dataset, options))
 
 
 def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: FitOptions) -> Part:
@@ -94,21 +93,15 @@ def train_gps_on_maps(config: LatentGPConfig, dataset: TerrainDataset, options: 
 def _train_on_logs(data: str, out: str, config: LatentGPConfig, options: FitOptions) -> None:
     """Trains the GPs on slip logs, into a checkpoint, whose class table the logs are read with if it is there."""
     there = existing(Path(out), options.overwrite)
-    logs = read_slip_logs(data, there.class_names if there else ())
-    names, cells = logs.class_names, logs.cells
-    sums, digest = SlopeSums.of(cells, len(names)), f"file:{logs.digest}"
+    names, cells, sha256 = read_slip_logs(data, there.class_names if there else ())
+    sums, digest = SlopeSums.of(cells, len(names)), f"file:{sha256}"
     target = open_target(out, Checkpoint(class_names=names), [GP], digest, options)
     counts = dict(zip(names, sums.count.tolist(), strict=True))
-    if missing := [name for name, count in counts.items() if not count]:
+    if few := [f"{name} {count}" for name, count in counts.items() if count < _FEW_ROWS]:
         lost = f", and what {out} had learned of them is dropped" if there and GP in there.parts else ""
         tell(
-            f"benchnav-train: warning: {data} has no rows of {len(missing)} of {len(counts)} classes "
-            f"({', '.join(missing)}); their GPs become the prior, which is vague{lost}"
-        )
-    if few := [f"{name} {count}" for name, count in counts.items() if 0 < count < _FEW_ROWS]:
-        tell(
-            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of some classes ({', '.join(few)}); what "
-            "is predicted of them is little more than the prior"
+            f"benchnav-train: warning: {data} has fewer than {_FEW_ROWS} rows of {len(few)} of {len(counts)} classes "
+            f"({', '.join(few)}); their GPs are little more than the prior, which is vague{lost}"
         )
     metrics = {}
     if max(counts.values()) >= 1 / _HELD_OUT:
@@ -130,7 +123,7 @@ def _fit_and_say(
     """Trains the GPs, and names the classes that were found to have a second mode."""
     model = fit_gps(config, sums, device)
     if soft := model.soft:
-        modes = zip(class_names, soft.weight.tolist(), soft.mean.tolist(), soft.std.tolist(), strict=True)
+        modes = zip(class_names, *(values.tolist() for values in soft), strict=True)
         found = [
             f"{name} {share:.1%} of N({mean:.3f}, {std:.3f})" for name, share, mean, std in modes if share
         ]

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from lightning.pytorch.callbacks import EarlyStopping
 
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import one_line
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
@@ -17,19 +17,18 @@ from benchnav.models.checkpoint import (
     Part,
     as_stored,
     member_name,
-    member_names,
     training_folder,
 )
 from benchnav.models.config import ClassifierConfig, LatentGPConfig, NetworkConfig, TrainOptions, check_seed
-from benchnav.models.nets.classifier import TerrainClassifier, fit_pool_temperature
+from benchnav.models.nets.classifier import TerrainClassifier, classifiers_of, fit_pool_temperature
 from benchnav.models.nets.mdn import MixtureDensityNetwork
 from benchnav.models.training.data import (
     TRAIN,
     VALID,
     MapData,
+    MapDataset,
     check_maps,
     open_dataset,
-    read_maps,
     training_digest,
 )
 from benchnav.models.training.fit import (
@@ -68,8 +67,7 @@ def train_networks(
         gp: of the GPs, if any.
         members: how many classifiers there are to be.
     """
-    if members < 1:
-        raise ConfigError(f"Expected `members` ≥ 1, got {members}.")
+    expect(members >= 1, f"`members` ≥ 1, got {members}.")
     check_seed(how.seed, members)
     dataset, trainer = open_dataset(data), dict(how.trainer or {})
     # The length of training is the network's own setting, wherever it is said.
@@ -154,22 +152,20 @@ def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOp
         chosen = options.chosen(max_epochs=config.max_epochs)
         trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
     every = trainer.check_val_every_n_epoch or 0
-    if every > config.max_epochs:
-        raise ConfigError(
-            f"Expected `trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, "
-            f"got {every}."
-        )
-    counts = {split: dataset.map_count(split) for split in (TRAIN, VALID)}
-    batches = {split: -(-maps // config.batch_size) for split, maps in counts.items()}
+    expect(
+        every <= config.max_epochs,
+        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, got {every}.",
+    )
     for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
-        limit = getattr(trainer, name)
-        if (batches[split] * limit if isinstance(limit, float) else limit) < 1:
-            raise ConfigError(
-                f"Expected `trainer.{name}` that leaves a batch of the {batches[split]} of split {split}, got {limit}. "
-                "Leave it out to take all."
-            )
-    together = min(2, counts[TRAIN] // batches[TRAIN])
-    batch = read_maps(dataset, TRAIN, kind.fields).read(range(together))
+        limit, batches = getattr(trainer, name), -(-dataset.map_count(split) // config.batch_size)
+        expect(
+            (batches * limit if isinstance(limit, float) else limit) >= 1,
+            f"`trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
+            "Leave it out to take all.",
+        )
+    maps = dataset.map_count(TRAIN)
+    together = min(2, maps // -(-maps // config.batch_size))
+    batch = MapDataset(dataset.path, TRAIN, ("rgb", *kind.fields)).read(range(together))
     try:
         with torch.no_grad():
             network.train().assess(batch)
@@ -197,18 +193,16 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
             seed=seed,
             metrics=metrics,
             data_id=dataset.id,
-            data_digest=training_digest(dataset),
+            data_digest=target.digest,
             half_precision=options.half_precision,
             trainer=options.trainer_settings,
         )
         target.add(part, trained)
-    parts = member_names(target.checkpoint)
-    if not isinstance(config, ClassifierConfig) or len(parts) == 1 or not is_first_process():
+    if not isinstance(config, ClassifierConfig) or not is_first_process():
         return
-    members = [
-        TerrainClassifier.from_tensors(part.config, len(target.checkpoint.class_names), part.tensors)
-        for part in map(target.checkpoint.part, parts)
-    ]
-    temperature = fit_pool_temperature(members, read_maps(dataset, VALID), options.seed, options.place)
+    members = classifiers_of(target.checkpoint)
+    if len(members) == 1:
+        return
+    temperature = fit_pool_temperature(members, MapDataset(dataset.path, VALID), options.seed, options.place)
     say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)

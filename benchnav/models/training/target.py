@@ -137,8 +137,12 @@ def open_target(
         checkpoint = existing(folder, may_replace) or fresh
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
         if not may_replace:
+            wanted, got = (
+                f"a {item.model} model of the classes {', '.join(item.class_names)}"
+                for item in (fresh, checkpoint)
+            )
             raise CheckpointError(
-                f"Expected checkpoint {folder} to be {_describe(fresh)}, got {_describe(checkpoint)}. "
+                f"Expected checkpoint {folder} to be {wanted}, got {got}. "
                 "Choose another `out`, or pass --overwrite to replace it."
             )
         checkpoint = fresh
@@ -169,7 +173,3 @@ def existing(folder: Path, overwrite: bool) -> Checkpoint | None:
         if overwrite:
             return None
         raise
-
-
-def _describe(checkpoint: Checkpoint) -> str:
-    return f"a {checkpoint.model} model of the classes {', '.join(checkpoint.class_names)}"

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav.core.errors import CheckpointError, ConfigError
 from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.mixture import LogNormalCDF, TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.base import predict
@@ -25,7 +25,6 @@ from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets import mdn
 from benchnav.models.nets.mdn import (
-    LogNormalCDF,
     MixtureDensityModel,
     MixtureDensityNetwork,
     censored_nll,

@@ -1,6 +1,9 @@
+from collections.abc import Iterator
+
 import pytest
 import torch
 
+from benchnav.core.device import CPU
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.fused import sharpen
 from benchnav.models.nets.classifier import fit_pool_temperature, fit_temperature, sample_logits
@@ -83,10 +86,12 @@ class Witness(torch.nn.Module):
 class Held(MapDataset):
     """Maps of no dataset."""
 
-    shape = (16, 16)  # type: ignore[assignment]
-
     def __init__(self, rgb: torch.Tensor, class_id: torch.Tensor) -> None:
         self._memory, self._maps = {"rgb": rgb, "class_id": class_id}, len(rgb)
+
+    def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, dict[str, torch.Tensor]]]:
+        every = range(len(self))
+        yield every, self.read(every)
 
 
 def witnessed(maps: int, seed: int) -> MapDataset:

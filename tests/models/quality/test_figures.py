@@ -20,7 +20,7 @@ from benchnav.models.quality.figures import (
     reliability_figure,
     severity_figure,
 )
-from benchnav.models.quality.measure import Quality, Reliability, evaluate
+from benchnav.models.quality.measure import Quality, evaluate
 from benchnav.models.quality.report import numbers
 from benchnav.models.slope_gp.table import SoftModes
 from tests.models.stub import ColourModel, true_table
@@ -85,11 +85,13 @@ def test_the_reliability_diagram_shows_the_curve_and_the_cells(qualities: Qualit
     by_class = {split: quality.classes[0] for split, quality in qualities.items()}
     figure = reliability_figure(by_class)
     curve = by_class["test/hs"].reliability
-    cells = np.array(curve.cells)
+    cells = np.array(curve["cells"])
     often = cells >= 1e-3 * cells.sum()
     axes = panel(figure, "test/hs")
     drawn = line(axes, color="#0072B2", linestyle="-")
-    np.testing.assert_allclose(drawn, [np.array(curve.confidence)[often], np.array(curve.accuracy)[often]])
+    np.testing.assert_allclose(
+        drawn, [np.array(curve["confidence"])[often], np.array(curve["accuracy"])[often]]
+    )
     assert axes.get_title() == f"test/hs: ECE {by_class['test/hs'].ece:.3f}"
     assert not axes.texts  # nothing is written where a curve may run
     bars = [axes for axes in figure.axes if len(axes.patches) == len(cells)]
@@ -191,9 +193,11 @@ def test_a_class_that_was_not_measured_is_shaded_throughout(dataset: TerrainData
 @pytest.mark.parametrize("count", [1, 2, 4, 5])
 def test_every_number_of_splits_can_be_drawn(count: int, qualities: Qualities) -> None:
     many = {f"split-{number}": qualities["valid"] for number in range(count)}
-    sure = Reliability(
-        cells=(*[0] * 13, 5, 9), confidence=(*[0.0] * 13, 0.9, 1.0), accuracy=(*[0.0] * 13, 0.8, 1.0)
-    )
+    sure = {
+        "cells": (*[0] * 13, 5, 9),
+        "confidence": (*[0.0] * 13, 0.9, 1.0),
+        "accuracy": (*[0.0] * 13, 0.8, 1.0),
+    }
     by_class = {split: replace(one.classes[0], reliability=sure) for split, one in many.items()}
     for figure in (
         confusion_figure(by_class, ColourModel().class_names),

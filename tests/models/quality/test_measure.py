@@ -100,9 +100,9 @@ def test_class_metrics_are_those_counted_by_hand() -> None:
     assert classes.brier == pytest.approx((left + right) / 2)
     half = terrain.class_id.numel() // 2 * len(chunks)
     assert classes.confusion == ((half, 0, 0), (half, 0, 0), (0, 0, 0))
-    assert classes.reliability.cells[12] == 2 * half
-    assert classes.reliability.accuracy[12] == 0.5
-    assert classes.reliability.confidence[12] == pytest.approx(0.8)
+    assert classes.reliability["cells"][12] == 2 * half
+    assert classes.reliability["accuracy"][12] == 0.5
+    assert classes.reliability["confidence"][12] == pytest.approx(0.8)
     nats = -sum(p * math.log(p) for p in (0.8, 0.15, 0.05))
     assert classes.entropy == pytest.approx(nats, rel=1e-5)
     assert classes.entropy_auroc == 0.5
@@ -284,7 +284,7 @@ def test_cells_without_a_class_count_in_no_measure_of_classes() -> None:
     found, expected = whole.classes[0], wanted.classes[0]
     assert found.confusion == expected.confusion
     assert found.slope_cells == expected.slope_cells
-    assert found.reliability.cells == expected.reliability.cells
+    assert found.reliability["cells"] == expected.reliability["cells"]
     names = (
         "accuracy", "miou", "ece", "brier", "entropy", "mutual_information", "entropy_auroc",
         "mutual_information_auroc",

@@ -253,7 +253,7 @@ ALIKE = [(0, 2), (1,), (0, 2), (3,)]  # the first and the third of four classes
 
 def tally(probabilities: Tensor, class_id: Tensor, alike: list[tuple[int, ...]] = ALIKE) -> LookAlikeQuality:
     """Of cells in a row: probabilities [N, C] and classes [N]."""
-    counted = LookAlikeTally(alike, torch.device("cpu"))
+    counted = LookAlikeTally(alike)
     for part in torch.arange(len(class_id)).tensor_split(3):
         counted.add(probabilities[part].T[None, :, None], class_id[part][None, None])
     return counted.quality()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from benchnav.core.errors import ConfigError, DatasetError
+from benchnav.core.errors import DatasetError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.slope_gp.cells import (
@@ -48,20 +48,10 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
     ids = torch.tensor([[0, 0], [1, 1]])
     slope = torch.tensor([[1.0, 2.0], [math.nan, 4.0]])
     value = torch.tensor([[0.1, math.nan], [0.3, 0.4]])
-    cells = observed_cells(ids, slope, value, 2)
+    cells = observed_cells(ids, slope, value)
     np.testing.assert_allclose([rows_of(cells, 0)[0], rows_of(cells, 1)[0]], [(1, 0.1), (4, 0.4)])
     assert len(cells) == 2
-    assert len(observed_cells(ids, slope, torch.full((2, 2), math.nan), 2)) == 0
-
-
-def test_columns_out_of_range_are_refused() -> None:
-    ids = torch.tensor([0, 1])
-    with pytest.raises(ConfigError, match="traversability"):
-        observed_cells(ids, torch.tensor([1.0, 2.0]), torch.tensor([0.5, 1.5]), 2)
-    with pytest.raises(ConfigError, match="slope_deg"):
-        observed_cells(ids, torch.tensor([1.0, -2.0]), torch.tensor([0.5, 0.5]), 2)
-    with pytest.raises(ConfigError, match="class_id"):
-        observed_cells(ids, torch.tensor([1.0, 2.0]), torch.tensor([0.5, 0.5]), 1)
+    assert len(observed_cells(ids, slope, torch.full((2, 2), math.nan))) == 0
 
 
 def test_holding_out_splits_each_class_by_the_share() -> None:
@@ -131,7 +121,7 @@ def test_nll_of_a_class_with_a_second_mode_is_that_of_both() -> None:
 def test_cells_without_a_class_are_left_out() -> None:
     ids = torch.tensor([0, 255, 1, 255], dtype=torch.uint8)
     numbers = torch.tensor([0.1, 0.2, 0.3, 0.4])
-    cells = observed_cells(ids, numbers, numbers, 2)
+    cells = observed_cells(ids, numbers, numbers)
     assert cells.class_id.tolist() == [0, 1]
     assert cells.traversability.tolist() == pytest.approx([0.1, 0.3])
 

@@ -6,7 +6,7 @@ import torch
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.config import LatentGPConfig
 from benchnav.models.slope_gp.cells import Cells, SlopeSums, sum_cells
-from benchnav.models.slope_gp.soft_modes import find_soft_modes, main_bins
+from benchnav.models.slope_gp.soft_modes import find_soft_modes
 from benchnav.models.slope_gp.table import SoftModes
 from benchnav.models.training.gaussian_processes import fit_gps
 
@@ -74,9 +74,10 @@ def test_a_class_without_a_second_mode_keeps_one(count: int, seeds: int) -> None
     parts = [draw(count, 0.0, seed=seed, steep_deg=(4.0, 8.0, 15.0)[seed % 3]) for seed in range(seeds)]
     many = [Cells(class_id=one.class_id + c, slope_deg=one.slope_deg, traversability=one.traversability)
             for c, one in enumerate(parts)]  # fmt: skip
-    soft, share = find_soft_modes(sum_cells(many, seeds))
+    sums = sum_cells(many, seeds)
+    soft, kept = find_soft_modes(sums)
     assert soft is None
-    assert bool((share == 1).all())
+    assert all(torch.equal(kept[name], values) for name, values in sums.bins(censored=True).items())
 
 
 @pytest.mark.parametrize(("fall", "flat"), [(9e-3, 1.0), (2e-2, 0.9), (1e-3, 1.05), (3e-3, 0.1)])
@@ -115,10 +116,10 @@ def test_the_sums_of_the_main_mode_are_those_of_its_own_cells() -> None:
         class_id=without.class_id + 1, slope_deg=without.slope_deg, traversability=without.traversability
     )
     sums = sum_cells([with_soft, second], 2)
-    soft, share = find_soft_modes(sums)
+    soft, kept = find_soft_modes(sums)
     assert soft is not None
     assert soft.weight.tolist()[1] == 0
-    kept, exact = main_bins(sums, soft, share), sums.bins(censored=True)
+    exact = sums.bins(censored=True)
     for name, values in exact.items():
         assert torch.equal(kept[name][1], values[1]), name
     # 95 % of the soft cells are under 0.13, where nearly no firm cell of flat ground is.
