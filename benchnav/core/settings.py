@@ -249,7 +249,10 @@ def load_yaml(text: str, place: str = "") -> Any:
     from jsonargparse import get_loader
 
     try:
-        content = get_loader("yaml")(text)
+        try:
+            content = get_loader("yaml")(text)
+        except TypeError:  # which jsonargparse raises of `{0: null}`
+            return yaml.safe_load(text)
         if isinstance(content, str) and isinstance(without_values := yaml.safe_load(text), dict):
             return without_values  # which jsonargparse leaves as text
         return content

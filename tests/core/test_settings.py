@@ -183,6 +183,7 @@ def test_types_are_told_in_words(kind: Any, words: str) -> None:
 def test_yaml_has_numbers_with_exponents_and_mappings_without_values(tmp_path: Path) -> None:
     assert load_yaml("{a: 1e-3, b: yes, c: 2024-01-01}") == {"a": 0.001, "b": True, "c": "2024-01-01"}
     assert load_yaml("a:\n") == {"a": None}
+    assert load_yaml("{0: null}") == {0: None}
     path = tmp_path / "a.yaml"
     path.write_text("a: 1\nb: [\n")
     with pytest.raises(ConfigError, match=r"^Expected YAML, got .*a.yaml, line 3: did not find"):

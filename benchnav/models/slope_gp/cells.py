@@ -391,22 +391,24 @@ def _read_classes(column: pd.Series, path: Path, names: tuple[str, ...]) -> tupl
             raise DatasetError(
                 f"Expected class ids as whole numbers in {path}, got {broken[0]}. Number or name the classes."
             )
-        own: Any = range(int(ids.max()) + 1)
-        if names and len(own) > len(names):
+        count = int(ids.max()) + 1
+        own: Any = range(count)
+        if names and count > len(names):
             raise DatasetError(
-                f"Expected class ids in 0–{len(names) - 1} in the slip log, got {len(own) - 1}. "
+                f"Expected class ids in 0–{len(names) - 1} in the slip log, got {count - 1}. "
                 "Number the classes as in the class table."
             )
     else:
         own = np.unique(found)
+        count = len(own)
         if names and (others := [name for name in own if name not in names]):
             near = hint(others[0], names) or " Name classes as in the class table."
             raise DatasetError(
                 f"Expected classes among {', '.join(names)} in the slip log, got {str(others[0])!r}.{near}"
             )
         ids = pd.Index(names or own).get_indexer(found)
-    if len(own) > _MOST_CLASSES:
+    if count > _MOST_CLASSES:
         raise DatasetError(
-            f"Expected at most {_MOST_CLASSES} classes in {path}, got {len(own)}. Number classes from 0."
+            f"Expected at most {_MOST_CLASSES} classes in {path}, got {count}. Number classes from 0."
         )
     return names or tuple(map(str, own)), torch.from_numpy(ids.astype(np.int64))

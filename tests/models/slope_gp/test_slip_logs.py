@@ -69,6 +69,12 @@ def test_integer_classes_are_indices_into_the_class_table(tmp_path: Path) -> Non
 HEADER = "class,slope_deg,traversability\n"
 
 
+def test_the_number_that_means_no_class_in_maps_is_a_class_of_a_log(tmp_path: Path) -> None:
+    cells = read_slip_logs(write(tmp_path, HEADER + "255,1,0.5\n3,2,0.4\n")).cells
+    assert cells.class_id.tolist() == [255, 3]
+    assert SlopeSums.of(cells, 256).steepest_deg[[3, 255]].tolist() == [2, 1]
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -84,6 +90,7 @@ HEADER = "class,slope_deg,traversability\n"
         (HEADER + "a,inf,0.1\n", "got inf in row 1"),
         (HEADER + "a,1,0.1\n,1,0.1\n", "`class` in every row.*row 2"),
         (HEADER + "256,1,0.1\n", "at most 256 classes.*got 257"),
+        (HEADER + "99999999999999999999,1,0.1\n", "at most 256 classes.*got 100000000000000000001"),
         (HEADER + "a,1,0.1\na,1,0.1,0.2,0.3\n", "cannot be read: .*line 3"),
         (b"\x89\xff\x00\x01" * 50, "cannot be read"),
     ],
