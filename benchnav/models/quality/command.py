@@ -37,14 +37,15 @@ def evaluate(
     from benchnav import __version__
     from benchnav.core.command import show_progress
     from benchnav.core.errors import expect
-    from benchnav.core.store import write_text
+    from benchnav.core.store import output_path, write_text
     from benchnav.core.tables import print_table
     from benchnav.datagen.files.reader import TerrainDataset, find_dataset
     from benchnav.models.config import check_seed
 
     check_seed(seed)
     expect(maps >= 0, f"`maps` ≥ 0, got {maps}. 0 leaves the map sheets out.")
-    _check_targets(out, json, overwrite)
+    target, folder = output_path(json), output_path(out)
+    _check_targets(target if json else None, folder if out else None, overwrite)
     dataset = TerrainDataset(find_dataset(data))
     expect(splits != [], f"`splits` among {', '.join(dataset.splits)}, got none.")
 
@@ -92,12 +93,11 @@ def evaluate(
     }
     report = quality_json(about, qualities)
     if json:
-        write_text(Path(json), report)
+        write_text(target, report)
         print(f"wrote {json}")
     if not out:
         print(f"what the columns mean: with --out FOLDER, {PAGE} there says so")
         return
-    folder = Path(out)
     write_text(folder / REPORT, report)
     write_text(folder / CSV, quality_csv(qualities))
     for old in (folder / FIGURES).glob("*.p[nd][gf]"):
@@ -119,19 +119,19 @@ def evaluate(
     print(f"what the columns and figures mean: {folder / PAGE}")
 
 
-def _check_targets(out: str, json: str, overwrite: bool) -> None:
+def _check_targets(json: Path | None, out: Path | None, overwrite: bool) -> None:
     """Refuses what cannot be written to before any work is done."""
     from benchnav.core.errors import expect
-    from benchnav.core.store import output_path, refuse_taken
+    from benchnav.core.store import refuse_taken
 
-    target, folder = output_path(json), output_path(out)
-    expect(
-        not json or (target.parent.is_dir() and not target.is_dir()),
-        f"`json` to be a file in a folder that exists, got {json}. Make {target.parent} first.",
-    )
+    if json:
+        expect(
+            json.parent.is_dir() and not json.is_dir(),
+            f"`json` to be a file in a folder that exists, got {json}. Make {json.parent} first.",
+        )
     if out:
-        refuse_taken(folder, overwrite, _foreign)
-    for path in [target] * bool(json) + [folder / REPORT] * bool(out):
+        refuse_taken(out, overwrite, _foreign)
+    for path in (path for path in (json, out and out / REPORT) if path):
         nearest = next(parent for parent in path.absolute().parents if parent.exists())
         try:
             with tempfile.TemporaryFile(dir=nearest):

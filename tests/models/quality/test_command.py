@@ -53,7 +53,8 @@ def test_json_alone_is_written_for_other_programs(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = tmp_path / "report.json"
-    assert call(monkeypatch, "colours", "--data", dataset.path, "--json", report, "--seed", 5) == 0
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert call(monkeypatch, "colours", "--data", dataset.path, "--json=~/report.json", "--seed", 5) == 0
     found = json.loads(report.read_text())
     assert list(found["splits"]) == ["test/std", "test/hs"]
     assert found["dataset"] == {"id": dataset.id, "digest": dataset.digest}
