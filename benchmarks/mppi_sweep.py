@@ -25,9 +25,10 @@ from benchnav.eval.experiment.suite import Suite
 from benchnav.eval.experiment.unit import Unit
 from benchnav.eval.run.unit import Settings, build, simulate
 from benchnav.planning.objective import distance
-from benchnav.planning.planners.planner import Planner, Step
+from benchnav.planning.planners.planner import Planner
 from benchnav.planning.problem import Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing import Step
 from benchnav.planning.world.outcome import Outcome
 
 OBJECTIVES, SCENARIOS, BUDGET_S = ("goal_distance", "travel_time"), ("std", "hg", "hs"), 100.0

@@ -21,9 +21,10 @@ from benchnav.core.terrain import Observation
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.planners.planner import Planner, Step
+from benchnav.planning.planners.planner import Planner
 from benchnav.planning.problem import Problem, Rules, Task, pose_problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing import Step
 
 SAMPLES = (2000, 5000, 10_000, 20_000, 50_000)
 HORIZONS_S = (1, 2, 5, 10, 20)

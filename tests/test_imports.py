@@ -1,4 +1,4 @@
-"""Imports go one way: core → datagen → planning and models → env → eval, and so do the drawers within them."""
+"""Imports go one way: core → datagen → planning and models → env → eval, and so do the folders within them."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -8,8 +8,8 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "benchnav"
 
-# The values that the drawers of `planning` share, and the shells that Gymnasium is given.
-VALUES = ("free_space", "objective", "problem", "risk", "robots")
+# The values that the folders of `planning` share, and the shells that Gymnasium is given.
+VALUES = ("free_space", "objective", "problem", "risk", "robots", "sensing")
 PLANNING = tuple(f"planning.{name}" for name in VALUES)
 SYNTHESIS = ("datagen.synth", "datagen.recipe", "datagen.schema")
 # Whatever is known of models beside their training and their quality.
@@ -20,7 +20,7 @@ VALUES_OF_EVAL = ("eval.experiment",)
 # What running writes and reports read.
 WRITTEN = ("eval.folder", "eval.recording")
 
-# What the modules of a drawer may import besides the root's; a name stands for all that is under it.
+# What the modules of a folder may import besides the root's; a name stands for all that is under it.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "": (),
     "core": ("core",),
@@ -55,7 +55,7 @@ def modules() -> list[Path]:
     return [path.relative_to(PACKAGE) for path in sorted(PACKAGE.rglob("*.py"))]
 
 
-def drawer(place: Path) -> str:
+def folder_of(place: Path) -> str:
     """The nearest entry of the table: the module's own, else that of a folder it lies in."""
     return next(
         name
@@ -73,7 +73,7 @@ def may_import(place: Path, name: str) -> bool:
     return (
         not inner
         or is_core
-        or any(f"{inner}.".startswith(f"{known}.") for known in MAY_IMPORT[drawer(place)])
+        or any(f"{inner}.".startswith(f"{known}.") for known in MAY_IMPORT[folder_of(place)])
     )
 
 
@@ -154,11 +154,11 @@ def test_no_modules_import_one_another_in_a_circle() -> None:
         ("eval/cli.py", "benchnav.models.cli", False),
     ],
 )
-def test_the_rule_knows_its_drawers(place: str, name: str, allowed: bool) -> None:
+def test_the_rule_knows_its_folders(place: str, name: str, allowed: bool) -> None:
     assert may_import(Path(place), name) == allowed
 
 
-def test_every_folder_is_a_drawer_or_lies_in_one() -> None:
+def test_every_folder_has_a_rule_or_lies_in_one_that_has() -> None:
     named = {Path(name) for name in MAY_IMPORT if name}
     for name in named:
         assert (PACKAGE / name).exists(), f"{name} is in the table alone"
@@ -166,12 +166,12 @@ def test_every_folder_is_a_drawer_or_lies_in_one() -> None:
         assert named & {folder, *folder.parents}, f"{folder} has no rule"
 
 
-def test_values_of_planning_are_all_that_lies_beside_its_drawers() -> None:
+def test_values_of_planning_are_all_that_lies_beside_its_folders() -> None:
     beside = {path.stem for path in (PACKAGE / "planning").glob("*.py")} - {"__init__"}
     assert beside == set(VALUES)
 
 
-def test_no_drawers_without_a_label() -> None:
+def test_no_folders_without_a_label() -> None:
     names = {place.stem for place in modules()} | {
         parent.name for place in modules() for parent in place.parents
     }

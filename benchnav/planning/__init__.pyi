@@ -4,10 +4,11 @@ from benchnav.planning.planners.astar.astar_dwa import AStarDWA
 from benchnav.planning.planners.astar.astar_mppi import AStarMPPI
 from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT
 from benchnav.planning.planners.mppi import MPPI, MPPIConfig
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, Task, pose_problem
 from benchnav.planning.robots import SPEED, STEERING, TURN_RATE, Bicycle, DifferentialDrive, Robot, Unicycle
+from benchnav.planning.sensing import Step
 
 __all__ = [
     "CLRRT",

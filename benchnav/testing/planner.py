@@ -18,8 +18,9 @@ from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import Rules
 from benchnav.planning.objective import GoalDistance
 from benchnav.planning.planners.boundary import NOT_FINITE, find_fault, find_layer_faults
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem, Task, pose_problem
+from benchnav.planning.sensing import Step
 from benchnav.testing.breaches import NOTHING, SEED, Breaches, same
 
 _RESOLUTION_M = 0.5

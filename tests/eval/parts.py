@@ -12,9 +12,10 @@ import torch
 
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.models.base import TraversabilityModel
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing import Step
 
 
 class Spy(Planner[Any]):

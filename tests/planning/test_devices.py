@@ -19,10 +19,11 @@ from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTens
 from benchnav.core import registry
 from benchnav.core.terrain import Terrain
 from benchnav.planning.planners.boundary import act, begin
-from benchnav.planning.planners.planner import Plan, Step
+from benchnav.planning.planners.planner import Plan
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem, pose_problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing import Step
 from benchnav.planning.world import realisation
 from benchnav.planning.world import simulation as simulation_module
 from benchnav.planning.world import world as world_module

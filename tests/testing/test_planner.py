@@ -11,10 +11,11 @@ from torch import Tensor
 from benchnav.core import registry
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance
-from benchnav.planning.planners.planner import Plan, Planner, Step
+from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import DifferentialDrive, Unicycle
+from benchnav.planning.sensing import Step
 from benchnav.testing import check_planner
 from tests.testing.refusal import refusal
 

@@ -15,8 +15,9 @@ import torch
 from benchnav.core.device import GPU_FAULTS, gpu_failed
 from benchnav.core.errors import BenchnavError
 from benchnav.eval.experiment.condition import Condition
-from benchnav.planning.planners.planner import Plan, Planner, Step
+from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
+from benchnav.planning.sensing import Step
 
 # Starting a process, importing PyTorch and compiling are not the planner's time.
 _START_S = 120.0

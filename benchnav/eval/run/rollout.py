@@ -21,8 +21,9 @@ from benchnav.core.errors import BenchnavError
 from benchnav.core.settings import one_line
 from benchnav.planning.objective import distance
 from benchnav.planning.planners.boundary import Answer, act, begin, standing_actions
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
+from benchnav.planning.sensing import Step
 from benchnav.planning.world.outcome import Outcome, tell_standstill
 from benchnav.planning.world.simulation import Simulation, SimulationState, end
 

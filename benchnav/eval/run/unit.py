@@ -35,8 +35,9 @@ from benchnav.eval.run.rows import episode_rows, error_rows, step_table
 from benchnav.models.base import predict
 from benchnav.models.predictor import Clairvoyant, load_model
 from benchnav.planning import risk
-from benchnav.planning.planners.planner import Plan, Planner, Step
+from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem, pose_problem
+from benchnav.planning.sensing import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Places

@@ -11,8 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchnav.planning.planners.planner import LAYERS, Plan, Planner, Step
+from benchnav.planning.planners.planner import LAYERS, Plan, Planner
 from benchnav.planning.problem import Problem
+from benchnav.planning.sensing import Step
 
 NOT_FINITE = "Expected finite actions, got some that are not."
 

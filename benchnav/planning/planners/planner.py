@@ -14,10 +14,10 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch
 from benchnav.core.errors import expect
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import Robot
+from benchnav.planning.sensing import Step
 
 # What a `Plan` draws, with the dimensions of each layer between that of the episodes and (x, y).
 LAYERS = {"path": "N", "samples": "MN", "reference": "N", "tree": "EN"}
@@ -29,23 +29,6 @@ class PlanStatus(IntEnum):
     OK = 0
     PARTIAL = 1  # no way to the goal was found yet; the action leads along the best way so far
     FAILED = 2  # the planner gives up; the episode ends as a planner failure
-
-
-@dataclass(frozen=True, kw_only=True)
-class Step(Batch):
-    """What a planner is told at each step.
-
-    Args:
-        state: where the robots are, shape [B, S].
-        traversability: the λ that each met in the last step, NaN at first, shape [B].
-        time_s: time since the episodes began.
-        draw: what is planned will be drawn; a planner may leave the layers of its `Plan` out otherwise.
-    """
-
-    state: Tensor
-    traversability: Tensor
-    time_s: float
-    draw: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

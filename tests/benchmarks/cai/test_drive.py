@@ -9,8 +9,9 @@ from benchmarks.cai.drive import drive, has_arrived, move, traction_at
 from benchmarks.cai.task import STEPS, Setup, pose
 from benchmarks.cai.world import GRID, draw_vegetation
 from benchnav.core import rng
-from benchnav.planning.planners.planner import Plan, Planner, Step
+from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.problem import Problem
+from benchnav.planning.sensing import Step
 
 DT_S = 0.1
 

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from benchnav.eval.run import rollout
-from benchnav.planning.planners.planner import Plan, Planner, Step
+from benchnav.planning.planners.planner import Plan, Planner
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import World

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from benchnav.planning.planners.boundary import NOT_FINITE, Answer, act, begin, find_layer_faults
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Unicycle
+from benchnav.planning.sensing import Step
 from tests import factories
 
 BATCH = 3

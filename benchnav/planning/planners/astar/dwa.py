@@ -22,7 +22,7 @@ from benchnav.core.batch import Batch
 from benchnav.core.grid import Grid
 from benchnav.planning.objective import Objective
 from benchnav.planning.planners.compilation import Fused
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Step, check_finite, rollout_path
+from benchnav.planning.planners.planner import LocalPlanner, Plan, check_finite, rollout_path
 from benchnav.planning.planners.straight import turn_toward
 from benchnav.planning.problem import (
     Problem,
@@ -31,6 +31,7 @@ from benchnav.planning.problem import (
     stage_cost,
 )
 from benchnav.planning.robots import Robot, component_wise, steps_in
+from benchnav.planning.sensing import Step
 
 # A chunk of the horizon compiles in seconds.
 _CHUNK_STEPS = 10

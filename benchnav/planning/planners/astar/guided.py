@@ -16,9 +16,10 @@ from benchnav.planning.objective import GoalDistance, has_path_cost, toward_wayp
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.recovery import Recovery, aim, watch
 from benchnav.planning.planners.astar.waypoint import GroundCosts, choose_waypoint, ground_costs
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, Step, check_finite
+from benchnav.planning.planners.planner import LocalPlanner, Plan, Planner, check_finite
 from benchnav.planning.planners.straight import steer_toward
 from benchnav.planning.problem import Problem, Task
+from benchnav.planning.sensing import Step
 
 Local = TypeVar("Local")
 

@@ -54,9 +54,10 @@ from benchnav.planning.planners.cl_rrt.pursuit import (
     Tracking,
 )
 from benchnav.planning.planners.cl_rrt.tree import Route, no_route, search
-from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, Step, check_finite
+from benchnav.planning.planners.planner import Plan, Planner, PlanStatus, check_finite
 from benchnav.planning.problem import Problem, Task
 from benchnav.planning.robots import SPEED, TURN_RATE
+from benchnav.planning.sensing import Step
 
 _STALL_M = 0.25  # progress less than this in `stall_s` is none
 

@@ -11,9 +11,10 @@ from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
 from benchnav.planning.planners.astar.guided import GuideConfig, Guided
 from benchnav.planning.planners.astar.waypoint import choose_waypoint, ground_costs
-from benchnav.planning.planners.planner import LocalPlanner, Plan, Step
+from benchnav.planning.planners.planner import LocalPlanner, Plan
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, Unicycle
+from benchnav.planning.sensing import Step
 from benchnav.planning.world.outcome import Outcome
 from tests import factories
 from tests.planning.planners.driving import drive, fake_cuda, first, generator, on_cuda, step_at, with_start

@@ -17,10 +17,11 @@ from benchnav.planning.planners.cl_rrt.cl_rrt import CLRRT, CLRRTConfig, CLRRTSt
 from benchnav.planning.planners.cl_rrt.edges import ClosedLoop
 from benchnav.planning.planners.cl_rrt.pursuit import FollowerConfig
 from benchnav.planning.planners.cl_rrt.tree import Route, search
-from benchnav.planning.planners.planner import Plan, PlanStatus, Step
+from benchnav.planning.planners.planner import Plan, PlanStatus
 from benchnav.planning.planners.straight import Straight
 from benchnav.planning.problem import Problem
 from benchnav.planning.robots import Bicycle, DifferentialDrive, Robot, Unicycle
+from benchnav.planning.sensing import Step
 from benchnav.planning.world.outcome import Outcome
 from benchnav.planning.world.simulation import Simulation
 from benchnav.planning.world.world import Immobile, World
