@@ -1,7 +1,7 @@
 """What models are measured and calibrated on is the device that is asked for, and the numbers are the same."""
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -226,9 +226,6 @@ def test_what_was_trained_is_measured_and_calibrated_where_it_was(
 def test_a_pool_is_calibrated_on_the_device(
     dataset: TerrainDataset, checkpoint_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    there = load_checkpoint(checkpoint_path)
-    part = there.part("classifier")
-    both = replace(there, parts={**there.parts, "classifier-1": part})
     given: list[torch.device] = []
 
     def fit_pool(members: Any, maps: Any, seed: int, device: torch.device) -> float:
@@ -236,11 +233,11 @@ def test_a_pool_is_calibrated_on_the_device(
         return 1.5
 
     monkeypatch.setattr(networks, "fit_pool_temperature", fit_pool)
-    monkeypatch.setattr(networks, "member_names", lambda checkpoint: ("classifier", "classifier-1"))
+    monkeypatch.setattr(networks, "classifiers_of", lambda checkpoint: [None, None])
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for device in ("cpu", "cuda"):
         target = SimpleNamespace(
-            checkpoint=both,
+            checkpoint=load_checkpoint(checkpoint_path),
             options=FitOptions(device=device),
             holds=lambda *words: True,
             set_pool_temperature=lambda value: None,

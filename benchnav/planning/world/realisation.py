@@ -123,15 +123,16 @@ def check_known(terrain: Terrain, world: World) -> None:
     Raises:
         ConfigError: they have such cells.
     """
-    expect(
-        not terrain.truth.means.isnan().any(),
-        "maps with a class in every cell to drive on, got some without: their λ is not known. Maps with unlabelled "
-        "cells are there to train and measure models on.",
-    )
-    expect(
-        world.noise != "stored" or not terrain.traversability.isnan().any(),
-        "maps with λ in every cell for `noise` 'stored', got some that were not observed. Take `noise` 'resampled'.",
-    )
+    if bool(terrain.truth.means.isnan().any()):
+        raise ConfigError(
+            "Expected maps with a class in every cell to drive on, got some without: their λ is not known. "
+            "Maps with unlabelled cells are there to train and measure models on."
+        )
+    if world.noise == "stored" and bool(terrain.traversability.isnan().any()):
+        raise ConfigError(
+            "Expected maps with λ in every cell for `noise` 'stored', got some that were not observed. "
+            "Take `noise` 'resampled'."
+        )
 
 
 def draw_frozen(

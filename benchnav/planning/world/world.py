@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.settings import check_known, plain, read
 from benchnav.planning.free_space import FreeSpace, Rules
 
@@ -107,16 +107,17 @@ class World:
             ConfigError: T is a multiple of a reference time that is not there.
         """
         reference_time_s = reference_time_s.double()
-        if self.time_budget_ratio is None:
-            return torch.full_like(reference_time_s, self.time_budget_s)  # type: ignore[arg-type]
-        lacking = int(reference_time_s.isnan().sum())
-        expect(
-            not lacking,
-            "a reference time on each map, of which the time budget is a multiple (`time_budget_ratio`), got none on "
-            f"{lacking} of {len(reference_time_s)} maps, which were not asked to be solvable. Make such maps: "
-            "benchnav-datagen create RECIPE id=NAME splits.SPLIT.solvable=true; or give `time_budget_s`, as in "
-            "world={'preset': 'stakes', 'time_budget_s': 60}.",
-        )
+        if self.time_budget_s is not None:
+            return torch.full_like(reference_time_s, self.time_budget_s)
+        assert self.time_budget_ratio is not None
+        lacking = reference_time_s.isnan()
+        if bool(lacking.any()):
+            raise ConfigError(
+                "Expected a reference time on each map, of which the time budget is a multiple (`time_budget_ratio`), "
+                f"got none on {int(lacking.sum())} of {len(lacking)} maps, which were not asked to be solvable. Make "
+                "such maps: benchnav-datagen create RECIPE id=NAME splits.SPLIT.solvable=true; or give "
+                "`time_budget_s`, as in world={'preset': 'stakes', 'time_budget_s': 60}."
+            )
         return self.time_budget_ratio * reference_time_s / top_speed_mps
 
     def steps(self, budget_s: Tensor, dt_s: float) -> Tensor:
@@ -126,10 +127,10 @@ class World:
             ConfigError: there is none.
         """
         steps = (budget_s / dt_s).round().long()
-        expect(
-            (steps >= 1).all(),
-            f"a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s.",
-        )
+        if bool((steps < 1).any()):
+            raise ConfigError(
+                f"Expected a time budget of at least one time step of {dt_s:g} s, got {float(budget_s.min()):g} s."
+            )
         return steps
 
     def to_dict(self) -> dict[str, Any]:

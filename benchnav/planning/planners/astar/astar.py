@@ -16,7 +16,7 @@ from torch import Tensor
 
 from benchnav.core import gridgraph
 from benchnav.core.batch import Batch
-from benchnav.core.errors import expect
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.planning.free_space import PENALTY
 from benchnav.planning.objective import distance
@@ -68,10 +68,10 @@ def edge_costs(problem: Problem) -> Tensor:
             "path.",
         )
     least, most = torch.stack(per_m).aminmax()
-    expect(
-        0 < least <= most < torch.inf,
-        f"{name} as finite numbers > 0, got {least:g} to {most:g}. Let no metre of a path be free.",
-    )
+    if not 0 < least <= most < torch.inf:
+        raise ConfigError(
+            f"Expected {name} as finite numbers > 0, got {least:g} to {most:g}. Let no metre of a path be free."
+        )
     penalty = PENALTY * (not_free[:, source] + not_free[:, target])
     return 0.5 * length_m * (per_m[0] + per_m[1]) + 0.5 * length_m * penalty
 
