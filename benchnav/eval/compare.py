@@ -48,7 +48,7 @@ def compare_runs(
 
     Args:
         folders: finished runs.
-        by: in what conditions differ; see `pairing.by_what`.
+        by: in what conditions differ; see `pairs.by_what`.
         against: what all others are compared with; all pairs when empty.
         asked: labels of the conditions that are looked at, by column; of columns that are not named all.
         difference: of success, for which the maps needed are counted.

@@ -76,7 +76,7 @@ def best_set_p(values: np.ndarray, flips: np.ndarray) -> tuple[np.ndarray, float
 
     Args:
         values: by map and condition, the higher the better, shape [M, K].
-        flips: from `difference.sign_flips`, shape [ways, M].
+        flips: from `paired_difference.sign_flips`, shape [ways, M].
 
     Returns:
         p by condition, corrected for their number, shape [K], 1 for the best; and the least |t| that would be

@@ -27,7 +27,7 @@ def compare(pairs: Sequence[Pair], difference: float = 0.05) -> pd.DataFrame:
     """Compares each pair map by map; Holm's correction is over all of them, for success and for time apart.
 
     Args:
-        pairs: from `pairing.find_pairs`.
+        pairs: from `pairs.find_pairs`.
         difference: of success, for which the maps that it would need are counted, in (0, 1].
 
     Returns:

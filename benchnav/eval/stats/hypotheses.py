@@ -40,7 +40,7 @@ def test_hypotheses(
         `unit` of all that follows; `n_maps`, of which a group counts as one, and `n_episodes` of each condition;
         `mean_one`, `mean_other`, `difference`, and the ends of its 95 % and 90 % intervals, `low`, `high`, `low_90`,
         `high_90`; `p`, after Holm's correction `p_holm`; and `supported`, true where `p_holm` is under 0.05. Under
-        `difference.LEAST_MAPS` maps a difference of anything but success has no interval.
+        `paired_difference.LEAST_MAPS` maps a difference of anything but success has no interval.
     """
     rows = dict(list(episodes.groupby("condition", sort=False)))
     made = []
