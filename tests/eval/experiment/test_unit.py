@@ -127,3 +127,9 @@ def test_other_words_for_what_is_recorded_are_refused() -> None:
         ConfigError, match=r"Expected `record` .*none.*steps.*first.*failures.*all.*got 'sometimes'"
     ):
         Suite(record="sometimes")  # type: ignore[arg-type]
+
+
+def test_an_extended_run_has_what_either_command_asked_for() -> None:
+    wide, deep = Extent.product((0, 1), 1, 5), Extent.product((0,), 2, 9)
+    assert wide.union(deep).draws == ((0, 0, 9), (1, 0, 5), (0, 1, 9))
+    assert deep.union(wide).draws == ((0, 0, 9), (0, 1, 9), (1, 0, 5))
