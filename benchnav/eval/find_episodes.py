@@ -47,9 +47,10 @@ def find_episodes(
             words += [f"realisation {realisation}", f"map {map_index}"]
             words += [] if seed is None else [f"seed {seed}"]
             near = "".join(hint(asked[name], known[name]) for name in strange[:1])
+            held = [f"{name} {', '.join(labels)}" for name, labels in known.items() if labels]
+            held.append(f"map 0 to {max(extent.maps for _, extent in run.conditions.values()) - 1}")
             raise ConfigError(
-                f"Expected an episode of the run, got {', '.join(words)}. "
-                f"It has {', '.join(f'{name}s {values}' for name, values in known.items())}.{near}"
+                f"Expected an episode of the run, got {', '.join(words)}. It has {'; '.join(held)}.{near}"
             )
         seed = unit.seed
         found.setdefault(unit.condition.id, (unit, unit.maps.index(map_index)))

@@ -109,5 +109,8 @@ def test_other_maps_do_not_stand_together(folder: Path) -> None:
      {"realisation": 2}, {"seed": 9, "realisation": 1}],
 )  # fmt: skip
 def test_what_is_not_there_is_refused_with_what_is(asked: dict[str, Any], folder: Path) -> None:
-    with pytest.raises(ConfigError, match=r"Expected an episode of the run, got .*planners \['straight'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"Expected an episode of the run, got .* It has .*planner straight, .*; map 0 to \d+\.",
+    ):
         found(folder, **asked)

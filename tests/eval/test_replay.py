@@ -133,7 +133,7 @@ def test_run_says_what_it_recorded_and_how_it_is_replayed(
         (("replay", "RUN", "--video", "a.avi"), "Expected `video` as a file .mp4, got 'a.avi'"),
         (("replay", "RUN", "--video", "a.mp4", "--web"), "Expected `video` or `web`, got both."),
         (("replay", "RUN", "--video", "mp4"), "Expected `video` as a file .mp4"),
-        (("replay", "RUN", "--planner", "mpi"), "planners ['straight', 'Faulty']"),
+        (("replay", "RUN", "--planner", "mpi"), "planner straight, Faulty; "),
         (("run", "--recorded", "4"), "It is now '--record'."),
         (("run", "--instances", "4"), "It is now '--maps'."),
         (("replay", "RUN", "--instance", "4"), "It is now '--map'."),

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -296,3 +297,20 @@ def test_a_worker_runs_units_on_the_device_and_under_the_limit_of_the_run(
     for settings in asked:
         assert run_on_worker(tmp_path, unit, Settings().origins().of(unit), settings) == (unit, {})
     assert given == asked
+
+
+def test_the_rows_of_a_unit_come_last_since_they_say_that_it_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[str] = []
+
+    @contextmanager
+    def replacing(path: Path) -> Iterator[Path]:
+        yield tmp_path / "partial"
+        written.append(path.relative_to(tmp_path).parts[0])
+
+    monkeypatch.setattr(cluster, "replacing", replacing)
+    monkeypatch.setattr(cluster, "clear_unit", lambda folder, unit: written.append("cleared"))
+    files = {"units/a.parquet": b"", "playback/a.npz": b"", "steps/a.parquet": b""}
+    cluster.store_files(tmp_path, None, files)  # type: ignore[arg-type]
+    assert written == ["cleared", "playback", "steps", "units"]

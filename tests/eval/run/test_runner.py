@@ -404,6 +404,7 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     mine.write_text(MINE)
     suite = quick(dataset_path, planners=(f"{mine}:Mine",), scenarios=("std",), risks=("mean",))
     first = finish(suite, folder)
+    first_key = next(folder.glob("units/*/*.parquet")).stem.rpartition("-")[2]
     mine.write_text(MINE + "# the same, in other words\n")
     said: list[str] = []
     rows = finish(replace(suite, seeds=(0, 5)), folder, reuse_code=True, say=said.append)
@@ -425,6 +426,11 @@ def test_units_of_other_code_are_taken_when_asked_for_and_marked(
     finish(replace(suite, seeds=(0, 5)), folder)
     assert open_run(folder).about["reused"] == ""
     assert len(set(read_table(folder, "episodes.parquet")["code"])) == 1
+    # Where a unit is there of this code too, that one is taken, though other code's is newer.
+    for path in folder.glob(f"units/*/*-{first_key}.parquet"):
+        os.utime(path, (time.time() + 60,) * 2)
+    finish(replace(suite, seeds=(0, 5)), folder, reuse_code=True)
+    assert set(read_table(folder, "episodes.parquet").query("risk == 'mean'")["code"]) == {codes[5]}
     # Of other maps nothing is ever taken.
     other = factories.tiny_dataset(tmp_path / "other.h5", replace(factories.tiny_recipe(), seed=1))
     data = tmp_path / "data.h5"
@@ -451,6 +457,10 @@ def test_what_was_recorded_by_other_code_is_not_taken_for_this(dataset_path: Pat
     said: list[str] = []
     finish(suite, folder, say=said.append)
     assert "run again for recordings or steps that were not asked for: 1 of 1 units" in said
+    pd.testing.assert_frame_equal(read_steps(folder), driven)
+    # What is lost is made again with all that was kept, though less is asked for now.
+    shutil.rmtree(folder / "steps")
+    finish(replace(suite, record="none"), folder)
     pd.testing.assert_frame_equal(read_steps(folder), driven)
 
 
@@ -487,6 +497,9 @@ def test_overwrite_drops_run_folders_alone(dataset_path: Path, tmp_path: Path) -
     with pytest.raises(ConfigError, match="something else"):
         finish(quick(dataset_path), tmp_path / "run")
     assert precious.read_text() == "years"
+    finish(quick(dataset_path, scenarios=("std", "hs")), tmp_path / "other")
+    rows = finish(quick(dataset_path, scenarios=("std",)), tmp_path / "other", overwrite=True)
+    assert set(rows["scenario"]) == {"std"}
 
 
 def test_replay_repeats_an_episode_that_was_not_recorded(finished: tuple[Suite, Path]) -> None:

@@ -1,0 +1,46 @@
+from pathlib import Path
+
+import pytest
+
+from benchnav.eval.experiment.condition import Condition, conditions_of
+from benchnav.eval.experiment.suite import Suite
+from benchnav.eval.folder.provenance import describe_parts
+
+PLANNERS = "benchnav.planning.planners."
+
+
+def condition(**parts: str) -> Condition:
+    given = {"model": "oracle", "planners": "straight", "risks": "mean"} | parts
+    suite = Suite(**{name: value if name == "model" else (value,) for name, value in given.items()})  # type: ignore[arg-type]
+    (found,) = conditions_of(suite, lambda data: ["std"])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("parts", "own", "foreign"),
+    [
+        ({"planners": "mppi"}, PLANNERS + "mppi", PLANNERS + "cl_rrt.cl_rrt"),
+        ({"planners": "cl_rrt"}, PLANNERS + "cl_rrt.tree", PLANNERS + "astar.dwa"),
+        ({"planners": "astar_dwa"}, PLANNERS + "astar.dwa", PLANNERS + "mppi"),
+        ({"planners": "mppi", "model": "paper-v1"}, "benchnav.models.fused", PLANNERS + "cl_rrt.cl_rrt"),
+    ],
+)
+def test_the_code_of_a_unit_is_what_its_own_parts_import(
+    parts: dict[str, str], own: str, foreign: str
+) -> None:
+    modules = describe_parts(condition(**parts))["modules"]
+    assert own in modules
+    assert foreign not in modules
+    assert "benchnav.planning.world.simulation" in modules  # of what runs every unit
+    assert "benchnav.eval.report.write" not in modules
+
+
+def test_a_part_of_a_users_own_is_known_by_its_digest(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text("def worst(mixture):\n    return mixture.var(0.99)\n")
+    before = describe_parts(condition(planners="mppi", risks=f"{path}:worst"))
+    path.write_text("def worst(mixture):\n    return mixture.var(0.9)\n")
+    after = describe_parts(condition(planners="mppi", risks=f"{path}:worst"))
+    assert before["modules"] == after["modules"]
+    assert before["parts"] != after["parts"]
+    assert list(before["parts"]) == [f"risk {path}:worst"]
