@@ -100,9 +100,9 @@ def _why(
     """How the best setting's failures failed, and on what ground."""
     failed = sum(best[column] for column in FAILURE_COUNTS)
     if not failed:
-        yield "It never failed."
+        yield f"{best['name']} never failed."
         return
-    yield f"It failed in {failed} of {best['n_episodes']} episodes: {_shares(pd.DataFrame([best]))}."
+    yield f"{best['name']} failed in {failed} of {best['n_episodes']} episodes: {_shares(pd.DataFrame([best]))}."
     observed = failures.loc[failures["condition"] == best["condition"], "last_traversability"].median()
     # An end outside the map has no λ̂.
     given = pd.Series(predicted.get(best["condition"]), dtype=float).median()

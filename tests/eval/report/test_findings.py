@@ -37,7 +37,7 @@ def test_a_best_that_all_others_are_worse_than() -> None:
         "The next is MPPI, mean with 40 %: the difference is 50.0 points (95 % interval of the pair alone "
     )
     assert sentences[2].endswith(", p ≤ 0.0001 (max-T sign-flip test by map over 3 settings).")
-    assert sentences[3] == "It failed in 10 of 100 episodes: 10 immobilised (100 %)."
+    assert sentences[3] == "MPPI, cvar:0.9 failed in 10 of 100 episodes: 10 immobilised (100 %)."
     assert sentences[4] == (
         "All 3 compared settings together failed in 140 of 300 episodes: 140 immobilised (100 %)."
     )
@@ -94,7 +94,7 @@ def test_a_rate_is_not_rounded_to_all() -> None:
 
 def test_a_single_setting_and_two() -> None:
     alone = said(condition(100))
-    assert alone[1:] == ["There is no other setting to compare it with.", "It never failed."]
+    assert alone[1:] == ["There is no other setting to compare it with.", "MPPI, cvar never failed."]
     two = said(condition(90, risk="a"), condition(10, risk="b"))
     assert two[1] == "The other setting is significantly worse: it is the best here."
     assert two[2].endswith("(max-T sign-flip test by map over 2 settings).")
@@ -104,7 +104,7 @@ def test_failures_are_counted_by_outcome_the_most_frequent_first() -> None:
     rows = condition(90, of=96, outcome="stuck")
     own = made.condition()
     rows += [made.row(own, i, None, outcome="out_of_bounds") for i in (96, 97)]
-    assert said(rows)[2] == "It failed in 8 of 98 episodes: 6 stuck (75 %), 2 out of bounds (25 %)."
+    assert said(rows)[2] == "MPPI, cvar failed in 8 of 98 episodes: 6 stuck (75 %), 2 out of bounds (25 %)."
     many = [made.row(own, i, None, outcome="stuck") for i in range(98, 500)]
     assert said([*rows, *many])[2].endswith("408 stuck (100 %), 2 out of bounds (< 1 %).")
 
