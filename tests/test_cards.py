@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from benchnav.datagen.files.reader import TerrainDataset
-from benchnav.models.predictor import find_checkpoint, load_model, model_identity
+from benchnav.models.checkpoint import digests_of
+from benchnav.models.predictor import find_checkpoint, load_model
 
 ROOT = Path(__file__).parents[1]
 MODELS = [ROOT / "checkpoints" / name for name in ("paper-v1", "stakes-v1")]
@@ -60,7 +61,7 @@ def test_what_a_model_card_measures_is_in_the_readme_of_the_models(path: Path) -
 def test_a_card_in_its_folder_does_not_change_a_model(path: Path) -> None:
     assert find_checkpoint(str(path)) == path
     assert load_model(path).class_names
-    assert set(model_identity(path)["files"]) == {"config.json", "classifier.safetensors", "gp.safetensors"}
+    assert set(digests_of(path)) == {"config.json", "classifier.safetensors", "gp.safetensors"}
 
 
 @pytest.mark.parametrize("name", ["paper-v1", "stakes-v1"])

@@ -30,7 +30,6 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-import benchnav
 from benchnav.core.errors import ConfigError
 from benchnav.core.settings import NO_DEFAULT as NO_DEFAULT
 from benchnav.core.settings import Option as Option
@@ -368,7 +367,7 @@ def _found_in_module(kind: str, place: str, name: str) -> Found:
         ) from error
     target = attribute(module, place, name)
     if place.partition(".")[0] == "benchnav":
-        return Found(target=target, origin=f"benchnav {benchnav.__version__}", shipped=True)
+        return Found(target=target, origin="benchnav", shipped=True)
     modules = {place, str(getattr(target, "__module__", place))}
     foreign = [name for name in modules if name.partition(".")[0] not in ("benchnav", "builtins")]
     return Found(

@@ -23,6 +23,7 @@ from torch import Tensor
 
 import benchnav
 from benchnav.core.errors import CheckpointError
+from benchnav.core.sources import digest_of_path
 from benchnav.core.store import (
     building,
     output_path,
@@ -126,6 +127,12 @@ def member_name(index: int) -> str:
 def is_member(name: str) -> bool:
     """Tells whether a part is a classifier."""
     return name.partition("-")[0] == CLASSIFIER
+
+
+def digests_of(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file of a checkpoint, by name; a card beside them is none."""
+    files = sorted(path for path in folder.iterdir() if path.suffix in (".json", ".safetensors"))
+    return {path.name: digest_of_path(path) for path in files}
 
 
 def member_names(checkpoint: Checkpoint) -> list[str]:

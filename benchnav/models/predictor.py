@@ -6,7 +6,6 @@ stands at a name is either called with its options and makes a model, or is a fa
 Letters in shapes: K components.
 """
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -153,31 +152,6 @@ def list_checkpoints() -> list[Path]:
         for path in sorted(config.parent for config in folder.glob(f"*/{CONFIG}")):
             found.setdefault(path.name, path)
     return list(found.values())
-
-
-def model_identity(source: Source) -> dict[str, Any]:
-    """Says which model a source is, so that a change of it is seen: plain data.
-
-    Args:
-        source: as `load_model` takes it.
-
-    Returns:
-        Of a checkpoint its `name`, and under `files` the SHA-256 of each; of a part `name`, `origin`,
-        `digest` and, where it is of this package, `shipped`. Options are not in it.
-
-    Raises:
-        ConfigError: there is no such model.
-    """
-    part = _as_part(source)
-    if not isinstance(part, Path):
-        found = registry.find("model", part.part)
-        return {"name": part.part, "origin": found.origin, "digest": found.digest, "shipped": found.shipped}
-    name = source if isinstance(source, str | Path) else registry.read_part("model", source).part
-    files = sorted(path for path in part.iterdir() if path.suffix in (".json", ".safetensors"))
-    return {
-        "name": str(name),
-        "files": {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files},
-    }
 
 
 def trained_on(source: Source) -> dict[str, str]:

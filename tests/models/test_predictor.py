@@ -16,7 +16,7 @@ from benchnav.core.terrain import Observation, Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models import fused
 from benchnav.models.base import TraversabilityModel, predict
-from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.checkpoint import Checkpoint, Part, digests_of, load_checkpoint, save_checkpoint
 from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
 from benchnav.models.nets.mdn import MixtureDensityNetwork
@@ -24,7 +24,6 @@ from benchnav.models.predictor import (
     Oracle,
     class_mismatch,
     load_model,
-    model_identity,
     open_checkpoint,
 )
 from tests.models.support import NAMES, linear_table, make_terrain
@@ -266,27 +265,15 @@ def test_a_checkpoint_has_no_options(checkpoint_path: Path) -> None:
         load_model({**given, "options": {"level": 1}})
 
 
-@pytest.mark.usefixtures("_own_file")
-def test_the_identity_of_a_model_changes_with_its_files(checkpoint_path: Path) -> None:
-    copy = Path(shutil.copytree(checkpoint_path, "copy"))
-    before = model_identity("copy")
-    assert before["name"] == "copy"
-    assert set(before["files"]) == {"config.json", "classifier.safetensors", "gp.safetensors"}
-    assert before["files"]["config.json"] == hashlib.sha256((copy / "config.json").read_bytes()).hexdigest()
-    assert model_identity({"part": "copy", "label": "ours"}) == before
+def test_the_digests_of_a_checkpoint_change_with_its_files(checkpoint_path: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(checkpoint_path, tmp_path / "copy"))
+    before = digests_of(copy)
+    assert set(before) == {"config.json", "classifier.safetensors", "gp.safetensors"}
+    assert before["config.json"] == hashlib.sha256((copy / "config.json").read_bytes()).hexdigest()
     with open(copy / "gp.safetensors", "ab") as file:
         file.write(b" ")
-    after = model_identity("copy")
-    assert {name for name in before["files"] if before["files"][name] != after["files"][name]} == {
-        "gp.safetensors"
-    }
-
-    own = model_identity("./mine_of_tests.py:Constant:0.25")
-    assert (own["name"], own["origin"]) == ("./mine_of_tests.py:Constant", "file mine_of_tests.py")
-    assert model_identity("./mine_of_tests.py:Constant") == own
-    Path("mine_of_tests.py").write_text(MINE + "# changed")
-    assert model_identity("./mine_of_tests.py:Constant")["digest"] != own["digest"]
-    assert model_identity("oracle")["shipped"]
+    after = digests_of(copy)
+    assert {name for name in before if before[name] != after[name]} == {"gp.safetensors"}
 
 
 def test_another_class_table_is_told_in_one_line(checkpoint_path: Path, dataset: TerrainDataset) -> None:

@@ -31,8 +31,8 @@ from benchnav.core.store import text_digest
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
-from benchnav.models.checkpoint import read_config
-from benchnav.models.predictor import find_checkpoint, model_identity
+from benchnav.models.checkpoint import digests_of, read_config
+from benchnav.models.predictor import find_checkpoint
 from benchnav.planning.planners.compilation import can_compile
 
 PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
@@ -110,8 +110,9 @@ def describe_parts(condition: Condition) -> Code:
         part = getattr(condition, kind)
         name = f"{kind} {part.part}"
         if is_checkpoint(kind, part.part):
-            parts[name] = text_digest(model_identity(part.part)["files"])
-            family = read_config(find_checkpoint(part.part))["model"]
+            folder = find_checkpoint(part.part)
+            parts[name] = text_digest(digests_of(folder))
+            family = read_config(folder)["model"]
             modules.append(registry.find("model", family).target.__module__)
             continue
         found = registry.find(kind, part.part)

@@ -470,7 +470,7 @@ def test_a_changed_checkpoint_is_named(
     suite = quick(dataset_path, scenarios=("std",))
     suite = replace(suite, model=SHIPPED)
     finish(suite, tmp_path / "run")
-    monkeypatch.setattr(provenance, "model_identity", lambda source: {"name": source, "files": {"a": "b"}})
+    monkeypatch.setattr(provenance, "digests_of", lambda folder: {"a": "b"})
     assert unused(suite, tmp_path / "run") == f"model {SHIPPED}"
 
 
