@@ -161,7 +161,7 @@ def read_part(kind: str, given: str | Mapping[str, Any] | Part) -> Part:
         or not isinstance(fields.get("options") or {}, Mapping)
     ):
         raise ConfigError(
-            f"Expected a {kind} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
+            f"Expected {_a(kind)} as NAME or as {{part: NAME, label: LABEL, options: {{…}}}}, got {given!r}."
         )
     text = fields["part"]
     source, value = _split_value(kind, text)
@@ -342,9 +342,13 @@ def _skipped(kind: str, target: Any) -> tuple[str, ...]:
     return _GIVEN.get(kind, ())
 
 
+def _a(kind: str) -> str:
+    return f"an {kind}" if kind == "objective" else f"a {kind}"
+
+
 def _unknown(kind: str, source: str, remedy: str, reason: str = "") -> ConfigError:
     return ConfigError(
-        f"Expected a {kind} among {', '.join(names(kind))}, package.module:Name or path/to/file.py:Name, "
+        f"Expected {_a(kind)} among {', '.join(names(kind))}, package.module:Name or path/to/file.py:Name, "
         f"got {source!r}{reason}.{remedy}"
     )
 
@@ -384,7 +388,7 @@ def _found_in_file(kind: str, path: Path, name: str) -> Found:
     except OSError as error:
         near = hint(path.name, (other.name for other in path.parent.glob("*.py")))
         raise ConfigError(
-            f"Expected a {kind} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
+            f"Expected {_a(kind)} in a file, got {str(path)!r}, which cannot be read: {error.strerror}.{near}"
         ) from error
     target = attribute(load_file(path.resolve(), content), str(path), name)
     source = partial(digest_of_file_part, path.resolve(), content)
