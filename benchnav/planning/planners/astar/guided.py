@@ -6,7 +6,7 @@ robot that its local planner holds in place is steered along the path. Source: p
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -125,5 +125,6 @@ class Guided(Planner[GuidedState[Local]], Generic[Local]):
 
     def select(self, plan_state: GuidedState[Local], members: Tensor) -> GuidedState[Local]:
         """Keeps some episodes; see `Planner`."""
-        local = self.local.select(plan_state.local, members)
-        return replace(plan_state.select(members), local=local)
+        # The local planner alone knows which of its tensors are of episodes.
+        shared: GuidedState[Any] = replace(plan_state, local=None)  # type: ignore[arg-type]
+        return replace(shared.select(members), local=self.local.select(plan_state.local, members))

@@ -1,11 +1,13 @@
 """The guide and the recovery, with local planners that do as little as can be."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+from benchnav.core.batch import Batch
 from benchnav.core.errors import ConfigError
 from benchnav.planning.objective import GoalDistance, Objective, TravelTime
 from benchnav.planning.planners.astar import astar
@@ -156,6 +158,26 @@ def test_the_recovery_of_an_episode_stays_its_own_when_others_leave_the_batch() 
 
 
 # --- The guide.
+
+
+def test_a_local_planner_alone_selects_what_it_carries() -> None:
+    @dataclass(frozen=True)
+    class Carried(Batch):
+        of_episodes: Tensor
+        shared: Tensor  # the same for all, so that no index of an episode fits it
+
+    class Carrying(Constant):
+        def select(self, plan_state: Any, members: Tensor) -> Any:
+            return replace(plan_state, of_episodes=plan_state.of_episodes[members])
+
+    problem = factories.problem(torch.full((4, 8, 8), 0.85))
+    planner = Guided(GuideConfig(), Carrying((0.0, 0.0)))
+    begun = planner.init(problem, generator())
+    carried = Carried(torch.arange(4.0), torch.zeros(2))
+    left = planner.select(replace(begun, local=carried), torch.tensor([1, 3]))
+    assert left.local.of_episodes.tolist() == [1, 3]
+    assert left.local.shared is carried.shared
+    assert len(left.problem) == 2
 
 
 def test_it_gives_the_way_points_of_the_rule_under_its_settings() -> None:
