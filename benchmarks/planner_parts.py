@@ -23,10 +23,10 @@ class NoLines(AStarDWA):
 
     def plan(self, step: Any, plan_state: Any) -> Any:
         problem, field, state = plan_state.problem, plan_state.field, step.state
-        count = 2 + int(self.guide.lookahead_m / problem.grid.resolution_m)
+        count = 2 + int(self.config.lookahead_m / problem.grid.resolution_m)
         points = astar.path_points(problem, field, state, count)
         along_m = torch.linalg.vector_norm(points.diff(dim=1), dim=2).cumsum(dim=1)
-        farthest = torch.where(along_m <= self.guide.lookahead_m, torch.arange(count - 1), 0).amax(dim=1)
+        farthest = torch.where(along_m <= self.config.lookahead_m, torch.arange(count - 1), 0).amax(dim=1)
         target = points[:, 1:].gather(1, farthest[:, None, None].expand(-1, 1, 2))[:, 0]
         action, local, plan = self.local.plan_toward(step, plan_state.local, target)
         recovery = watch(plan_state.recovery, state, action, problem.robot)
@@ -41,6 +41,6 @@ class NoLines(AStarDWA):
 class NoHalving(CLRRT):
     """CL-RRT whose turning radius stays what it is after a failure."""
 
-    def _closed_loop(self, problem: Any, failures: Any) -> Any:
-        loop = super()._closed_loop(problem, failures)
+    def _closed_loop(self, *given: Any) -> Any:
+        loop = super()._closed_loop(*given)
         return replace(loop, radius_m=torch.full_like(loop.radius_m, self.config.turning_radius_m))
