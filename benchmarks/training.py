@@ -51,10 +51,12 @@ class Stopwatch(Callback):
         self.ends = [*self.starts[1:], time.perf_counter()]
 
 
-def ours(data: MapData, config: ClassifierConfig, precision: str, classes: int) -> tuple[float, float]:
+def ours(
+    data: MapData, config: ClassifierConfig, precision: str, classes: tuple[str, ...]
+) -> tuple[float, float]:
     """Images a second of training, and of whole epochs; the best of the epochs but the first."""
     watch = Stopwatch()
-    model = TerrainClassifier(config, classes, data.scale())
+    model = TerrainClassifier(config).build(data.scale(("rgb",)), classes)
     with tempfile.TemporaryDirectory() as folder:
         options = FitOptions(folder=Path(folder), trainer={"precision": precision})
         fit(model, "bench", options, {}, [KeepBest(), watch], {"datamodule": data}, max_epochs=EPOCHS)
@@ -62,9 +64,9 @@ def ours(data: MapData, config: ClassifierConfig, precision: str, classes: int) 
     return len(data.train) / min(watch.steps[1:]), len(data.train) / min(whole[1:])
 
 
-def plain(data: MapData, config: ClassifierConfig, classes: int, autocast: bool) -> float:
+def plain(data: MapData, config: ClassifierConfig, classes: tuple[str, ...], autocast: bool) -> float:
     """Images a second of a plain loop."""
-    model = TerrainClassifier(config, classes, data.scale()).train()
+    model = TerrainClassifier(config).build(data.scale(("rgb",)), classes).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-3)
     best = float("inf")
     for _ in range(EPOCHS):
@@ -72,7 +74,7 @@ def plain(data: MapData, config: ClassifierConfig, classes: int, autocast: bool)
         for batch in data.train_dataloader():
             optimizer.zero_grad()
             with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-                loss = torch.nn.functional.cross_entropy(model(batch["rgb"]), batch["class_id"].long())
+                loss = torch.nn.functional.cross_entropy(model(batch), batch["class_id"].long())
             loss.backward()
             optimizer.step()
         best = min(best, time.perf_counter() - start)
@@ -87,7 +89,7 @@ def main() -> None:
             for _ in create(load_recipe("paper-v1"), path, jobs=2):
                 pass
         dataset = TerrainDataset(path)
-        classes = len(dataset.recipe.classes)
+        classes = tuple(item.name for item in dataset.recipe.classes)
         config = ClassifierConfig(max_epochs=EPOCHS)
         data = MapData(dataset, config.batch_size, 0)
         table = Table("training, images/s", "32-true", default_precision(), "ratio")

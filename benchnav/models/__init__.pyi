@@ -1,5 +1,7 @@
 from benchnav.models.base import ModelFamily, TraversabilityModel, predict
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
+from benchnav.models.config import TrainingConfig
+from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
 from benchnav.models.quality.measure import evaluate as evaluate_model
 
@@ -7,6 +9,8 @@ __all__ = [
     "Checkpoint",
     "ModelFamily",
     "Part",
+    "TrainableModel",
+    "TrainingConfig",
     "TraversabilityModel",
     "evaluate_model",
     "find_checkpoint",

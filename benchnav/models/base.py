@@ -6,12 +6,13 @@ Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, 
 
 import inspect
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from typing import Any, TypeGuard
 
 from torch import Tensor
 
 from benchnav.core.device import exact_convolutions
-from benchnav.core.errors import ConfigError
+from benchnav.core.errors import ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.models.checkpoint import Checkpoint
@@ -78,6 +79,27 @@ class PrivilegedModel(TraversabilityModel):
 def is_family(target: Any) -> TypeGuard[type[ModelFamily]]:
     """Tells a class whose models are kept in checkpoints from one that is made with options."""
     return inspect.isclass(target) and issubclass(target, ModelFamily)
+
+
+def layers_of(observation: Observation, names: Iterable[str]) -> dict[str, Tensor]:
+    """The layers of an observation that a model was trained on, by name.
+
+    Raises:
+        ConfigError: the maps lack one.
+    """
+    known = {
+        "rgb": observation.rgb,
+        "elevation_m": observation.elevation_m,
+        "slope_deg": observation.slope_deg,
+        **observation.layers,
+    }
+    lacking = [name for name in names if name not in known]
+    expect(
+        not lacking,
+        f"maps with the layers that the model was trained on, {' and '.join(lacking)} among them, got "
+        f"{', '.join(known)}. Take a dataset that has them.",
+    )
+    return {name: known[name] for name in names}
 
 
 def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityMixture:

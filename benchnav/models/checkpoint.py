@@ -37,9 +37,10 @@ from benchnav.core.store import (
     unseal,
     write_text,
 )
+from benchnav.models.card import CARD, card_of
 
 FORMAT = "benchnav-checkpoint"
-FORMAT_VERSION = (2, 2)
+FORMAT_VERSION = (2, 3)
 OLDEST_VERSION = (2, 0)
 _SEALED = (2, 2)  # from which on config.json holds its own digest
 CONFIG = "config.json"
@@ -90,15 +91,17 @@ class Checkpoint:
     Args:
         class_names: names of the C classes, in the order of their ids.
         parts: its parts by name; `gp`, `classifier`, `classifier-2`, … of a fused model.
-        model: registered name of the family that rebuilds the model.
-        pool_temperature: of the averaged probabilities of several classifiers (see `models.nets.classifier`);
-            1 changes nothing.
+        model: registered name of the family that rebuilds the model; of a user's own class, found in a file or
+            module, its name alone.
+        pool_temperature: of the average of several members (see `models.nets.calibration`); 1 changes nothing.
+        code: digest of the code of the class; empty where that is ours.
     """
 
     class_names: tuple[str, ...]
     parts: Mapping[str, Part] = field(default_factory=dict)
     model: str = FUSED
     pool_temperature: float = 1.0
+    code: str = ""
 
     def part(self, name: str) -> Part:
         """Gives a part.
@@ -109,24 +112,30 @@ class Checkpoint:
         if name not in self.parts:
             raise CheckpointError(
                 f"Expected a checkpoint with a part {name!r}, got one with {sorted(self.parts)}. "
-                f"Train it with `benchnav-train {name}` into the same folder."
+                f"Train it with `benchnav-train {_command(name)}` into the same folder."
             )
         return self.parts[name]
 
     def with_part(self, name: str, part: Part) -> "Checkpoint":
-        """Gives a copy in which one part is added or replaced; another classifier makes another pool."""
-        pooled = 1.0 if is_member(name) else self.pool_temperature
+        """Gives a copy in which one part is added or replaced; another member makes another pool."""
+        pooled = self.pool_temperature if name == GP else 1.0
         return replace(self, parts={**self.parts, name: part}, pool_temperature=pooled)
 
 
-def member_name(index: int) -> str:
-    """Name of the part that holds a classifier: the members of an ensemble are counted from 0."""
-    return f"{CLASSIFIER}-{index + 1}" if index else CLASSIFIER
+def _command(part: str) -> str:
+    """The command that trains a part."""
+    stem = part.partition("-")[0]
+    return stem if stem in (CLASSIFIER, GP) else f"fit {stem}"
 
 
-def is_member(name: str) -> bool:
-    """Tells whether a part is a classifier."""
-    return name.partition("-")[0] == CLASSIFIER
+def member_name(index: int, stem: str) -> str:
+    """Name of the part that holds a member of an ensemble; members are counted from 0, and the first is the stem."""
+    return f"{stem}-{index + 1}" if index else stem
+
+
+def is_member(name: str, stem: str) -> bool:
+    """Tells whether a part is a member of the name `stem`."""
+    return name == stem or (name.startswith(f"{stem}-") and name.removeprefix(f"{stem}-").isdigit())
 
 
 def digests_of(folder: Path) -> dict[str, str]:
@@ -135,10 +144,10 @@ def digests_of(folder: Path) -> dict[str, str]:
     return {path.name: digest_of_path(path) for path in files}
 
 
-def member_names(checkpoint: Checkpoint) -> list[str]:
-    """Names of the classifiers that are there, the first one in any case."""
-    names = [member_name(index) for index in range(len(checkpoint.parts))]
-    return [name for name in names if name in checkpoint.parts] or [CLASSIFIER]
+def member_names(checkpoint: Checkpoint, stem: str) -> list[str]:
+    """Names of the members that are there, the first one in any case."""
+    names = [member_name(index, stem) for index in range(len(checkpoint.parts))]
+    return [name for name in names if name in checkpoint.parts] or [stem]
 
 
 def as_stored(tensors: Mapping[str, Tensor], half_precision: bool) -> dict[str, Tensor]:
@@ -164,7 +173,7 @@ def save_checkpoint(folder: str | Path, checkpoint: Checkpoint) -> None:
         BenchnavError: another process is writing it.
     """
     with sole_writer(Path(folder), str(folder)), open_place(folder) as (place, partial):
-        _write(partial, checkpoint)
+        _write(partial, checkpoint, place.name)
         take_place(partial, place, last=CONFIG)
 
 
@@ -205,8 +214,9 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         if not 0 < pooled < float("inf"):
             raise ValueError(f"pool_temperature is {pooled}")
         return Checkpoint(
-            class_names=tuple(names), parts=parts, model=config["model"], pool_temperature=pooled
-        )
+            class_names=tuple(names), parts=parts, model=config["model"], pool_temperature=pooled,
+            code=str(config.get("code", "")),
+        )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _damaged(folder / CONFIG, f"{type(error).__name__} {error}") from error
 
@@ -229,7 +239,7 @@ def refuse_unfinished(folder: str | Path, trained: Collection[str] = ()) -> None
     logs = training_folder(folder)
     begun = sorted(path.name for path in logs.glob("*") if path.is_dir() and path.name not in trained)
     if begun:
-        command = "all" if GP in trained else begun[0].partition("-")[0]
+        command = "all" if GP in trained else _command(begun[0])
         raise CheckpointError(
             f"Expected a trained model in {folder}, got one whose training was interrupted: {logs / begun[0]} has not "
             "come to its end. Go on with the command that began it and --resume, such as "
@@ -272,25 +282,32 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def _write(folder: Path, checkpoint: Checkpoint) -> None:
+def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
     parts = {}
-    for name, part in checkpoint.parts.items():
+    for part_name, part in checkpoint.parts.items():
         content = safetensors.torch.save(_to_store(part.tensors, part.half_precision))
-        with replacing(folder / f"{name}.safetensors") as partial:
+        with replacing(folder / f"{part_name}.safetensors") as partial:
             partial.write_bytes(content)
-        kept = {name: value for name, value in vars(part).items() if name not in _APART and value is not None}
+        kept = {key: value for key, value in vars(part).items() if key not in _APART and value is not None}
         digest = hashlib.sha256(content).hexdigest()
-        parts[name] = {**kept, "data": {"id": part.data_id, "digest": part.data_digest}, "sha256": digest}
-    pooled = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
+        parts[part_name] = {
+            **kept,
+            "data": {"id": part.data_id, "digest": part.data_digest},
+            "sha256": digest,
+        }
+    optional = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
+    optional |= {"code": checkpoint.code} if checkpoint.code else {}
     config = {
         "format": FORMAT,
         "format_version": ".".join(map(str, FORMAT_VERSION)),
         "model": checkpoint.model,
         "class_count": len(checkpoint.class_names),
         "class_names": list(checkpoint.class_names),
-        **pooled,
+        **optional,
         "parts": parts,
     }
+    if parts:
+        write_text(folder / CARD, card_of(checkpoint, name))
     write_text(folder / CONFIG, seal(config) + "\n")
 
 

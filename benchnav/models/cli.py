@@ -1,6 +1,7 @@
 """The command `benchnav-train`: train models and measure them."""
 
 import sys
+from typing import Any
 
 from benchnav.core.command import INTERRUPTED, Command, Device, run
 from benchnav.models.config import (
@@ -11,8 +12,33 @@ from benchnav.models.config import (
 )
 from benchnav.models.quality.command import evaluate
 
-_RESUMABLE = ("classifier", "all", "mdn")
+_RESUMABLE = ("fit", "classifier", "all", "mdn")
 _DEFAULT_CLASSIFIER, _DEFAULT_GP, _DEFAULT_MDN = ClassifierConfig(), LatentGPConfig(), MDNConfig()
+
+
+def fit(
+    options: TrainOptions,
+    model: str,
+    data: str,
+    out: str,
+    settings: dict[str, Any] | None = None,
+    members: int = 1,
+) -> None:
+    """Train a model of any kind, by name or of your own class, or an ensemble of them.
+
+    Args:
+        options: How.
+        model: NAME of a model that can be trained, such as fused or mdn, path/to/file.py:Class or
+            package.module:Class with a TrainableModel.
+        data: Path or id of a dataset with splits train and valid.
+        out: Checkpoint folder. Logs go to OUT.training.
+        settings: Settings of the model, such as --settings.learning_rate 1e-3 --settings.inputs [rgb,elevation_m];
+            of fused those of its stages, such as --settings.classifier.encoder_depth 3.
+        members: How many to train; their distributions are averaged.
+    """
+    from benchnav.models.training.networks import fit_model
+
+    fit_model(options, model, data, out, settings or {}, members)
 
 
 def train_classifier(
@@ -31,9 +57,9 @@ def train_classifier(
         classifier: Settings of the classifier.
         members: How many to train; their probabilities are averaged.
     """
-    from benchnav.models.training.networks import train_networks
+    from benchnav.models.training.networks import classifier_of, train_networks
 
-    train_networks(options, data, out, classifier, members=members)
+    train_networks(options, data, out, classifier_of(classifier), members=members)
 
 
 def train_gp(
@@ -80,9 +106,9 @@ def train_all(
         gp: Settings of the GPs.
         members: How many classifiers to train; their probabilities are averaged.
     """
-    from benchnav.models.training.networks import train_networks
+    from benchnav.models.training.networks import classifier_of, train_networks
 
-    train_networks(options, data, out, classifier, gp, members)
+    train_networks(options, data, out, classifier_of(classifier), gp, members)
 
 
 def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFAULT_MDN) -> None:
@@ -94,14 +120,15 @@ def train_mdn(options: TrainOptions, data: str, out: str, mdn: MDNConfig = _DEFA
         out: Checkpoint folder. Logs go to OUT.training.
         mdn: Settings of the network.
     """
-    from benchnav.models.training.networks import train_networks
+    from benchnav.models.training.networks import find_trainable, train_networks
 
-    train_networks(options, data, out, mdn)
+    train_networks(options, data, out, find_trainable("mdn", vars(mdn)))
 
 
 def main() -> None:
     """Entry point of `benchnav-train`."""
     commands = {
+        "fit": Command(fit, ("model",), settings=TrainOptions),
         "classifier": Command(train_classifier, settings=TrainOptions),
         "gp": Command(train_gp),
         "all": Command(train_all, settings=TrainOptions),

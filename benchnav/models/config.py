@@ -1,4 +1,4 @@
-"""Settings of the two learned halves of a model; light to import, so that commands start fast."""
+"""Settings of models and of their training; light to import, so that commands start fast."""
 
 import math
 from dataclasses import dataclass
@@ -23,6 +23,8 @@ class TrainOptions:
         workers: Processes that read maps ahead. The result is the same for any number.
         in_memory: Hold all maps in memory, in place of reading them as they are asked for.
         half_precision: Store the weights of networks as float16.
+        symmetries: Turn and mirror training maps at random; false for photos, whose light comes from one direction.
+        crop: Train on squares of so many cells a side, drawn anew each epoch; 0 takes whole maps.
         resume: Go on with a training that was interrupted; finished parts and whole epochs are kept.
         overwrite: Replace the same parts, or a checkpoint of another model or other classes, that is there.
     """
@@ -33,20 +35,23 @@ class TrainOptions:
     workers: int = 0
     in_memory: bool = False
     half_precision: bool = True
+    symmetries: bool = True
+    crop: int = 0
     resume: bool = False
     overwrite: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkConfig:
-    """What any network is and how it is trained.
+class TrainingConfig:
+    """What any trainable model is given, and how it is trained; a model of one's own adds its own settings.
 
     Args:
-        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
-        encoder: one of its encoders, for example resnet18.
-        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
+        inputs: layers of the maps that the network is given: rgb, elevation_m, slope_deg, and others that they have,
+            such as vegetation_m.
         jitter: largest relative change of brightness, contrast and saturation of a training map. At 0
             low light stays unseen in training.
+        symmetries: turn and mirror training maps at random; false for photos, whose light comes from one direction.
+        crop: cells of a side of the squares that maps are cut to; 0 takes whole maps.
         learning_rate: highest rate of the one-cycle schedule.
         weight_decay: of AdamW.
         batch_size: most maps a batch.
@@ -54,10 +59,10 @@ class NetworkConfig:
         patience: epochs without a better validation loss after which training stops.
     """
 
-    architecture: str = "unet"
-    encoder: str = "resnet18"
-    pretrained: bool = False
+    inputs: tuple[str, ...] = ("rgb", "slope_deg")
     jitter: float = 0.0
+    symmetries: bool = True
+    crop: int = 0
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
     batch_size: int = 16
@@ -71,6 +76,21 @@ class NetworkConfig:
             _check(self, 0 <= getattr(self, name) < 1, name, "in [0, 1)")
         _check_least(self, 2, "batch_size")
         _check_least(self, 1, "max_epochs", "patience")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig(TrainingConfig):
+    """What a network of segmentation-models-pytorch is and how it is trained.
+
+    Args:
+        architecture: a decoder of segmentation-models-pytorch, for example unet, fpn or segformer.
+        encoder: one of its encoders, for example resnet18.
+        pretrained: start from ImageNet weights, which are downloaded; otherwise from random ones.
+    """
+
+    architecture: str = "unet"
+    encoder: str = "resnet18"
+    pretrained: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +108,7 @@ class ClassifierConfig(NetworkConfig):
         label_smoothing: probability spread over all classes in the targets of the cross-entropy.
     """
 
+    inputs: tuple[str, ...] = ("rgb",)
     encoder_depth: int = 5
     decoder_channels: tuple[int, ...] = ()
     full_resolution: bool = True
@@ -179,6 +200,7 @@ class MDNConfig(NetworkConfig):
         """Refuses numbers that cannot train."""
         super().__post_init__()
         _check_least(self, 1, "components", "hidden")
+        _check(self, set(self.inputs) - {"slope_deg"}, "inputs", "with a layer beside slope_deg")
 
 
 def check_seed(seed: int, count: int = 1) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
-from benchnav.models.base import ModelFamily
+from benchnav.models.base import ModelFamily, layers_of
 from benchnav.models.checkpoint import GP, Checkpoint
 from benchnav.models.slope_gp.table import SlopeTable
 
@@ -26,7 +26,8 @@ class FusedModel(ModelFamily):
     option is `TraversabilityMixture.most_likely` of the prediction.
 
     Args:
-        classifiers: the members, each from uint8 images [B, 3, H, W] to logits [B, C, H, W].
+        classifiers: the members, each from maps by field to logits [B, C, H, W]; one that has `inputs` is given
+            these layers, and any other the colours alone.
         table: the GPs over slope.
         class_names: names of the C classes.
         pool_temperature: of the averaged probabilities (see `models.nets.classifier`).
@@ -78,12 +79,16 @@ class FusedModel(ModelFamily):
         Returns:
             float32, shape [M, B, C, H, W].
         """
-        rgb, (height, width) = observation.rgb, observation.grid.shape
-        chunks = rgb.split(max(1, CHUNK_CELLS // (height * width)))
-        members = []
+        height, width = observation.grid.shape
+        size, members = max(1, CHUNK_CELLS // (height * width)), []
         with torch.inference_mode():
             for member in self.classifiers:
-                member.to(rgb.device)
+                layers = layers_of(observation, getattr(member, "inputs", ("rgb",)))
+                member.to(observation.rgb.device)
+                chunks = [
+                    {name: layer[at : at + size] for name, layer in layers.items()}
+                    for at in range(0, len(observation.rgb), size)
+                ]
                 members.append(torch.cat([member(chunk).float().softmax(1) for chunk in chunks]))
         return torch.stack(members)
 

@@ -6,6 +6,7 @@ stands at a name is either called with its options and makes a model, or is a fa
 Letters in shapes: K components.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ from typing import Any
 import torch
 
 from benchnav.core import registry
+from benchnav.core.command import tell
 from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, expect
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.recipe.recipe import Recipe
-from benchnav.models.base import PrivilegedModel, TraversabilityModel, is_family
+from benchnav.models.base import ModelFamily, PrivilegedModel, TraversabilityModel, is_family
 from benchnav.models.checkpoint import (
     CLASSIFIER,
     CONFIG,
@@ -71,7 +73,8 @@ def load_model(source: Source) -> TraversabilityModel:
     Args:
         source: the folder of a checkpoint, by path or by its name in `checkpoints/` here or
             among those shipped; or a part, such as `oracle`, `package.module:Name` or `path/to/file.py:Name`, with
-            options where it is a mapping.
+            options where it is a mapping; or the checkpoint of a class that a file or module holds,
+            `path/to/file.py:Name@CHECKPOINT`.
 
     Raises:
         ConfigError: there is no such model, or it refuses its options.
@@ -79,6 +82,9 @@ def load_model(source: Source) -> TraversabilityModel:
     """
     part = _as_part(source)
     if isinstance(part, Path):
+        own = split_own(registry.read_part("model", source).part) if not isinstance(source, Path) else None
+        if own:
+            return _load_own(own[0], part)
         checkpoint = load_checkpoint(part)
         if checkpoint.model == FUSED and CLASSIFIER not in checkpoint.parts:
             refuse_unfinished(part, checkpoint.parts)
@@ -89,6 +95,34 @@ def load_model(source: Source) -> TraversabilityModel:
         "Name a checkpoint of it, by its path if it bears the same name.",
     )
     return registry.make("model", part)
+
+
+def split_own(source: str | Path) -> tuple[str, str] | None:
+    """Splits `path/to/file.py:Name@CHECKPOINT` into class and checkpoint; None of what is not of this form."""
+    named = re.fullmatch(r"(.+?:[A-Za-z_][\w.]*)@(.+)", str(source))
+    return None if named is None or (Path(source) / CONFIG).is_file() else (named[1], named[2])
+
+
+def _load_own(place: str, folder: Path) -> TraversabilityModel:
+    """Rebuilds the model of a checkpoint by a class that the user names, and tells when its code is another now."""
+    found = registry.find("model", place)
+    if not is_family(found.target):
+        raise ConfigError(
+            f"Expected {place} to be a benchnav.models.TrainableModel or ModelFamily, whose models are kept in "
+            "checkpoints, got another class or function."
+        )
+    checkpoint, name = load_checkpoint(folder), found.target.__name__
+    if checkpoint.model != name:
+        raise CheckpointError(
+            f"Expected a checkpoint of the class {name}, got {folder}, which is one of {checkpoint.model!r}. "
+            "Name the class that it was trained with."
+        )
+    if checkpoint.code and checkpoint.code != found.digest:
+        tell(
+            f"benchnav: warning: the code of {place} is not that which trained {folder} "
+            f"(digest {found.digest[:12]}, then {checkpoint.code[:12]}): what it predicts may differ"
+        )
+    return _rebuilt(found.target, checkpoint)
 
 
 def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
@@ -103,9 +137,14 @@ def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
     family = registry.find("model", checkpoint.model).target if checkpoint.model in known else None
     if not is_family(family):
         raise CheckpointError(
-            f"Expected a checkpoint of a model among {', '.join(known)}, got one of "
-            f"{checkpoint.model!r}. Install the package that registers it."
+            f"Expected a checkpoint of a model among {', '.join(known)}, got one of {checkpoint.model!r}. Install the "
+            f"package that registers it, or name the class: path/to/file.py:{checkpoint.model}@CHECKPOINT."
         )
+    return _rebuilt(family, checkpoint)
+
+
+def _rebuilt(family: type[ModelFamily], checkpoint: Checkpoint) -> TraversabilityModel:
+    """Rebuilds a model; what its class raises ends in one line."""
     try:
         return family.from_checkpoint(checkpoint)
     except CheckpointError:
@@ -119,10 +158,14 @@ def open_checkpoint(checkpoint: Checkpoint) -> TraversabilityModel:
 def find_checkpoint(source: str | Path) -> Path:
     """Finds the folder of a checkpoint by path, or by name in `checkpoints/` here or among the shipped ones.
 
+    Of `path/to/file.py:Name@CHECKPOINT` it is the folder of CHECKPOINT.
+
     Raises:
         CheckpointError: the training of the checkpoint was interrupted.
         ConfigError: there is no such folder, nor a model of that name.
     """
+    if own := split_own(source):
+        source = own[1]
     places = (Path(source), *(folder / source for folder in _checkpoint_folders()))
     for path in places:
         if (path / CONFIG).is_file():
@@ -196,10 +239,16 @@ def class_mismatch(model: TraversabilityModel | Checkpoint, recipe: Recipe, name
 
 
 def _as_part(source: Source) -> registry.Part | Path:
-    """Reads a source as a part of the registry or as the folder of a checkpoint; known names go first."""
+    """Reads a source as a part of the registry or as the folder of a checkpoint; known names go first.
+
+    Of the checkpoint of a class that a file or module holds it is the folder.
+    """
     if isinstance(source, Path):
         return find_checkpoint(source)
     part = registry.read_part("model", source)
+    if split_own(part.part):
+        expect(not part.options, f"no options for the checkpoint {part.part!r}, got {dict(part.options)}.")
+        return find_checkpoint(part.part)
     if part.part in registry.names("model"):
         return part
     if (":" in part.part or part.part.endswith(".py")) and not (Path(part.part) / CONFIG).is_file():

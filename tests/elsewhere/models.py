@@ -17,14 +17,9 @@ from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.classifier import (
-    TerrainClassifier,
-    fit_pool_temperature,
-    fit_temperature,
-    sample_logits,
-)
-from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
-from benchnav.models.nets.trainable import MapScale
+from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import Ideal, Oracle
 from benchnav.models.quality import measure as measure_module
 from benchnav.models.quality.measure import evaluate
@@ -36,14 +31,15 @@ from benchnav.models.training.networks import fit_network
 from tests.elsewhere.device import elsewhere, waits
 from tests.models.conftest import checkpoint_path as _checkpoint_path
 from tests.models.conftest import dataset as _dataset
+from tests.models.support import scale, trainable
 
 checkpoint_path, dataset = _checkpoint_path, _dataset  # fixtures
 
 
-def network() -> MixtureDensityNetwork:
+def network() -> MixtureDensityModel:
     mean, std = torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30])
     config = MDNConfig(encoder="mobilenet_v2", hidden=16)
-    return MixtureDensityNetwork(config, 0, MapScale(mean, std, torch.tensor(10.0)), 0).eval()
+    return MixtureDensityModel(config).build(scale(mean, std, 10.0)).eval()
 
 
 def pair(checkpoint_path: Path) -> FusedModel:
@@ -52,7 +48,7 @@ def pair(checkpoint_path: Path) -> FusedModel:
     model = FusedModel.from_checkpoint(checkpoint)
     part = checkpoint.part("classifier")
     other = {name: value * 1.1 if value.ndim > 1 else value for name, value in part.tensors.items()}
-    second = TerrainClassifier.from_tensors(part.config, len(checkpoint.class_names), other)
+    second = TerrainClassifier.from_tensors(part.config, checkpoint.class_names, other)
     return FusedModel((*model.classifiers, second), model.table, model.class_names, 1.5)
 
 
@@ -77,7 +73,7 @@ def test_a_model_is_measured_on_another_device_as_here(
     model: Any = {
         "oracle": Oracle,
         "ideal": Ideal,
-        "mdn": lambda: MixtureDensityModel(network()),
+        "mdn": network,
         "pair": lambda: pair(checkpoint_path),
     }[name]()
     here = dict(evaluate(model, dataset))
@@ -217,7 +213,9 @@ def test_what_was_trained_is_measured_and_calibrated_where_it_was(
             ClassifierConfig(encoder="mobilenet_v2", batch_size=5),
             MDNConfig(encoder="mobilenet_v2", hidden=16, batch_size=5),
         ):
-            trained, _ = fit_network(config, dataset, 0, FitOptions(device="cpu"), half_precision=True)
+            trained, _ = fit_network(
+                trainable(config), dataset, 0, FitOptions(device="cpu"), half_precision=True
+            )
             assert {value.device for value in trained.parameters()} == {CPU}
     # The classifier is measured and calibrated, the other network measured; before, colours are read on the CPU.
     assert [place for place in read if place != CPU] == [device] * 3

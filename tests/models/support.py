@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
@@ -11,10 +12,32 @@ from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
+from benchnav.models.config import ClassifierConfig, TrainingConfig
+from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.slope_gp.cells import Cells, SlopeSums
 from benchnav.models.slope_gp.table import SlopeTable, table_slopes
+from benchnav.models.training.check import Trainable
+from benchnav.models.training.networks import classifier_of, find_trainable
 
 NAMES = ("a", "b", "c")
+
+
+def names(count: int) -> tuple[str, ...]:
+    """Names of so many classes."""
+    return tuple(map(str, range(count)))
+
+
+def scale(mean: Tensor, std: Tensor, slope_deg: float = 1.0) -> dict[str, LayerScale]:
+    """Scales of colour and slope."""
+    slope = LayerScale(torch.zeros(1), torch.ones(1), torch.tensor(slope_deg))
+    return {"rgb": LayerScale(mean, std, torch.ones(())), "slope_deg": slope}
+
+
+def trainable(config: TrainingConfig) -> Trainable:
+    """The classifier or mixture-density network of some settings, to be trained."""
+    if isinstance(config, ClassifierConfig):
+        return classifier_of(config)
+    return find_trainable("mdn", vars(config))
 
 
 def make_dataset(path: Path, **maps: int) -> TerrainDataset:

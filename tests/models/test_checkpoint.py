@@ -26,7 +26,7 @@ from benchnav.models.predictor import find_checkpoint, load_model, open_checkpoi
 from benchnav.models.slope_gp.table import SlopeTable, SoftModes
 from benchnav.testing.model import check_model
 from tests.models.stub import true_table
-from tests.models.support import make_terrain
+from tests.models.support import make_terrain, names
 
 
 @pytest.fixture
@@ -166,11 +166,11 @@ def test_a_damaged_config_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("version", "remedy"), [("2.3", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
+    ("version", "remedy"), [("2.4", "pip install --upgrade benchnav"), ("1.0", "Train the model again")]
 )
 def test_another_format_is_refused(folder: Path, version: str, remedy: str) -> None:
     edit(folder, format_version=version)
-    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.2 .* got {version}.*{remedy}"):
+    with pytest.raises(CheckpointError, match=rf"Expected format version 2\.3 .* got {version}.*{remedy}"):
         load_checkpoint(folder)
 
 
@@ -197,7 +197,7 @@ def test_tensors_that_do_not_fit_their_settings_are_refused(folder: Path) -> Non
 
 def test_no_weights_are_downloaded_for_a_pretrained_checkpoint(folder: Path) -> None:
     part = load_checkpoint(folder).part("classifier")
-    model = TerrainClassifier.from_tensors({**part.config, "pretrained": True}, 10, part.tensors)
+    model = TerrainClassifier.from_tensors({**part.config, "pretrained": True}, names(10), part.tensors)
     assert model.config.pretrained is False
 
 
@@ -243,7 +243,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Terrain, Trav
     members = {
         name: Part(
             config={**asdict(config), "temperature": 0.5 + seed},
-            tensors=dict(TerrainClassifier(config, len(classes), seed=seed).state_dict()),
+            tensors=dict(TerrainClassifier(config).build(map_classes=classes, seed=seed).state_dict()),
             seed=seed,
             metrics={"valid_loss": 0.5},
             data_id="tiny-v1",

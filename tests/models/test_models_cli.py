@@ -13,16 +13,12 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import load_checkpoint, save_checkpoint
 from benchnav.models.cli import main
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.classifier import (
-    TerrainClassifier,
-    fit_pool_temperature,
-    fit_temperature,
-    sample_logits,
-)
+from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.predictor import load_model
 from benchnav.models.training import networks
 from benchnav.models.training.data import MapDataset
-from tests.models.support import make_dataset
+from tests.models.support import make_dataset, names
 
 QUICK_GP = ["--gp.epochs", "1", "--gp.epoch_steps", "5"]
 QUICK_CLASSIFIER = [
@@ -354,7 +350,7 @@ def test_what_is_stored_is_what_was_measured_and_calibrated(
     assert call(monkeypatch, "classifier", *where, *QUICK_CLASSIFIER, *small) == 0
     part, valid = load_checkpoint(tmp_path / "c").part("classifier"), MapDataset(dataset.path, "valid")
     assert part.half_precision == half_precision
-    plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, 10, part.tensors)
+    plain = TerrainClassifier.from_tensors({**part.config, "temperature": 1.0}, names(10), part.tensors)
     assert part.config["temperature"] == fit_temperature(*sample_logits(plain, valid))
     for name, value in plain.measure(valid).items():
         assert part.metrics[name] == pytest.approx(value, rel=0 if half_precision else 1e-3, abs=1e-12), name

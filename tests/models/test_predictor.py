@@ -2,6 +2,7 @@ import hashlib
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.checkpoint import Checkpoint, Part, digests_of, load_checkpoint, save_checkpoint
 from benchnav.models.config import MDNConfig
 from benchnav.models.fused import FusedModel
-from benchnav.models.nets.mdn import MixtureDensityNetwork
+from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import (
     Oracle,
     class_mismatch,
@@ -36,7 +37,8 @@ class Fixed(nn.Module):
         super().__init__()
         self.logits = torch.tensor(probabilities).log().view(1, -1, 1, 1)
 
-    def forward(self, rgb: Tensor) -> Tensor:
+    def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
+        rgb = maps["rgb"]
         return self.logits.expand(len(rgb), -1, *rgb.shape[-2:])
 
 
@@ -91,8 +93,8 @@ def test_single_class_is_the_gp_of_the_most_likely_class() -> None:
 
 def test_chunks_change_nothing_and_the_result_is_no_inference_tensor(monkeypatch: pytest.MonkeyPatch) -> None:
     class Bright(nn.Module):
-        def forward(self, rgb: Tensor) -> Tensor:
-            return rgb.float() / 100
+        def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
+            return maps["rgb"].float() / 100
 
     terrain = make_terrain(batch=5)
     model = FusedModel([Bright()], linear_table(), NAMES)
@@ -328,7 +330,7 @@ def test_a_checkpoint_is_the_same_model_where_gradients_are_switched_off(
         save_checkpoint(path, there.with_part("classifier-2", there.part("classifier")))
     if kind == "mdn":
         config = MDNConfig(encoder="mobilenet_v2", hidden=8)
-        network = MixtureDensityNetwork(config, 0, seed=1)
+        network = MixtureDensityModel(config).build(seed=1)
         part = Part(
             config=asdict(config),
             tensors=dict(network.state_dict()),

@@ -15,10 +15,10 @@ from benchnav.core.terrain import Observation
 from benchnav.models.base import TraversabilityModel, is_family
 from benchnav.models.checkpoint import load_checkpoint, member_name
 from benchnav.models.config import MDNConfig
-from benchnav.models.nets.mdn import MixtureDensityModel, MixtureDensityNetwork
-from benchnav.models.nets.trainable import MapScale
+from benchnav.models.nets.mdn import MixtureDensityModel
 from benchnav.models.predictor import load_model, open_checkpoint
 from benchnav.testing import check_model
+from tests.models.support import scale
 from tests.testing.refusal import refusal
 
 NAMES = ("soft", "firm")
@@ -285,11 +285,10 @@ def test_fused_models_keep_the_contract(checkpoint_path: Path, members: int) -> 
             name: value * torch.rand(value.shape, generator=generator) if value.ndim > 3 else value
             for name, value in part.tensors.items()
         }
-        checkpoint = checkpoint.with_part(member_name(index), replace(part, tensors=tensors))
+        checkpoint = checkpoint.with_part(member_name(index, "classifier"), replace(part, tensors=tensors))
     check_model(open_checkpoint(checkpoint))
 
 
 def test_a_mixture_density_model_keeps_the_contract() -> None:
-    scale = MapScale(torch.full((3,), 90.0), torch.full((3,), 40.0), torch.tensor(9.0))
-    network = MixtureDensityNetwork(MDNConfig(encoder="mobilenet_v2"), 0, scale)
-    check_model(MixtureDensityModel(network))
+    scales = scale(torch.full((3,), 90.0), torch.full((3,), 40.0), 9.0)
+    check_model(MixtureDensityModel(MDNConfig(encoder="mobilenet_v2")).build(scales).eval())

@@ -8,7 +8,6 @@ is run, and belong to the suite.
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -220,8 +219,12 @@ def _product(listed: Mapping[str, list[Any]], scenarios_of: Any) -> Iterator[Con
 
 
 def is_checkpoint(kind: str, source: str) -> bool:
-    """Whether a part is a checkpoint, by folder or by name: a model that is neither registered nor of a module."""
-    return kind == "model" and ":" not in source and source not in registry.names("model")
+    """Whether a part is a checkpoint, by folder or by name, or with the class that a file or module holds."""
+    from benchnav.models.predictor import split_own
+
+    if kind != "model" or source in registry.names("model"):
+        return False
+    return ":" not in source or split_own(source) is not None
 
 
 def _parts(kind: str, given: Any) -> list[Part]:
@@ -231,12 +234,13 @@ def _parts(kind: str, given: Any) -> list[Part]:
 
     part = registry.read_part(kind, given)
     if is_checkpoint(kind, part.part):
-        find_checkpoint(part.part)
+        folder = find_checkpoint(part.part)
         if part.options:
             raise ConfigError(
                 f"Expected no options for the checkpoint {part.part!r}, got {dict(part.options)}."
             )
-        return [replace(part, label=Path(part.part).name) if part.label == part.part else part]
+        is_named = part.label not in (part.part, part.part.rpartition(":")[2])
+        return [part if is_named else replace(part, label=folder.name)]
     if kind == "model" and is_family(registry.find("model", part.part).target):
         load_model(part)  # says what to name in place of a family
     made = [registry.complete(kind, one) for one in each_part(kind, part)]

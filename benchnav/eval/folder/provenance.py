@@ -32,7 +32,7 @@ from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.eval.experiment.condition import PART_KINDS, Condition, is_checkpoint
 from benchnav.eval.experiment.unit import Conditions, Unit
 from benchnav.models.checkpoint import digests_of, read_config
-from benchnav.models.predictor import find_checkpoint
+from benchnav.models.predictor import find_checkpoint, split_own
 from benchnav.planning.planners.compilation import can_compile
 
 PACKAGES = ("torch", "numpy", "scipy", "gpytorch", "segmentation-models-pytorch")
@@ -112,8 +112,12 @@ def describe_parts(condition: Condition) -> Code:
         if is_checkpoint(kind, part.part):
             folder = find_checkpoint(part.part)
             parts[name] = text_digest(digests_of(folder))
-            family = read_config(folder)["model"]
-            modules.append(registry.find("model", family).target.__module__)
+            own = split_own(part.part)
+            family = registry.find(kind, own[0] if own else read_config(folder)["model"])
+            if family.shipped:
+                modules.append(family.target.__module__)
+            else:
+                parts[f"class of {name}"] = text_digest([family.origin, family.digest])
             continue
         found = registry.find(kind, part.part)
         if found.shipped:

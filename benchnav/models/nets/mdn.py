@@ -8,25 +8,23 @@ limited dependent variables". Letters in shapes: B maps, H×W cells, K component
 """
 
 import math
+from collections.abc import Mapping
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
-from torchmetrics import MeanSquaredError
 
 from benchnav.core.mixture import TraversabilityMixture, component_log_prob
-from benchnav.core.terrain import Observation
-from benchnav.models.base import ModelFamily
-from benchnav.models.checkpoint import Checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
-from benchnav.models.nets.classifier import TerrainClassifier
-from benchnav.models.nets.trainable import NO_SCALE, MapScale, TrainableNetwork
+from benchnav.models.nets.classifier import build_network
+from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
+from benchnav.models.nets.trainable import Loss, TrainableModel
 
-MDN = "mdn"
+SLOPE = "slope_deg"
 LEAST_STD = 0.01
 
 _FIRST_STD, _FIRST_SPREAD = 0.2, 0.1
 _FEATURES = 32
-_CHUNK_CELLS = 2**17
 
 
 def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Tensor) -> Tensor:
@@ -51,38 +49,44 @@ def censored_nll(log_weights: Tensor, means: Tensor, stds: Tensor, observed: Ten
     return -torch.where(seen, total, 0.0).sum() / seen.sum().clamp(min=1)
 
 
-class MixtureDensityNetwork(TrainableNetwork):
+class MixtureDensityModel(TrainableModel):
     """Predicts the mixture of every cell from colour and slope.
 
     Args:
         config: what it is.
-        class_count: which does not matter.
-        scale: of the training maps.
-        seed: root seed of the initial weights.
     """
 
-    part, kind = MDN, MDNConfig
-    fields = ("slope_deg", "traversability")
     slope_scale_deg: Tensor
 
-    def __init__(
-        self, config: MDNConfig, class_count: int, scale: MapScale = NO_SCALE, seed: int = 0
-    ) -> None:
-        """Builds the network with fresh weights."""
-        super().__init__(config, rmse=MeanSquaredError(squared=False))
-        self.register_buffer("slope_scale_deg", scale.slope_deg.clone())
-        image = ClassifierConfig(
+    def __init__(self, config: MDNConfig) -> None:
+        """Keeps the settings."""
+        super().__init__(config)
+        # The classifier's network, whose outputs tell of the ground by features rather than by classes.
+        self.image = ClassifierConfig(
             architecture=config.architecture, encoder=config.encoder, pretrained=config.pretrained
         )
-        # The classifier's network, whose outputs tell of the ground by features rather than by classes.
-        self.ground = TerrainClassifier(image, _FEATURES, scale, seed)
-        count, hidden = config.components, config.hidden
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
-            self.joint = nn.Sequential(
-                nn.Conv2d(_FEATURES + 1, hidden, 1), nn.SiLU(), nn.Conv2d(hidden, hidden, 1), nn.SiLU()
-            )
-            self.head = nn.Conv2d(hidden, 3 * count, 1)
+
+    @property
+    def stride(self) -> int:
+        """By which the encoder makes images smaller."""
+        return 2**self.image.encoder_depth
+
+    def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
+        """Makes the network of the image, and what joins its features with the slope, where that is an input."""
+        self.has_slope = SLOPE in self.inputs
+        rms = scale[SLOPE].rms if scale and self.has_slope else torch.ones(())
+        self.register_buffer("slope_scale_deg", rms.clone())
+        self.stack = InputStack([name for name in self.inputs if name != SLOPE], scale)
+        self.network = build_network(self.image, self.stack.channels, _FEATURES)
+        count, hidden = self.config.components, self.config.hidden
+        torch.default_generator.manual_seed(self.seed)  # so that these weights do not hang on the encoder
+        self.joint = nn.Sequential(
+            nn.Conv2d(_FEATURES + self.has_slope, hidden, 1),
+            nn.SiLU(),
+            nn.Conv2d(hidden, hidden, 1),
+            nn.SiLU(),
+        )
+        self.head = nn.Conv2d(hidden, 3 * count, 1)
         self.joint.to(memory_format=torch.channels_last)
         # Components begin with means evenly over [0, 1], and with nearly the same weight and width.
         means = (torch.arange(count) + 0.5) / count
@@ -90,71 +94,38 @@ class MixtureDensityNetwork(TrainableNetwork):
         first = torch.cat([torch.zeros(count), means, torch.full((count,), width)])
         self.head.load_state_dict({"weight": _FIRST_SPREAD * self.head.weight, "bias": first})
 
-    def forward(self, rgb: Tensor, slope_deg: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def configure_losses(self) -> Loss:
+        """The negative log likelihood of λ as observed."""
+        return lambda outputs, observed: censored_nll(*outputs, observed)
+
+    def forward(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor]:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.
 
         Args:
-            rgb: uint8, shape [B, 3, H, W].
-            slope_deg: shape [B, H, W].
+            maps: B maps by field, `inputs` among them.
 
         Returns:
             Logarithms of the weights, means and standard deviations, each of shape [B, K, H, W].
         """
-        features = self.ground(rgb)
-        slope = (slope_deg.to(self.slope_scale_deg) / self.slope_scale_deg).unsqueeze(1)
-        hidden = self.joint(torch.cat([features, slope.to(features.dtype)], dim=1))
-        with torch.autocast(rgb.device.type, enabled=False):
+        features = super().forward(maps)
+        if self.has_slope:
+            slope = (maps[SLOPE].to(self.slope_scale_deg) / self.slope_scale_deg).unsqueeze(1)
+            features = torch.cat([features, slope.to(features.dtype)], dim=1)
+        hidden = self.joint(features)
+        with torch.autocast(hidden.device.type, enabled=False):
             logits, means, widths = self.head(hidden.to(self.head.weight.dtype)).chunk(3, dim=1)
             return logits.log_softmax(1), means, nn.functional.softplus(widths) + LEAST_STD
 
-    def assess(self, batch: dict[str, Tensor]) -> tuple[Tensor, int]:
-        """Computes the loss of a batch, and how many of its cells were observed; in evaluation updates `metrics`."""
-        log_weights, means, stds = self(batch["rgb"], batch["slope_deg"])
-        observed = batch["traversability"]
-        seen = observed.isfinite()
-        with torch.autocast(observed.device.type, enabled=False):
-            loss = censored_nll(log_weights, means, stds, observed)
-        if not self.training:
-            expected = TraversabilityMixture(log_weights.exp(), means, stds).mean()
-            self.metrics["rmse"].update(expected[seen], observed[seen])
-        return loss, int(seen.sum())
-
-
-class MixtureDensityModel(ModelFamily):
-    """A trained mixture-density network as a model.
-
-    Args:
-        network: the network.
-    """
-
-    def __init__(self, network: MixtureDensityNetwork) -> None:
-        """Sets the network to evaluation."""
-        self.network = network.eval()
-
-    def predict(self, observation: Observation) -> TraversabilityMixture:
-        """Predicts on the observation's device, to which the network is moved.
-
-        Args:
-            observation: B maps of any size.
-
-        Returns:
-            Mixture with float32 parameters of shape [B, K, H, W].
-        """
-        rgb, (height, width) = observation.rgb, observation.grid.shape
-        self.network.to(rgb.device)
-        size = max(1, _CHUNK_CELLS // (height * width))
-        with torch.inference_mode():
-            chunks = zip(rgb.split(size), observation.slope_deg.split(size), strict=True)
-            parts = [self.network(*chunk) for chunk in chunks]
-        log_weights, means, stds = (torch.cat(values) for values in zip(*parts, strict=True))
+    def to_distribution(self, outputs: tuple[Tensor, Tensor, Tensor]) -> TraversabilityMixture:
+        """The mixture, with parameters of shape [B, K, H, W]."""
+        log_weights, means, stds = outputs
         return TraversabilityMixture(log_weights.exp(), means, stds)
 
     @classmethod
-    def from_checkpoint(cls, checkpoint: Checkpoint) -> "MixtureDensityModel":
-        """Rebuilds the model from a checkpoint with a part `mdn`.
-
-        Raises:
-            CheckpointError: the part is missing.
-        """
-        part = checkpoint.part(MDN)
-        return cls(MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors))
+    def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
+        """As `TrainableModel.from_tensors`; before format 2.3 the network of the image had another name."""
+        renamed = {
+            name.replace("ground.colour_", "stack.").replace("ground.network.", "network."): value
+            for name, value in tensors.items()
+        }
+        return super().from_tensors(config, map_classes, renamed)

@@ -1,91 +1,211 @@
-"""What a network is that `models.training` can train: named hooks, which a subclass fills in.
+"""What a trainable model is: named hooks that a subclass fills in.
 
-Letters in shapes: B maps, H×W cells.
+`benchnav-train fit` trains any `TrainableModel`, a user's own as well as ours. It learns one field of the maps, observed
+λ, from layers of the same maps. A subclass says which layers (`inputs` among its settings), makes its network, its
+loss and its distribution, and leaves the rest as it is:
+
+    class Mine(TrainableModel):
+        def __init__(self, config: MyConfig = MyConfig()) -> None:
+            super().__init__(config)
+
+        def configure_network(self, channels: int) -> nn.Module: ...
+        def configure_losses(self) -> Loss: ...
+        def to_distribution(self, outputs) -> TraversabilityDistribution: ...
+
+Letters in shapes: B maps, H×W cells, N channels of all inputs together.
 """
 
 import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import lightning
+import numpy as np
 import torch
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
-from torch import Tensor
-from torchmetrics import MeanMetric, MetricCollection
+from torch import Tensor, nn
+from torchmetrics import MeanMetric, MeanSquaredError, Metric, MetricCollection
 
-from benchnav.core.settings import of, read
-from benchnav.models.config import NetworkConfig
+from benchnav.core import rng
+from benchnav.core.batch import map_tensors
+from benchnav.core.conditioned import conditioned
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import expect
+from benchnav.core.pooled import pool
+from benchnav.core.settings import config_class, of, read
+from benchnav.core.terrain import Observation
+from benchnav.datagen.schema import UNLABELLED
+from benchnav.models.base import ModelFamily, TraversabilityModel, layers_of
+from benchnav.models.checkpoint import Checkpoint, Part, member_names
+from benchnav.models.config import TrainingConfig
+from benchnav.models.nets.calibration import fit_width, sample_scores
+from benchnav.models.nets.inputs import InputStack, LayerScale, Maps
+
+CHUNK_CELLS = 2**17
 
 _WARM_UP_SHARE = 0.15
 
-
-class MapScale(NamedTuple):
-    """What values of maps are scaled by.
-
-    Args:
-        colour_mean: of the training maps, 0–255, shape [3].
-        colour_std: of the training maps, shape [3].
-        slope_deg: by which slopes are divided; the root mean square of the training maps', at least 1.
-    """
-
-    colour_mean: Tensor
-    colour_std: Tensor
-    slope_deg: Tensor
-
-
-NO_SCALE = MapScale(torch.zeros(3), torch.ones(3), torch.ones(()))
+Loss = Callable[[Any, Tensor], Tensor]
 
 
 class TrainableNetwork(lightning.LightningModule):
-    """A network that learns one field of the maps from their colours and perhaps other fields.
-
-    A subclass is built from its settings, the number of classes, a `MapScale` and the root seed of its weights.
+    """A network that learns one field of the maps from others: the base of trainable models, and of the classifier.
 
     Args:
-        config: what it is, and how it is trained.
-        metrics: what is measured on the validation maps beside the loss, by name.
+        config: what it is and how it is trained.
     """
 
-    part: ClassVar[str]  # name of the part of a model that it is
-    kind: ClassVar[type[NetworkConfig]]  # of its settings
-    fields: ClassVar[tuple[str, ...]]  # that are read beside `rgb`; the last is what it learns
+    target: ClassVar[str] = "traversability"
+    """Field of the maps that is learned."""
 
-    def __init__(self, config: NetworkConfig, **metrics: Any) -> None:
-        """Prepares what is measured."""
+    def __init__(self, config: TrainingConfig) -> None:
+        """Keeps the settings; `build` makes the network."""
         super().__init__()
         self.config: Any = config
+        self.map_classes: tuple[str, ...] = ()
+        self.seed, self.temperature = 0, 1.0
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Layers that the network is given: `rgb`, `elevation_m`, `slope_deg`, and others that the maps have."""
+        return tuple(self.config.inputs)
+
+    @property
+    def stride(self) -> int:
+        """Maps are padded to multiples of so many cells for the network, and its outputs cropped."""
+        return 1
+
+    @abstractmethod
+    def configure_network(self, channels: int) -> nn.Module:
+        """Makes the network with fresh weights, drawn from PyTorch's global generator, which has been seeded.
+
+        Args:
+            channels: N, of the images that it is given, [B, N, H, W].
+        """
+
+    @abstractmethod
+    def configure_losses(self) -> Loss:
+        """Gives the loss of a batch, from outputs of `forward` and the field that is learned, [B, H, W], to a number.
+
+        The field is NaN, or 255 of classes, where it is not known; those cells are to be left out.
+        """
+
+    def configure_metrics(self) -> dict[str, Metric]:
+        """Gives what is measured on the validation maps beside the loss, by name; `update_metrics` updates it."""
+        return {}
+
+    def update_metrics(self, outputs: Any, target: Tensor) -> None:
+        """Updates `self.metrics` by a batch of validation maps, [B, H, W] of the field that is learned."""
+
+    def build(
+        self,
+        scale: Mapping[str, LayerScale] | None = None,
+        map_classes: tuple[str, ...] = (),
+        seed: int = 0,
+    ) -> Self:
+        """Makes the network with fresh weights; leaves PyTorch's global generator as it was.
+
+        Args:
+            scale: of the training maps, by layer of `inputs`.
+            map_classes: names of the terrain classes of the maps.
+            seed: root seed of the weights, and of what is drawn in training.
+        """
+        self.map_classes, self.seed = map_classes, seed
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            self.make_modules(scale)
         # A loss that is no number is to be seen, not left out.
-        measured = {"loss": MeanMetric(nan_strategy=math.nan), **metrics}
+        measured = {"loss": MeanMetric(nan_strategy=math.nan), **self.configure_metrics()}
         self.metrics = MetricCollection(measured, prefix="valid_", compute_groups=False)
+        self.loss = self.configure_losses()
+        return self
+
+    def make_modules(self, scale: Mapping[str, LayerScale] | None) -> None:
+        """Makes what has weights: `stack`, from layers to one image, and `network`."""
+        self.stack = InputStack(self.inputs, scale)
+        self.network = self.configure_network(self.stack.channels)
 
     @classmethod
-    def from_tensors(cls, config: dict[str, Any], class_count: int, tensors: dict[str, Tensor]) -> Self:
+    def from_tensors(cls, config: Mapping[str, Any], map_classes: tuple[str, ...], tensors: Maps) -> Self:
         """Rebuilds a trained network, downloading nothing.
 
         Args:
-            config: fields of its settings.
-            class_count: of the maps.
+            config: fields of its settings, and perhaps a `temperature`.
+            map_classes: names of the terrain classes of the maps it was trained on.
             tensors: a state dict.
 
         Raises:
             ConfigError: the settings are not those of such a network.
             RuntimeError: the tensors do not fit them.
         """
-        built = read(cls.kind, {**config, "pretrained": False}, of(cls.kind.__name__))
-        network: Any = cls(built, class_count)  # type: ignore[call-arg]
+        settings = dict(config)
+        temperature = settings.pop("temperature", 1.0)
+        fits = isinstance(temperature, int | float) and 0 < temperature < math.inf
+        expect(fits, f"a `temperature` > 0, got {temperature!r}.")
+        kind = config_class(cls)
+        if "pretrained" in settings:
+            settings["pretrained"] = False
+        network = cls(read(kind, settings, of(kind.__name__))).build(map_classes=map_classes)
         network.load_state_dict(tensors)
+        network.temperature = float(temperature)
         return network.eval()
 
-    def assess(self, batch: dict[str, Tensor]) -> tuple[Tensor, int]:
-        """Computes the loss of a batch, and of how many cells it is the mean; in evaluation updates `metrics`."""
-        raise NotImplementedError
-
-    def calibrate(self, maps: Any, seed: int, device: torch.device) -> None:
-        """Is called with the validation maps when the training has ended."""
-
     def settings(self) -> dict[str, Any]:
-        """Plain data that it is rebuilt from, beside its tensors."""
-        return asdict(self.config)
+        """Plain data that it is rebuilt from, beside its tensors: the configuration and the temperature."""
+        return {**asdict(self.config), "temperature": self.temperature}
+
+    def forward(self, maps: Maps) -> Any:
+        """Computes the outputs of the network for maps of any size, which are padded and the outputs cropped.
+
+        Args:
+            maps: B maps by field, `inputs` among them.
+
+        Returns:
+            Of a network whose output is one tensor, shape [B, *, H, W].
+        """
+        image = self.stack(maps)
+        height, width = image.shape[-2:]
+        if self.stride > 1:
+            padding = (0, -width % self.stride, 0, -height % self.stride)
+            image = nn.functional.pad(image, padding, mode="replicate")
+        return self.network(image.contiguous(memory_format=torch.channels_last))[..., :height, :width]
+
+    def assess(self, maps: Maps) -> tuple[Tensor, int]:
+        """Computes the loss of a batch, and of how many cells it is the mean; in evaluation updates `metrics`."""
+        outputs, target = self(maps), maps[self.target]
+        if target.is_floating_point():
+            known = target.isfinite()
+            with torch.autocast(target.device.type, enabled=False):
+                outputs = in_single_precision(outputs)
+                loss = self.loss(outputs, target)
+        else:
+            target = target.long()
+            known, loss = target != UNLABELLED, self.loss(outputs, target)
+        if not self.training:
+            self.update_metrics(outputs, target)
+        return loss, int(known.sum())
+
+    def calibrate(self, maps: Any, device: torch.device) -> None:
+        """Is called with the validation maps when the training has ended; the network is in evaluation.
+
+        Args:
+            maps: a `models.training.data.MapDataset` with `inputs` and the field that is learned.
+            device: where to compute.
+        """
+
+    @classmethod
+    def fit_pool(cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device) -> float:
+        """Fits the temperature of the average of several members.
+
+        Args:
+            members: trained and calibrated.
+            maps: a `models.training.data.MapDataset` with their inputs and the field that is learned.
+            seed: root seed of the cells to fit to.
+            device: where to compute.
+        """
+        raise NotImplementedError
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW under a one-cycle schedule over all steps of a training (Smith and Topin, 2018)."""
@@ -101,23 +221,29 @@ class TrainableNetwork(lightning.LightningModule):
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def training_step(self, batch: dict[str, Tensor], batch_index: int) -> Tensor:
-        """Computes the loss of a batch with `rgb` and `fields`."""
+    def on_train_epoch_start(self) -> None:
+        """Seeds what an epoch draws, such as dropout: by seed and epoch, so that a resumed training draws the same."""
+        place = np.array([self.current_epoch * self.trainer.world_size + self.global_rank])
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "epoch"), place, (1,))
+        torch.manual_seed(int(drawn.item() * 2**53))
+
+    def training_step(self, batch: Maps, batch_index: int) -> Tensor:
+        """Computes the loss of a batch."""
         loss, cells = self.assess(batch)
         self.log("train_loss", loss, on_step=False, on_epoch=True, sync_dist=True, batch_size=cells)
         return loss
 
-    def validation_step(self, batch: dict[str, Tensor], batch_index: int) -> None:
-        """Measures a batch with `rgb` and `fields`."""
+    def validation_step(self, batch: Maps, batch_index: int) -> None:
+        """Measures a batch."""
         self._update(batch)
         named = {"valid_loss": self.metrics["loss"], **dict(self.metrics.items())}  # tables begin with it
-        self.log_dict(named, on_epoch=True, batch_size=len(batch["rgb"]))
+        self.log_dict(named, on_epoch=True, batch_size=len(batch[self.target]))
 
     def measure(self, maps: Any) -> dict[str, float]:
         """Measures maps as training does, by name, such as `valid_loss`; the network is in evaluation.
 
         Args:
-            maps: a `models.training.data.MapDataset` with `rgb` and `fields`.
+            maps: a `models.training.data.MapDataset` with `inputs` and the field that is learned.
         """
         self.metrics.to(self.device).reset()
         with torch.inference_mode():
@@ -125,5 +251,131 @@ class TrainableNetwork(lightning.LightningModule):
                 self._update(batch)
         return {name: float(value) for name, value in self.metrics.compute().items()}
 
-    def _update(self, batch: dict[str, Tensor]) -> None:
-        self.metrics["loss"].update(*self.assess(batch))
+    def _update(self, batch: Maps) -> None:
+        loss, cells = self.assess(batch)
+        self.metrics["loss"].update(loss, cells)
+
+
+class TrainableModel(TrainableNetwork, ModelFamily):
+    """A model that `benchnav-train fit` trains, and that is kept in checkpoints.
+
+    Calibration: the temperature T widens or narrows every distribution on the scale of normal scores, to
+    F⁻¹(Φ(T·Φ⁻¹(u))). It is fitted to the validation maps by maximum likelihood and leaves every median as it is.
+    """
+
+    @abstractmethod
+    def to_distribution(self, outputs: Any) -> TraversabilityDistribution:
+        """Gives the distribution of λ in each cell, [B, H, W], from outputs of `forward`, float32."""
+
+    def predict(self, observation: Observation) -> TraversabilityDistribution:
+        """Predicts on the observation's device, to which the network is moved, some maps at a time.
+
+        Args:
+            observation: B maps of any size, with the layers of `inputs`.
+
+        Returns:
+            Distributions of shape [B, H, W].
+        """
+        return self.sharpen(self.predict_raw(layers_of(observation, self.inputs)))
+
+    def predict_raw(self, maps: Maps) -> TraversabilityDistribution:
+        """Predicts before calibration, from layers by name."""
+        first = next(iter(maps.values()))
+        self.eval().to(first.device)
+        size = max(1, CHUNK_CELLS // (first.shape[-2] * first.shape[-1]))
+        with torch.inference_mode():
+            chunks = [
+                self._some({name: layer[at : at + size] for name, layer in maps.items()})
+                for at in range(0, len(first), size)
+            ]
+        return map_tensors(chunks[0], lambda *values: torch.cat(values), *chunks[1:])
+
+    def _some(self, maps: Maps) -> TraversabilityDistribution:
+        return self.to_distribution(in_single_precision(self(maps)))
+
+    def sharpen(self, distribution: TraversabilityDistribution) -> TraversabilityDistribution:
+        """Applies the temperature."""
+        return widened(distribution, self.temperature)
+
+    def configure_metrics(self) -> dict[str, Metric]:
+        """The root mean square error of E[λ] to λ as observed."""
+        return {"rmse": MeanSquaredError(squared=False)}
+
+    def update_metrics(self, outputs: Any, target: Tensor) -> None:
+        """Updates the error of E[λ]."""
+        seen = target.isfinite()
+        self.metrics["rmse"].update(self.to_distribution(outputs).mean()[seen], target[seen])
+
+    def calibrate(self, maps: Any, device: torch.device) -> None:
+        """Fits the temperature."""
+        self.temperature = fit_width(*sample_scores(self.predict_raw, maps, self.inputs, self.seed, device))
+
+    @classmethod
+    def fit_pool(cls, members: Sequence[Self], maps: Any, seed: int, device: torch.device) -> float:
+        """Fits the temperature of the average of several members' distributions."""
+
+        def predict(layers: dict[str, Tensor]) -> TraversabilityDistribution:
+            return pool([member.sharpen(member.predict_raw(layers)) for member in members])
+
+        return fit_width(*sample_scores(predict, maps, members[0].inputs, seed, device))
+
+    @classmethod
+    def from_checkpoint(cls, checkpoint: Checkpoint) -> TraversabilityModel:  # type: ignore[override]
+        """Rebuilds the model, or the ensemble.
+
+        Raises:
+            CheckpointError: there is no part of it.
+        """
+        name = checkpoint.model
+        members = [
+            cls.from_part(checkpoint.part(part), checkpoint) for part in member_names(checkpoint, name)
+        ]
+        if len(members) == 1:
+            return members[0]
+        return Ensemble(members, checkpoint.pool_temperature)
+
+    @classmethod
+    def from_part(cls, part: Part, checkpoint: Checkpoint) -> Self:
+        """Rebuilds one member."""
+        return cls.from_tensors(part.config, checkpoint.class_names, part.tensors)
+
+
+class Ensemble(TraversabilityModel):
+    """Several models as one: the average of their distribution functions, calibrated as a whole.
+
+    Source: Lakshminarayanan et al. (2017), "Simple and scalable predictive uncertainty estimation using deep
+    ensembles".
+
+    Args:
+        members: the models.
+        temperature: of the average; see `TrainableModel`.
+    """
+
+    def __init__(self, members: Sequence[TrainableModel], temperature: float = 1.0) -> None:
+        """Keeps them."""
+        self.members, self.temperature = tuple(members), temperature
+
+    def predict(self, observation: Observation) -> TraversabilityDistribution:
+        """Predicts by all members; distributions of shape [B, H, W]."""
+        averaged = pool([member.predict(observation) for member in self.members])
+        return widened(averaged, self.temperature)
+
+
+def widened(distribution: TraversabilityDistribution, temperature: float) -> TraversabilityDistribution:
+    """Multiplies the normal scores of distributions by a temperature, over 1 to make them wider.
+
+    Args:
+        distribution: of shape [B, H, W].
+        temperature: > 0; at 1 nothing is changed.
+    """
+    if temperature == 1:
+        return distribution
+    zeros = torch.zeros(distribution.shape, dtype=distribution.dtype, device=distribution.device)
+    return conditioned(distribution, zeros, zeros + temperature)
+
+
+def in_single_precision(outputs: Any) -> Any:
+    """Outputs of a network, a tensor or several, as float32."""
+    if isinstance(outputs, Tensor):
+        return outputs.float()
+    return tuple(value.float() for value in outputs)

@@ -1,13 +1,14 @@
-"""Training data in whole maps, read as they are asked for, or held in memory.
+"""Training data: maps or squares cut from them, read as they are asked for, or held in memory.
 
 What a batch holds is a pure function of (seed, epoch, place in the epoch): order and augmentation
 come from named random streams, so a training that is resumed sees what it would have seen, however many
 processes read for it. Letters in shapes: B maps in all, b maps in a batch, H×W cells.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import lightning
 import numpy as np
@@ -18,44 +19,118 @@ from torchvision.transforms.v2 import functional as photometry
 
 from benchnav.core import rng
 from benchnav.core.device import CPU
-from benchnav.core.errors import DatasetError
+from benchnav.core.errors import DatasetError, expect
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.nets.trainable import MapScale
+from benchnav.models.nets.inputs import LayerScale, is_azimuth
 
 TRAIN, VALID = "train", "valid"
 
 _SYMMETRIES = tuple(range(8))  # of the square: four rotations, each as it is or mirrored
 _SYMMETRIES_OF_RECTANGLE = (0, 1, 4, 5)  # those that leave height and width as they are
+_LEAST_VARIANCE = 1e-4
 
-MapKey = tuple[Tensor, Tensor, Tensor]
 Batch = dict[str, Tensor]
 
 
+class MapKey(NamedTuple):
+    """Which maps a batch holds, and what is done to each.
+
+    Args:
+        index: of the maps, int64, shape [b].
+        symmetry: that each is turned by, int64, shape [b].
+        factors: of `apply_jitter`, shape [b, 3].
+        origin: first row and column of the square that is cut from each, int64, shape [b, 2].
+    """
+
+    index: Tensor
+    symmetry: Tensor
+    factors: Tensor
+    origin: Tensor
+
+
 class MapDataset(TerrainMaps):
-    """Maps by field, `rgb` (uint8, [b, 3, H, W]) among them; indexed by a whole batch at a time."""
+    """Maps by field, indexed by a whole batch at a time.
+
+    Args:
+        path: of the dataset.
+        split: name of one of its splits.
+        fields: which to read; `rgb` is uint8, [b, 3, H, W].
+        in_memory: read all maps at once.
+        crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
+        seed: root seed of the squares that `chunks` cuts.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        split: str,
+        fields: Sequence[str] = ("rgb", "class_id"),
+        in_memory: bool = False,
+        crop: int = 0,
+        seed: int = 0,
+    ) -> None:
+        """Checks split and fields, and reads the maps where that is asked for."""
+        super().__init__(path, split, fields, in_memory)
+        self.crop, self.seed = crop, seed
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
-        """Gives every field of the maps in `key`, shape [b, *, H, W].
-
-        Args:
-            key: indices of maps and the symmetry to apply to each, both int64 of shape [b], and the
-                factors of `apply_jitter`, shape [b, 3].
-        """
-        index, symmetry, factors = key
-        batch = {
-            name: torch.stack(
-                [apply_symmetry(layer, which) for layer, which in zip(values, symmetry.tolist(), strict=True)]
+        """Gives every field of the maps in `key`, shape [b, *, H, W]."""
+        which, place = key.index.unique(return_inverse=True)  # squares of one map are cut from one reading
+        read = self.read(which.tolist())
+        batch = {}
+        for name, values in read.items():
+            cut = (
+                self._cut(values[at], origin) for at, origin in zip(place, key.origin.tolist(), strict=True)
             )
-            for name, values in self.read(index.tolist()).items()
-        }
-        return {**batch, "rgb": apply_jitter(batch["rgb"], factors)}
+            turned = zip(cut, key.symmetry.tolist(), strict=True)
+            batch[name] = torch.stack([apply_symmetry(layer, symmetry, name) for layer, symmetry in turned])
+        if "rgb" in batch:
+            batch["rgb"] = apply_jitter(batch["rgb"], key.factors)
+        return batch
 
     def chunks(self, device: torch.device = CPU) -> Iterator[tuple[range, Batch]]:
-        """All maps as they are, in order, some at a time, with their indices; on a device."""
+        """All maps neither turned nor jittered, in order, some at a time, with their indices; on a device."""
+        origins = crop_origins(self.dataset.grid.shape, self.crop, self.seed, 0, len(self))
         for indices, maps in self.dataset.chunks(self.split, self.fields):
-            yield indices, {name: torch.from_numpy(values).to(device) for name, values in maps.items()}
+            batch = {name: torch.from_numpy(values) for name, values in maps.items()}
+            if self.crop:
+                chosen = origins[indices.start : indices.stop].tolist()
+                batch = {
+                    name: torch.stack([self._cut(*pair) for pair in zip(values, chosen, strict=True)])
+                    for name, values in batch.items()
+                }
+            yield indices, {name: values.to(device) for name, values in batch.items()}
+
+    def _cut(self, layer: Tensor, origin: Sequence[int]) -> Tensor:
+        """The square of a layer, [*, H, W], from a cell on; the layer itself where none is asked for."""
+        row, column = origin
+        return layer[..., row : row + self.crop, column : column + self.crop] if self.crop else layer
+
+
+def crop_origins(shape: tuple[int, int], crop: int, seed: int, epoch: int, count: int) -> np.ndarray:
+    """Draws where squares are cut from maps, by (seed, epoch, place).
+
+    Args:
+        shape: (H, W) of the maps.
+        crop: cells of a side; 0 takes whole maps, which begin at 0.
+        seed: root seed.
+        epoch: of the training.
+        count: places in the epoch.
+
+    Returns:
+        First rows and columns, int64, shape [count, 2].
+    """
+    if not crop:
+        return np.zeros((count, 2), dtype=np.int64)
+    drawn = rng.uniform(rng.stream_key(seed, "models", "map crop"), np.array([epoch]), (count, 2))[0]
+    return (drawn * (np.array(shape) - crop + 1)).astype(np.int64)
+
+
+def squares_a_map(shape: tuple[int, int], crop: int) -> int:
+    """Squares that a training map gives an epoch: as many as it has room for; 1 of whole maps."""
+    return (shape[0] // crop) * (shape[1] // crop) if crop else 1
 
 
 def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
@@ -75,15 +150,20 @@ def apply_jitter(rgb: Tensor, factors: Tensor) -> Tensor:
     return torch.stack(changed)
 
 
-def apply_symmetry(maps: Tensor, which: int) -> Tensor:
+def apply_symmetry(maps: Tensor, which: int, name: str = "") -> Tensor:
     """Turns maps by 90° `which // 2` times and then, if `which` is odd, mirrors them left to right.
 
     Args:
         maps: shape [*B, H, W].
         which: 0–7; 0 changes nothing.
+        name: of the field; directions turn with the map.
     """
     turned = torch.rot90(maps, which // 2, (-2, -1))
-    return turned.flip(-1) if which % 2 else turned
+    turned = turned.flip(-1) if which % 2 else turned
+    if which and is_azimuth(name):
+        turned = turned - 90 * (which // 2)
+        turned = (180 - turned if which % 2 else turned) % 360
+    return turned
 
 
 @dataclass(eq=False)
@@ -96,8 +176,10 @@ class MapSampler(Sampler[MapKey]):
         seed: root seed.
         symmetries: which symmetries to draw from; (0,) leaves maps as they are.
         jitter: largest relative change of brightness, contrast and saturation.
-        shuffle: whether to change the order each epoch.
+        shuffle: whether order, symmetries and squares change each epoch.
         share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
+        crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
+        shape: (H, W) of the maps that squares are cut from.
         epoch: that the next iteration gives.
     """
 
@@ -108,31 +190,39 @@ class MapSampler(Sampler[MapKey]):
     jitter: float = 0.0
     shuffle: bool = False
     share: tuple[int, int] = (0, 1)
+    crop: int = 0
+    shape: tuple[int, int] = (0, 0)
     epoch: int = 0
 
     def set_epoch(self, epoch: int) -> None:
         """Chooses the epoch that the next iteration gives; the trainer calls this."""
         self.epoch = epoch
 
+    @property
+    def places(self) -> int:
+        """Maps an epoch, or squares of them."""
+        return self.maps * (squares_a_map(self.shape, self.crop) if self.shuffle else 1)
+
     def __len__(self) -> int:
         """Batches an epoch."""
-        return -(-self.maps // self.batch_size)
+        return -(-self.places // self.batch_size)
 
     def __iter__(self) -> Iterator[MapKey]:
         """Yields the batches of the epoch."""
-        order, epoch = np.arange(self.maps), np.array([self.epoch])
+        count, number = self.places, self.epoch if self.shuffle else 0
+        order, epoch = np.arange(count), np.array([number])
         if self.shuffle:
-            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, self.maps)[0]
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (self.maps,))[0]
+            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, count)[0]
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (count,))[0]
         symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
-        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (self.maps, 3))[0]
+        drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (count, 3))[0]
         factors = 1 + self.jitter * (2 * drawn - 1)
+        origins = crop_origins(self.shape, self.crop, self.seed, number, count)
         first, step = self.share
-        pieces = (np.array_split(values, len(self)) for values in (order, symmetry, factors))
+        pieces = (np.array_split(v, len(self)) for v in (order % self.maps, symmetry, factors, origins))
         for batch in zip(*pieces, strict=True):
             start = min(first, len(batch[0]) - 1)  # no process is left without a map
-            index, which, how = (torch.from_numpy(values[start::step]) for values in batch)
-            yield index, which, how
+            yield MapKey(*(torch.from_numpy(values[start::step]) for values in batch))
 
 
 class MapData(lightning.LightningDataModule):
@@ -146,8 +236,10 @@ class MapData(lightning.LightningDataModule):
         dataset: where they are.
         batch_size: most maps a batch.
         seed: root seed of order and augmentation.
+        fields: which to read.
         jitter: largest relative change of brightness, contrast and saturation of a training map.
-        fields: which fields to read beside `rgb`.
+        symmetries: whether training maps are turned and mirrored.
+        crop: cells of a side of the squares to train and to measure on; 0 takes whole maps.
         in_memory: hold all maps in memory.
         workers: processes that read ahead; 0 reads in this one.
 
@@ -160,40 +252,53 @@ class MapData(lightning.LightningDataModule):
         dataset: TerrainDataset,
         batch_size: int,
         seed: int,
+        fields: Sequence[str] = ("rgb", "class_id"),
         jitter: float = 0.0,
-        fields: tuple[str, ...] = ("class_id",),
+        symmetries: bool = True,
+        crop: int = 0,
         in_memory: bool = False,
         workers: int = 0,
     ) -> None:
         """Opens the splits."""
         super().__init__()
         self.batch_size, self.seed, self.jitter, self.workers = batch_size, seed, jitter, workers
-        read = ("rgb", *fields)
+        self.symmetries = symmetries
         self.train, self.valid = (
-            MapDataset(dataset.path, split, read, in_memory) for split in (TRAIN, VALID)
+            MapDataset(dataset.path, split, fields, in_memory, crop, seed) for split in (TRAIN, VALID)
         )
 
-    def scale(self) -> MapScale:
-        """What the training maps' colours and slopes are scaled by; 1 of slopes that are not read."""
-        counts, squares = torch.zeros(3, 256, dtype=torch.int64), torch.zeros((), dtype=torch.float64)
-        for _, maps in self.train.chunks():
-            channels = maps["rgb"].unbind(1)
-            counts += torch.stack([channel.flatten().bincount(minlength=256) for channel in channels])
-            if "slope_deg" in maps:
-                squares += maps["slope_deg"].double().square().sum()
-        share, level = counts.double() / counts.sum(1, keepdim=True), torch.arange(256.0, dtype=torch.float64)
-        mean = (share * level).sum(1)
-        variance = (share * level**2).sum(1) - mean**2
-        # Ground of one colour, or flat, would have no scale.
-        std, slope_deg = (
-            value.clamp(min=1).sqrt().float() for value in (variance, squares / counts[0].sum())
-        )
-        return MapScale(mean.float(), std, slope_deg)
+    def scale(self, inputs: Sequence[str]) -> dict[str, LayerScale]:
+        """What layers of the training maps are scaled by, from all their cells that are known."""
+        counts = torch.zeros(3, 256, dtype=torch.int64)
+        sums: dict[str, Tensor] = {name: torch.zeros(2, dtype=torch.float64) for name in inputs}
+        cells = dict.fromkeys(inputs, 0)
+        for _, maps in self.train.dataset.chunks(TRAIN, inputs):
+            for name in inputs:
+                values = torch.from_numpy(maps[name])
+                if name == "rgb":
+                    channels = values.unbind(1)
+                    counts += torch.stack([channel.flatten().bincount(minlength=256) for channel in channels])
+                    continue
+                known = values.double().nan_to_num()
+                sums[name] += torch.stack([known.sum(), known.square().sum()])
+                cells[name] += int(values.isfinite().sum())
+        scale = {name: _layer_scale(name, *sums[name], cells[name]) for name in inputs if name != "rgb"}
+        if "rgb" in inputs:
+            share, level = (
+                counts.double() / counts.sum(1, keepdim=True),
+                torch.arange(256.0, dtype=torch.float64),
+            )
+            mean = (share * level).sum(1)
+            variance = (share * level**2).sum(1) - mean**2
+            # Ground of one colour would have no scale.
+            scale["rgb"] = LayerScale(mean.float(), variance.clamp(min=1).sqrt().float(), torch.ones(()))
+        return scale
 
     def train_dataloader(self) -> DataLoader[Batch]:
         """Augmented batches in random order."""
         height, width = self.train.dataset.grid.shape
-        symmetries = _SYMMETRIES if height == width else _SYMMETRIES_OF_RECTANGLE
+        square = height == width or self.train.crop
+        symmetries = (0,) if not self.symmetries else _SYMMETRIES if square else _SYMMETRIES_OF_RECTANGLE
         return self._load(self.train, symmetries=symmetries, jitter=self.jitter, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[Batch]:
@@ -202,12 +307,31 @@ class MapData(lightning.LightningDataModule):
 
     def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
         share = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        sampler = MapSampler(len(maps), self.batch_size, self.seed, share=share, **order)
+        sampler = MapSampler(
+            len(maps),
+            self.batch_size,
+            self.seed,
+            share=share,
+            crop=maps.crop,
+            shape=maps.dataset.grid.shape,
+            **order,
+        )
         # A generator of its own keeps the loader from drawing on PyTorch's global one.
         return DataLoader(
             maps, batch_size=None, sampler=sampler, generator=torch.Generator(),
             num_workers=self.workers, persistent_workers=self.workers > 0,
         )  # fmt: skip
+
+
+def _layer_scale(name: str, total: Tensor, squares: Tensor, cells: int) -> LayerScale:
+    """The scale of a layer from its sum and its sum of squares over so many known cells; directions keep theirs."""
+    if is_azimuth(name):
+        return LayerScale(torch.zeros(2), torch.ones(2), torch.ones(()))
+    mean, square = total / max(1, cells), squares / max(1, cells)
+    std = (
+        (square - mean**2).clamp(min=_LEAST_VARIANCE).sqrt()
+    )  # a layer that is the same everywhere has no scale
+    return LayerScale(mean.float().view(1), std.float().view(1), square.clamp(min=1).sqrt().float())
 
 
 def open_dataset(data: str) -> TerrainDataset:
@@ -225,21 +349,28 @@ def open_dataset(data: str) -> TerrainDataset:
     return dataset
 
 
-def check_maps(dataset: TerrainDataset, field: str) -> None:
+def check_maps(dataset: TerrainDataset, field: str, crop: int = 0) -> None:
     """Refuses a dataset that a network cannot learn from.
 
     Args:
         dataset: the maps.
         field: `class_id` or `traversability`, which is to be learned.
+        crop: cells of a side of the squares that are cut from maps; 0 takes whole maps.
 
     Raises:
-        DatasetError: there are fewer than two maps to train on, or none to measure on; or in one of these splits no
-            cell has what is learned.
+        ConfigError: the squares are larger than the maps.
+        DatasetError: there are fewer than two maps or squares to train on, or none to measure on; or in one of these
+            splits no cell has what is learned.
     """
+    height, width = dataset.grid.shape
+    expect(
+        crop == 0 or 8 <= crop <= min(height, width),
+        f"`crop` in 8–{min(height, width)} cells, the shorter side of the maps, or 0, got {crop}.",
+    )
     what = {"class_id": "cells with a class", "traversability": "observed traversability"}[field]
     for split, least in ((TRAIN, 2), (VALID, 1)):
         place, count = f"split {split} of {dataset.path}", dataset.map_count(split)
-        if count < least:
+        if count * squares_a_map((height, width), crop) < least:
             raise DatasetError(f"Expected at least {least} maps in {place}, got {count}.")
         chunks = (maps[field] for _, maps in dataset.chunks(split, (field,)))
         if not any(bool((np.isfinite(values) & (values != UNLABELLED)).any()) for values in chunks):

@@ -147,8 +147,10 @@ def fit(
             kept = {"logger": TensorBoardLogger(folder, name="", version=""), "plugins": [WholeFiles()]}
         trainer = make_trainer(callbacks, **kept, **options.chosen(**usual))
         handler = signal.getsignal(signal.SIGINT)
+        devices = [options.place] if options.place.type == "cuda" else []
         try:
-            trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
+            with torch.random.fork_rng(devices=devices):  # which training seeds anew each epoch
+                trainer.fit(module, **data, ckpt_path=state, weights_only=True if state else None)
         except SystemExit:  # so the trainer ends when interrupted, deaf to further interruptions
             signal.signal(signal.SIGINT, handler)
             raise KeyboardInterrupt from None

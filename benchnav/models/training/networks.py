@@ -1,14 +1,13 @@
-"""Training networks, whatever they learn: one door for classifiers, mixture-density networks and those to come."""
+"""Training networks, whatever they learn: one door for classifiers, trainable models of ours and a user's own."""
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
-import torch
 from lightning.pytorch.callbacks import EarlyStopping
 
+from benchnav.core import registry
 from benchnav.core.errors import ConfigError, expect
-from benchnav.core.settings import one_line
+from benchnav.core.settings import config_class, of, read
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
     CLASSIFIER,
@@ -17,43 +16,90 @@ from benchnav.models.checkpoint import (
     Part,
     as_stored,
     member_name,
+    member_names,
     training_folder,
 )
-from benchnav.models.config import ClassifierConfig, LatentGPConfig, NetworkConfig, TrainOptions, check_seed
-from benchnav.models.nets.classifier import TerrainClassifier, classifiers_of, fit_pool_temperature
-from benchnav.models.nets.mdn import MixtureDensityNetwork
-from benchnav.models.training.data import (
-    TRAIN,
-    VALID,
-    MapData,
-    MapDataset,
-    check_maps,
-    open_dataset,
-    training_digest,
-)
-from benchnav.models.training.fit import (
-    FitOptions,
-    KeepBest,
-    fit,
-    in_words,
-    is_first_process,
-    make_trainer,
-    quietly,
-    say,
-)
+from benchnav.models.config import ClassifierConfig, LatentGPConfig, TrainingConfig, TrainOptions, check_seed
+from benchnav.models.fused import FusedModel
+from benchnav.models.nets.classifier import TerrainClassifier
+from benchnav.models.nets.trainable import TrainableModel
+from benchnav.models.training.check import Trainable, check_network, class_names, fields_of
+from benchnav.models.training.data import VALID, MapData, MapDataset, open_dataset, training_digest
+from benchnav.models.training.fit import FitOptions, KeepBest, fit, in_words, is_first_process, say
 from benchnav.models.training.gaussian_processes import train_gps_on_maps
 from benchnav.models.training.target import Target, fresh_checkpoint, open_target
 
-NETWORKS: Mapping[type, Any] = {
-    network.kind: network for network in (TerrainClassifier, MixtureDensityNetwork)
-}
+
+def find_trainable(source: str, settings: dict[str, Any]) -> Trainable:
+    """Finds a trainable model by name, file or module.
+
+    Raises:
+        ConfigError: there is none of that name, it cannot be trained, or has no such settings.
+    """
+    found = registry.find("model", source)
+    kind = found.target
+    if not (isinstance(kind, type) and issubclass(kind, TrainableModel)):
+        known = [name for name in registry.names("model") if is_trainable(name)]
+        raise ConfigError(
+            f"Expected a model that can be trained, {', '.join([FUSED, *known])} or FILE.py:Class with a "
+            f"benchnav.models.TrainableModel, got {source!r}, which is none."
+        )
+    owner, config_kind = f"model {source!r}", config_class(kind)
+    if config_kind is None or not issubclass(config_kind, TrainingConfig):
+        raise ConfigError(
+            f"Expected {owner} to be made with one parameter `config`, a benchnav.models.TrainingConfig, got another. "
+            "Write def __init__(self, config: MyConfig = MyConfig()), where MyConfig is a subclass of it."
+        )
+    config = read(config_kind, settings, of(owner))
+    name = source if source in registry.names("model") else kind.__name__
+    code = "" if found.shipped else found.digest
+    return Trainable(kind=kind, config=config, name=name, family=name, code=code)
+
+
+def is_trainable(name: str) -> bool:
+    """Tells whether a registered model can be trained; one that cannot be imported cannot."""
+    try:
+        kind = registry.find("model", name).target
+    except ConfigError:
+        return False
+    return isinstance(kind, type) and issubclass(kind, TrainableModel)
+
+
+def fit_model(
+    how: TrainOptions, model: str, data: str, out: str, settings: dict[str, Any], members: int = 1
+) -> None:
+    """Trains any model: the fused one in its two stages, every other in one.
+
+    Args:
+        how: how to train.
+        model: registered name, package.module:Class or path/to/file.py:Class.
+        data: path or id of a dataset.
+        out: folder of the checkpoint.
+        settings: of the model, plain data by name; of the fused one those of its stages, `classifier` and `gp`.
+        members: how many networks there are to be.
+    """
+    if registry.find("model", model).target is FusedModel:
+        kinds = {CLASSIFIER: ClassifierConfig, GP: LatentGPConfig}
+        unknown = [name for name in settings if name not in kinds]
+        expect(not unknown, f"`settings` of {model!r} among {', '.join(kinds)}, got {', '.join(unknown)}.")
+        read_settings: Any = {
+            name: read(kind, settings.get(name, {}), of(name)) for name, kind in kinds.items()
+        }
+        train_networks(how, data, out, classifier_of(read_settings[CLASSIFIER]), read_settings[GP], members)
+        return
+    train_networks(how, data, out, find_trainable(model, settings), members=members)
+
+
+def classifier_of(config: ClassifierConfig) -> Trainable:
+    """The classifier of a fused model."""
+    return Trainable(kind=TerrainClassifier, config=config, name=CLASSIFIER, family=FUSED)
 
 
 def train_networks(
     how: TrainOptions,
     data: str,
     out: str,
-    config: NetworkConfig,
+    trainable: Trainable,
     gp: LatentGPConfig | None = None,
     members: int = 1,
 ) -> None:
@@ -63,32 +109,36 @@ def train_networks(
         how: how to train.
         data: path or id of a dataset.
         out: folder of the checkpoint.
-        config: of the networks.
+        trainable: the networks.
         gp: of the GPs, if any.
-        members: how many classifiers there are to be.
+        members: how many networks there are to be.
     """
     expect(members >= 1, f"`members` ≥ 1, got {members}.")
     check_seed(how.seed, members)
     dataset, trainer = open_dataset(data), dict(how.trainer or {})
-    # The length of training is the network's own setting, wherever it is said.
-    config = replace(config, max_epochs=trainer.pop("max_epochs", config.max_epochs))
+    # These are the network's own settings, wherever they are said.
+    config = replace(
+        trainable.config,
+        max_epochs=trainer.pop("max_epochs", trainable.config.max_epochs),
+        symmetries=how.symmetries and trainable.config.symmetries,
+        crop=how.crop or trainable.config.crop,
+    )
+    trainable = replace(trainable, config=config)
     options = FitOptions(**{**vars(how), "trainer": trainer, "folder": training_folder(out)})
-    check_network(config, dataset, options)
-    part = NETWORKS[type(config)].part
-    parts, model = [part], part
-    if part == CLASSIFIER:
-        parts, model = [member_name(index) for index in range(members)], FUSED
+    check_network(trainable, dataset, options)
+    parts = [member_name(index, trainable.name) for index in range(members)]
     trained = [GP] * bool(gp) + parts
-    target = open_target(out, fresh_checkpoint(dataset, model), trained, training_digest(dataset), options)
+    fresh = fresh_checkpoint(dataset, trainable.family, trainable.code)
+    target = open_target(out, fresh, trained, training_digest(dataset), options)
     if gp and not target.holds(GP, gp, how.seed):
         target.add(GP, train_gps_on_maps(gp, dataset, options))
-    train_parts(target, config, dataset, parts)
+    train_parts(target, trainable, dataset, parts)
     if not target.changed:
         print(f"{out} was finished already, with {' and '.join(sorted(target.checkpoint.parts))}")
 
 
 def fit_network(
-    config: NetworkConfig,
+    trainable: Trainable,
     dataset: TerrainDataset,
     seed: int,
     options: FitOptions,
@@ -98,7 +148,7 @@ def fit_network(
     """Trains a network on the split `train` until the split `valid` no longer gains, and calibrates it.
 
     Args:
-        config: what to train.
+        trainable: what to train.
         dataset: the maps.
         seed: root seed of weights, order and augmentation.
         options: how to train; precision is bf16-mixed where it is fast unless they say otherwise.
@@ -110,21 +160,22 @@ def fit_network(
         The network with its best weights, on the CPU, and what was measured on `valid` in the best epoch, before it
         was calibrated.
     """
-    kind = NETWORKS[type(config)]
+    config, network = trainable.config, trainable.kind(trainable.config)
     data = MapData(
-        dataset, config.batch_size, seed, config.jitter, kind.fields,
+        dataset, config.batch_size, seed, fields_of(network), config.jitter, config.symmetries, config.crop,
         in_memory=options.in_memory, workers=options.workers,
     )  # fmt: skip
-    network = kind(config, len(dataset.recipe.classes), data.scale(), seed)
+    network.build(data.scale(network.inputs), class_names(dataset), seed)
     metrics = fit(
         network,
-        part or kind.part,
+        part or trainable.name,
         options,
         {
             "config": asdict(config),
             "data": training_digest(dataset),
             "seed": seed,
             "half_precision": half_precision,
+            **({"code": trainable.code} if trainable.code else {}),
         },
         [KeepBest(), EarlyStopping("valid_loss", patience=config.patience, check_on_train_epoch_end=False)],
         {"datamodule": data},
@@ -134,57 +185,18 @@ def fit_network(
     if half_precision:
         network.load_state_dict(as_stored(network.state_dict(), half_precision))
         metrics = {**metrics, **network.measure(data.valid)}
-    network.calibrate(data.valid, seed, options.place)
+    network.calibrate(data.valid, options.place)
     return network.cpu(), metrics
 
 
-def check_network(config: NetworkConfig, dataset: TerrainDataset, options: FitOptions) -> None:
-    """Refuses what could not be trained before anything is: builds the trainer and tries the network on a batch.
-
-    Raises:
-        ConfigError: Lightning or the network does not take the settings, or nothing would be trained or measured.
-        DatasetError: there are too few maps, or none of their cells has what is learned.
-    """
-    kind = NETWORKS[type(config)]
-    check_maps(dataset, kind.fields[-1])
-    network = kind(config, len(dataset.recipe.classes))
-    with quietly():
-        chosen = options.chosen(max_epochs=config.max_epochs)
-        trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
-    every = trainer.check_val_every_n_epoch or 0
-    expect(
-        every <= config.max_epochs,
-        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, got {every}.",
-    )
-    for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
-        limit, batches = getattr(trainer, name), -(-dataset.map_count(split) // config.batch_size)
-        expect(
-            (batches * limit if isinstance(limit, float) else limit) >= 1,
-            f"`trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
-            "Leave it out to take all.",
-        )
-    maps = dataset.map_count(TRAIN)
-    together = min(2, maps // -(-maps // config.batch_size))
-    batch = MapDataset(dataset.path, TRAIN, ("rgb", *kind.fields)).read(range(together))
-    try:
-        with torch.no_grad():
-            network.train().assess(batch)
-    except (RuntimeError, ValueError, TypeError, AssertionError) as error:
-        height, width = dataset.grid.shape
-        raise ConfigError(
-            f"Expected a network that takes batches of {together} maps of {height}×{width} cells, got "
-            f"{config.architecture} of {config.encoder}, which does not: {one_line(error)} Choose another."
-        ) from error
-
-
-def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, parts: list[str]) -> None:
-    """Trains the networks that a checkpoint lacks, with the seeds `seed`, `seed` + 1, …, and pools classifiers."""
-    options = target.options
+def train_parts(target: Target, trainable: Trainable, dataset: TerrainDataset, parts: list[str]) -> None:
+    """Trains the networks that a checkpoint lacks, with the seeds `seed`, `seed` + 1, …, and calibrates their pool."""
+    options, config = target.options, trainable.config
     for seed, part in enumerate(parts, options.seed):
         if target.holds(part, config, seed):
             continue
-        network, metrics = fit_network(config, dataset, seed, options, part, options.half_precision)
-        calibrated = {name: value for name, value in network.settings().items() if name not in vars(config)}
+        network, metrics = fit_network(trainable, dataset, seed, options, part, options.half_precision)
+        calibrated = {} if network.temperature == 1 else {"temperature": network.temperature}
         shown = filter(None, [in_words(metrics, "valid_"), in_words(calibrated)])
         say(f"{part}: best epoch {metrics['epoch']:.0f}, validation {', '.join(shown)}")
         trained = Part(
@@ -198,11 +210,13 @@ def train_parts(target: Target, config: NetworkConfig, dataset: TerrainDataset, 
             trainer=options.trainer_settings,
         )
         target.add(part, trained)
-    if not isinstance(config, ClassifierConfig) or not is_first_process():
+    names = member_names(target.checkpoint, trainable.name)
+    if len(names) == 1 or not is_first_process():
         return
-    members = classifiers_of(target.checkpoint)
-    if len(members) == 1:
-        return
-    temperature = fit_pool_temperature(members, MapDataset(dataset.path, VALID), options.seed, options.place)
-    say(f"pool of {len(members)} classifiers: temperature {temperature:.3f}")
+    found = [target.checkpoint.part(name) for name in names]
+    classes = target.checkpoint.class_names
+    members = [trainable.kind.from_tensors(part.config, classes, part.tensors) for part in found]
+    maps = MapDataset(dataset.path, VALID, fields_of(members[0]), crop=config.crop, seed=options.seed)
+    temperature = trainable.kind.fit_pool(members, maps, options.seed, options.place)
+    say(f"pool of {len(members)} networks: temperature {temperature:.3f}")
     target.set_pool_temperature(temperature)

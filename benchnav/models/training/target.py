@@ -13,7 +13,6 @@ from rich.filesize import decimal
 from benchnav.core.errors import CheckpointError
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.checkpoint import (
-    CLASSIFIER,
     CONFIG,
     FUSED,
     Checkpoint,
@@ -23,7 +22,7 @@ from benchnav.models.checkpoint import (
     open_place,
     save_checkpoint,
 )
-from benchnav.models.config import NetworkConfig
+from benchnav.models.config import TrainingConfig
 from benchnav.models.training.fit import FitOptions, differing, forget, interrupted, is_first_process
 
 
@@ -50,7 +49,7 @@ class Target:
 
         Args:
             name: of the part.
-            config: settings of its training; such of a `NetworkConfig` under those of the trainer as well.
+            config: settings of its training; such of a `TrainingConfig` under those of the trainer as well.
             seed: its root seed.
 
         Raises:
@@ -64,7 +63,7 @@ class Target:
         wanted = {**asdict(config), "seed": seed, "data": self.digest}
         there = {key: part.config.get(key, usual) for key, usual in defaults.items()}
         there |= {"seed": part.seed, "data": part.data_digest}
-        if isinstance(config, NetworkConfig):
+        if isinstance(config, TrainingConfig):
             wanted["half_precision"], there["half_precision"] = options.half_precision, part.half_precision
             if part.trainer is not None:
                 wanted |= {f"trainer.{key}": value for key, value in options.trainer_settings.items()}
@@ -103,9 +102,9 @@ class Target:
         print(f"wrote {self.folder} with {parts} ({decimal(size)})")
 
 
-def fresh_checkpoint(dataset: TerrainDataset, model: str = FUSED) -> Checkpoint:
-    """A checkpoint without parts, of a family of models and the classes of a dataset."""
-    return Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model)
+def fresh_checkpoint(dataset: TerrainDataset, model: str = FUSED, code: str = "") -> Checkpoint:
+    """A checkpoint without parts, of a family of models, the classes of a dataset and the digest of a class's code."""
+    return Checkpoint(class_names=tuple(item.name for item in dataset.recipe.classes), model=model, code=code)
 
 
 def open_target(
@@ -135,6 +134,11 @@ def open_target(
     # Whether a checkpoint can be written there shows now rather than after the training.
     with open_place(out) as (folder, _):
         checkpoint = existing(folder, may_replace) or fresh
+    if checkpoint.code != fresh.code and checkpoint.model == fresh.model and not may_replace:
+        raise CheckpointError(
+            f"Expected checkpoint {folder} to be of the code of {fresh.model} as it is now, got one of other code. "
+            "Pass --overwrite to replace it."
+        )
     if (checkpoint.model, checkpoint.class_names) != (fresh.model, fresh.class_names):
         if not may_replace:
             wanted, got = (
@@ -146,12 +150,13 @@ def open_target(
                 "Choose another `out`, or pass --overwrite to replace it."
             )
         checkpoint = fresh
+    checkpoint = replace(checkpoint, code=fresh.code)
     if may_replace:
         # Members of an ensemble stand or fall together.
         kept = {
             name: part
             for name, part in checkpoint.parts.items()
-            if name not in parts and not (is_member(name) and CLASSIFIER in parts)
+            if name not in parts and not any(is_member(name, stem) for stem in parts)
         }
         checkpoint = replace(checkpoint, parts=kept)
     elif not options.resume and not checkpoint.parts.keys().isdisjoint(parts):

@@ -1,4 +1,5 @@
 import logging
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,23 +14,23 @@ from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.config import ClassifierConfig
 from benchnav.models.nets.classifier import MeanIoU, TerrainClassifier, build_network
-from benchnav.models.nets.trainable import MapScale
 from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.networks import fit_network
+from tests.models.support import names, scale, trainable
 
 CPU = FitOptions(device="cpu", trainer={"precision": "32-true"})
 MEAN, STD = torch.tensor([100.0, 90.0, 80.0]), torch.tensor([20.0, 25.0, 30.0])
 
 
 def build(seed: int = 0, **settings: object) -> TerrainClassifier:
-    return TerrainClassifier(
-        ClassifierConfig(**settings), 4, MapScale(MEAN, STD, torch.ones(())), seed
-    ).eval()  # type: ignore[arg-type]
+    config = ClassifierConfig(**settings)  # type: ignore[arg-type]
+    return TerrainClassifier(config).build(scale(MEAN, STD), names(4), seed).eval()
 
 
-def image(height: int, width: int, batch: int = 1) -> torch.Tensor:
+def image(height: int, width: int, batch: int = 1) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(5)
-    return torch.randint(0, 256, (batch, 3, height, width), generator=generator, dtype=torch.uint8)
+    rgb = torch.randint(0, 256, (batch, 3, height, width), generator=generator, dtype=torch.uint8)
+    return {"rgb": rgb}
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (33, 20), (32, 64)])
@@ -44,10 +45,10 @@ def test_colours_are_normalised_by_the_training_maps() -> None:
     model = build()
     seen: list[torch.Tensor] = []
     model.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    rgb = image(32, 32)
+    maps = image(32, 32)
     with torch.no_grad():
-        model(rgb)
-    expected = (rgb.float() - MEAN.view(3, 1, 1)) / STD.view(3, 1, 1)
+        model(maps)
+    expected = (maps["rgb"].float() - MEAN.view(3, 1, 1)) / STD.view(3, 1, 1)
     torch.testing.assert_close(seen[0], expected)
 
 
@@ -170,7 +171,7 @@ def _weights(model: torch.nn.Module) -> int:
 def test_a_smaller_network_is_read_back_from_plain_settings() -> None:
     settings = {"encoder_depth": 3, "decoder_channels": [32, 16, 8]}
     model = build(encoder_depth=3, decoder_channels=(32, 16, 8))
-    again = TerrainClassifier.from_tensors(settings, 4, model.state_dict())
+    again = TerrainClassifier.from_tensors(settings, names(4), model.state_dict())
     with torch.no_grad():
         assert torch.equal(model(image(32, 32)), again(image(32, 32)))
 
@@ -193,9 +194,9 @@ def test_training_is_reproducible_and_learns(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     config = ClassifierConfig(max_epochs=4, batch_size=5)
-    first, metrics = fit_network(config, dataset, 3, CPU)
+    first, metrics = fit_network(trainable(config), dataset, 3, CPU)
     lines = capfd.readouterr().err.strip().splitlines()
-    second, _ = fit_network(config, dataset, 3, CPU)
+    second, _ = fit_network(trainable(config), dataset, 3, CPU)
     for name, value in first.state_dict().items():
         assert torch.equal(value, second.state_dict()[name]), name
     assert metrics["valid_accuracy"] > 0.15
@@ -219,7 +220,7 @@ def test_training_stops_when_validation_no_longer_gains(
     dataset: TerrainDataset, capfd: pytest.CaptureFixture[str]
 ) -> None:
     config = ClassifierConfig(max_epochs=30, batch_size=5, patience=1, learning_rate=0.3)
-    fit_network(config, dataset, 0, CPU)
+    fit_network(trainable(config), dataset, 0, CPU)
     assert len(capfd.readouterr().err.strip().splitlines()) < 20
 
 
@@ -244,15 +245,15 @@ def test_classes_of_single_cells_are_learned_at_full_resolution_alone(
     optimizer = torch.optim.AdamW(model.parameters(), lr=5e-3)
     for _ in range(30):
         optimizer.zero_grad()
-        model.loss(model(rgb), class_id).backward()
+        model.loss(model({"rgb": rgb}), class_id).backward()
         optimizer.step()
-    accuracy = (model(rgb).argmax(1) == class_id).float().mean()
+    accuracy = (model({"rgb": rgb}).argmax(1) == class_id).float().mean()
     assert (accuracy > 0.95) == learns
 
 
 def test_weights_without_full_resolution_are_read_back() -> None:
     model = build(full_resolution=False)
-    again = TerrainClassifier.from_tensors({"full_resolution": False}, 4, model.state_dict())
+    again = TerrainClassifier.from_tensors({"full_resolution": False}, names(4), model.state_dict())
     with torch.no_grad():
         assert torch.equal(model(image(32, 32)), again(image(32, 32)))
 
@@ -302,7 +303,7 @@ def test_mean_iou_is_over_the_classes_that_occur_in_truth() -> None:
 
 def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
     rgb, class_id = (
-        image(8, 8, batch=2),
+        image(8, 8, batch=2)["rgb"],
         torch.randint(0, 4, (2, 8, 8), generator=torch.Generator().manual_seed(1)),
     )
     holed = class_id.clone()
@@ -321,10 +322,11 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
             return [([0, 1], self.some)]
 
     class Colour(TerrainClassifier):
-        def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
+            seen = maps["rgb"]
             return torch.cat((seen.float() / 100, 1 + 0 * seen[:, :1]), dim=1)
 
-    colour = Colour(ClassifierConfig(encoder="mobilenet_v2"), 4).eval()
+    colour = Colour(ClassifierConfig(encoder="mobilenet_v2")).build(map_classes=names(4)).eval()
     found, wanted = (colour.measure(maps) for maps in (Maps(holed, 8), Maps(class_id, 3)))  # type: ignore[arg-type]
     assert found == pytest.approx(wanted)
     assert 0 < found["valid_accuracy"] < 1
@@ -332,12 +334,12 @@ def test_a_trained_classifier_is_measured_on_labelled_cells_alone() -> None:
 
 def test_losses_of_validation_are_weighed_by_labelled_cells() -> None:
     """Two maps, one with a single labelled cell, one with all: the mean over cells, in training and afterwards."""
-    model, rgb = build(), image(8, 8, batch=3)
+    model, rgb = build(), image(8, 8, batch=3)["rgb"]
     class_id = torch.randint(0, 4, (3, 8, 8), generator=torch.Generator().manual_seed(1))
     class_id[0].fill_(UNLABELLED)[0, 0] = 2
     class_id[2] = UNLABELLED
     with torch.no_grad():
-        log_p = model(rgb).log_softmax(1).movedim(1, -1)
+        log_p = model({"rgb": rgb}).log_softmax(1).movedim(1, -1)
     labelled = class_id != UNLABELLED
     wanted = -log_p[labelled].gather(1, class_id[labelled][:, None]).double().mean()
     batches = [{"rgb": rgb[i : i + 1], "class_id": class_id[i : i + 1].byte()} for i in range(3)]
@@ -368,7 +370,7 @@ def test_what_a_hub_says_of_its_trials_does_not_bury_the_error(
 
     monkeypatch.setattr("segmentation_models_pytorch.create_model", unreachable)
     with pytest.raises(ConfigError, match="ImageNet weights of resnet18"):
-        build_network(ClassifierConfig(pretrained=True), 3, 0)
+        build_network(ClassifierConfig(pretrained=True), 3, 3)
     assert caplog.records == []
     hub.warning("seen again")
     assert len(caplog.records) == 1

@@ -24,29 +24,30 @@ from benchnav.models.checkpoint import Checkpoint, Part, as_stored, load_checkpo
 from benchnav.models.cli import main
 from benchnav.models.config import MDNConfig
 from benchnav.models.nets import mdn
-from benchnav.models.nets.mdn import (
-    MixtureDensityModel,
-    MixtureDensityNetwork,
-    censored_nll,
-)
-from benchnav.models.nets.trainable import MapScale
+from benchnav.models.nets import trainable as trainable_module
+from benchnav.models.nets.mdn import MixtureDensityModel, censored_nll
 from benchnav.models.predictor import Oracle, load_model, open_checkpoint
 from benchnav.models.training import networks
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest
 from benchnav.models.training.networks import fit_network
 from tests.factories import normal
-from tests.models.support import make_terrain
+from tests.models.support import make_terrain, scale, trainable
 
 EXACT = {"precision": "32-true"}
 SMALL = MDNConfig(encoder="mobilenet_v2", hidden=16, max_epochs=3, batch_size=5, jitter=0.2)
 QUICK = ["--mdn.encoder", "mobilenet_v2", "--mdn.batch_size", "5", "--trainer.precision", "32-true"]
 
 
-def build(seed: int = 0, **changes: object) -> MixtureDensityNetwork:
+def build(seed: int = 0, **changes: object) -> MixtureDensityModel:
     config = replace(SMALL, **changes)  # type: ignore[arg-type]
-    scale = MapScale(torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30]), torch.tensor(10.0))
-    return MixtureDensityNetwork(config, 0, scale, seed).eval()
+    scales = scale(torch.tensor([100.0, 90, 80]), torch.tensor([20.0, 25, 30]), 10.0)
+    return MixtureDensityModel(config).build(scales, seed=seed).eval()
+
+
+def layers(seen: Any, slope_deg: Tensor | None = None) -> dict[str, Tensor]:
+    """What the network is given of an observation or a terrain."""
+    return {"rgb": seen.rgb, "slope_deg": seen.slope_deg if slope_deg is None else slope_deg}
 
 
 def observe(batch: int, height: int, width: int) -> Observation:
@@ -160,21 +161,21 @@ def test_cells_that_were_not_observed_are_left_out() -> None:
 
 @pytest.mark.parametrize("shape", [(8, 8), (33, 20)])
 def test_maps_of_any_size_are_predicted(shape: tuple[int, int]) -> None:
-    mixture = MixtureDensityModel(build(components=4)).predict(observe(2, *shape))
+    mixture = build(components=4).predict(observe(2, *shape))
     assert mixture.weights.shape == (2, 4, *shape)
     assert mixture.weights.dtype == torch.float32
     assert not mixture.weights.is_inference()
 
 
 def test_the_network_is_moved_to_the_observations_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, moved = MixtureDensityModel(build()), list[torch.device]()
-    monkeypatch.setattr(model.network, "to", moved.append)
+    model, moved = build(), list[torch.device]()
+    monkeypatch.setattr(model, "to", moved.append)
     model.predict(observe(2, 32, 32))
     assert moved == [torch.device("cpu")]
 
 
 def test_components_begin_apart_within_the_range() -> None:
-    mixture = MixtureDensityModel(build(components=4)).predict(observe(2, 32, 32))
+    mixture = build(components=4).predict(observe(2, 32, 32))
     centres = torch.tensor([0.125, 0.375, 0.625, 0.875])
     assert float((mixture.means.mean((0, 2, 3)) - centres).abs().max()) < 0.1
     assert bool((mixture.weights > 0.1).all())
@@ -185,7 +186,7 @@ def test_no_component_is_narrower_than_the_least() -> None:
     network = build()
     with torch.no_grad():
         network.head.bias[-1] = -1000
-        _, _, stds = network(observe(1, 32, 32).rgb, observe(1, 32, 32).slope_deg)
+        _, _, stds = network(layers(observe(1, 32, 32)))
     assert bool((stds[:, -1] == mdn.LEAST_STD).all())
 
 
@@ -195,7 +196,7 @@ def test_initial_weights_are_a_function_of_the_seed_alone() -> None:
     assert torch.equal(before, torch.random.get_rng_state())
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
-    for name in ("joint.0.weight", "head.weight", "ground.network.head.1.weight"):
+    for name in ("joint.0.weight", "head.weight", "network.head.1.weight"):
         assert not torch.equal(first[name], other[name]), name
 
 
@@ -204,20 +205,20 @@ def test_slope_counts_in_its_own_cell_alone_and_by_its_scale() -> None:
     steeper = seen.slope_deg.clone()
     steeper[0, 7, 9] += 20
     with torch.no_grad():
-        _, before, _ = network(seen.rgb, seen.slope_deg)
-        _, after, _ = network(seen.rgb, steeper)
+        _, before, _ = network(layers(seen))
+        _, after, _ = network(layers(seen, steeper))
         changed = (before != after).any(1)[0]
         assert changed.nonzero().tolist() == [[7, 9]]
         network.slope_scale_deg *= 2
-        torch.testing.assert_close(network(seen.rgb, 2 * seen.slope_deg)[1], before)
+        torch.testing.assert_close(network(layers(seen, 2 * seen.slope_deg))[1], before)
 
 
 def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, seen = MixtureDensityModel(build()), observe(5, 16, 24)
+    model, seen = build(), observe(5, 16, 24)
     whole = model.predict(seen)
     sizes: list[int] = []
-    model.network.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
-    monkeypatch.setattr(mdn, "_CHUNK_CELLS", 2 * 16 * 24)
+    model.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0]["rgb"])))
+    monkeypatch.setattr(trainable_module, "CHUNK_CELLS", 2 * 16 * 24)
     pieces = model.predict(seen)
     assert sizes == [2, 2, 1]
     for name in ("weights", "means", "stds"):
@@ -227,7 +228,7 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_likelihood_is_in_single_precision_under_autocast() -> None:
     network, terrain = build(), make_terrain(size=32)
     with torch.autocast("cpu", torch.bfloat16):
-        parts = network(terrain.rgb, terrain.slope_deg)
+        parts = network(layers(terrain))
         loss = network.training_step(
             {
                 "rgb": terrain.rgb,
@@ -299,12 +300,12 @@ def test_it_recovers_a_known_distribution() -> None:
     for _ in range(steps):
         terrain, _ = draw_two_grounds(generator)
         optimizer.zero_grad()
-        censored_nll(*network(terrain.rgb, terrain.slope_deg), terrain.traversability).backward()
+        censored_nll(*network(layers(terrain)), terrain.traversability).backward()
         optimizer.step()
         schedule.step()
     terrain, grounds = draw_two_grounds(generator)
     with torch.no_grad():  # normalised by the batch as in training: running averages are too young
-        log_weights, means, stds = network(terrain.rgb, terrain.slope_deg)
+        log_weights, means, stds = network(layers(terrain))
     found = TraversabilityMixture(log_weights.exp(), means, stds)
     truth = predict(Oracle(), terrain)
     assert float((found.mean() - truth.mean()).square().mean().sqrt()) < 0.04
@@ -330,15 +331,17 @@ class KillInTheThirdEpoch(KeepBest):
 def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
     dataset: TerrainDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole, metrics = fit_network(SMALL, dataset, 3, FitOptions(device="cpu", trainer=EXACT))
+    whole, metrics = fit_network(trainable(SMALL), dataset, 3, FitOptions(device="cpu", trainer=EXACT))
     assert set(metrics) == {"train_loss", "valid_loss", "valid_rmse", "epoch"}
     with monkeypatch.context() as patch:
         patch.setattr(networks, "KeepBest", KillInTheThirdEpoch)
         with pytest.raises(Killed):
-            fit_network(SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, trainer=EXACT))
+            fit_network(
+                trainable(SMALL), dataset, 3, FitOptions(device="cpu", folder=tmp_path, trainer=EXACT)
+            )
     torch.manual_seed(99)  # what the global generator holds must not matter
     again, resumed = fit_network(
-        SMALL, dataset, 3, FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT)
+        trainable(SMALL), dataset, 3, FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT)
     )
     measured = ("valid_loss", "valid_rmse", "epoch")
     assert [resumed[name] for name in measured] == [metrics[name] for name in measured]
@@ -346,7 +349,7 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
         assert torch.equal(value, again.state_dict()[name]), name
     with pytest.raises(CheckpointError, match="to resume it"):
         fit_network(
-            replace(SMALL, components=2),
+            trainable(replace(SMALL, components=2)),
             dataset,
             3,
             FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT),
@@ -355,14 +358,18 @@ def test_training_is_reproducible_and_a_resumed_one_ends_with_the_same_weights(
 
 def test_a_network_kept_in_half_precision_is_measured_as_it_is_kept(dataset: TerrainDataset) -> None:
     network, metrics = fit_network(
-        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT), half_precision=True
+        trainable(replace(SMALL, max_epochs=1)),
+        dataset,
+        0,
+        FitOptions(device="cpu", trainer=EXACT),
+        half_precision=True,
     )
     whole, before = fit_network(
-        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
+        trainable(replace(SMALL, max_epochs=1)), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
     )
     for name, value in as_stored(whole.state_dict(), True).items():
         assert torch.equal(value, network.state_dict()[name]), name
-    valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
+    valid = MapData(dataset, 2, 0, fields=("rgb", "slope_deg", "traversability")).valid
     assert network.measure(valid).items() <= metrics.items()
     # Measured in the same way as in training, of which the rounding is all that changes it.
     for name, value in whole.measure(valid).items():
@@ -382,7 +389,7 @@ def test_maps_are_jittered_and_slopes_scaled_by_the_training_maps(
 
     monkeypatch.setattr(networks, "MapData", Watched)
     network, _ = fit_network(
-        replace(SMALL, max_epochs=1), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
+        trainable(replace(SMALL, max_epochs=1)), dataset, 0, FitOptions(device="cpu", trainer=EXACT)
     )
     assert jitters == [SMALL.jitter]
     slopes = torch.from_numpy(dataset.read("train", fields=["slope_deg"])["slope_deg"])
@@ -398,7 +405,7 @@ def test_what_is_measured_in_validation_leaves_out_what_was_not_observed() -> No
     batch = {"rgb": terrain.rgb, "slope_deg": terrain.slope_deg, "traversability": observed}
     with torch.no_grad():
         network.validation_step(batch, 0)
-    mixture = MixtureDensityModel(network).predict(terrain.observe())
+    mixture = network.predict(terrain.observe())
     error = (mixture.mean() - observed)[:, 1::2].square().mean().sqrt()
     nll = -mixture.log_prob(terrain.traversability)[:, 1::2].mean()
     torch.testing.assert_close(logged["valid_rmse"].compute(), error)
@@ -408,7 +415,7 @@ def test_what_is_measured_in_validation_leaves_out_what_was_not_observed() -> No
 # --- checkpoints and the command -----------------------------------------------------------------
 
 
-def checkpoint(network: MixtureDensityNetwork) -> Checkpoint:
+def checkpoint(network: MixtureDensityModel) -> Checkpoint:
     part = Part(
         config=asdict(network.config),
         tensors=dict(network.state_dict()),
@@ -423,10 +430,10 @@ def checkpoint(network: MixtureDensityNetwork) -> Checkpoint:
 def test_a_checkpoint_gives_the_network_back() -> None:
     network, seen = build(seed=5).train(), observe(1, 32, 32)
     again = open_checkpoint(checkpoint(network))
-    first, second = MixtureDensityModel(network).predict(seen), again.predict(seen)
+    first, second = network.predict(seen), again.predict(seen)
     assert isinstance(again, MixtureDensityModel)
     assert not network.training
-    assert not MixtureDensityNetwork.from_tensors(asdict(network.config), 0, network.state_dict()).training
+    assert not MixtureDensityModel.from_tensors(asdict(network.config), (), network.state_dict()).training
     for name in ("weights", "means", "stds"):
         assert torch.equal(getattr(first, name), getattr(second, name))
 
@@ -434,8 +441,8 @@ def test_a_checkpoint_gives_the_network_back() -> None:
 def test_a_checkpoint_of_a_pretrained_network_downloads_nothing() -> None:
     network = build()
     settings = {**asdict(network.config), "pretrained": True}
-    again = MixtureDensityNetwork.from_tensors(settings, 0, network.state_dict())
-    assert not again.ground.config.pretrained
+    again = MixtureDensityModel.from_tensors(settings, (), network.state_dict())
+    assert not again.config.pretrained
 
 
 @pytest.mark.parametrize("change", [{"components": 7}, {"encoder": "resnet19"}, {"width": 3}, {"hidden": 0}])
@@ -447,7 +454,7 @@ def test_tensors_that_do_not_fit_are_refused(change: dict[str, object]) -> None:
 
 
 def test_a_checkpoint_without_the_network_says_how_to_train_it() -> None:
-    with pytest.raises(CheckpointError, match="benchnav-train mdn"):
+    with pytest.raises(CheckpointError, match="benchnav-train fit mdn"):
         open_checkpoint(Checkpoint(model="mdn", class_names=()))
 
 
@@ -469,10 +476,14 @@ def test_the_command_trains_a_checkpoint_that_is_evaluated(
     assert (there.model, part.seed, part.data_id) == ("mdn", 7, "tiny-v1")
     assert json.loads(Path("mine.training/mdn/settings.json").read_text())["seed"] == 7
     assert (part.config["max_epochs"], part.config["components"], part.half_precision) == (2, 2, True)
-    assert load_model("mine").predict(observe(1, 32, 32)).weights.shape == (1, 2, 32, 32)  # type: ignore[union-attr]
+    seen = observe(1, 32, 32)
+    own: Any = load_model("mine")
+    assert own.predict_raw(layers(seen)).weights.shape == (1, 2, 32, 32)
+    assert own.predict(seen).shape == (1, 32, 32)
+    assert own.temperature == part.config["temperature"]
     # What it says of itself was measured on what is kept.
-    kept = MixtureDensityNetwork.from_tensors(part.config, 0, part.tensors)
-    valid = MapData(dataset, 2, 0, fields=("slope_deg", "traversability")).valid
+    kept = MixtureDensityModel.from_tensors(part.config, (), part.tensors)
+    valid = MapData(dataset, 2, 0, fields=("rgb", "slope_deg", "traversability")).valid
     assert kept.measure(valid).items() <= dict(part.metrics).items()
 
     assert call(monkeypatch, "evaluate", "mine", "--data", dataset.path, "--splits", "[test/std]") == 0

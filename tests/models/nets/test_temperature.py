@@ -1,4 +1,4 @@
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from benchnav.core.device import CPU
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.models.fused import sharpen
-from benchnav.models.nets.classifier import fit_pool_temperature, fit_temperature, sample_logits
+from benchnav.models.nets.calibration import fit_pool_temperature, fit_temperature, sample_logits
 from benchnav.models.quality.scores import ReliabilityCurve, calibration_error
 from benchnav.models.training.data import MapData, MapDataset
 
@@ -47,10 +47,10 @@ def test_sampled_logits_stay_beside_their_class(
     maps = MapData(dataset, 4, 0).valid
 
     class Colour(torch.nn.Module):
-        def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-            return rgb.float()
+        def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
+            return maps["rgb"].float()
 
-    monkeypatch.setattr("benchnav.models.nets.classifier._MOST_CELLS", 200)
+    monkeypatch.setattr("benchnav.models.nets.calibration._MOST_CELLS", 200)
     logits, class_id = sample_logits(Colour(), maps)
     assert logits.shape == (200, 3)
     stored = maps.read(range(len(maps)))
@@ -76,9 +76,9 @@ class Witness(torch.nn.Module):
         super().__init__()
         self.channel, self.boldness, self.temperature = channel, boldness, temperature
 
-    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+    def forward(self, maps: Mapping[str, torch.Tensor]) -> torch.Tensor:
         # A channel holds the evidence for each of three classes in a third of the byte's levels each.
-        level = rgb[:, self.channel].long()
+        level = maps["rgb"][:, self.channel].long()
         evidence = torch.stack([level % 6, level // 6 % 6, level // 36 % 6], 1).float() - 2.5
         return self.boldness * evidence / self.temperature
 
@@ -118,8 +118,8 @@ def test_a_pool_that_is_calibrated_as_a_whole_is_right_as_often_as_it_says() -> 
         own = Witness(channel, boldness)
         members.append(Witness(channel, boldness, fit_temperature(*sample_logits(own, maps))))
     stored = fresh.read(range(len(fresh)))
-    rgb, class_id = stored["rgb"], stored["class_id"]
-    alone = [member(rgb).softmax(1) for member in members]
+    class_id = stored["class_id"]
+    alone = [member(stored).softmax(1) for member in members]
     assert max(ece(one, class_id) for one in alone) < 0.03
     average = torch.stack(alone).mean(0)
     temperature = fit_pool_temperature(members, maps)

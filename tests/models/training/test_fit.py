@@ -21,12 +21,15 @@ from benchnav.datagen.schema import UNLABELLED
 from benchnav.models import cli
 from benchnav.models.checkpoint import load_checkpoint
 from benchnav.models.config import ClassifierConfig, MDNConfig
-from benchnav.models.nets.classifier import TerrainClassifier, fit_temperature, sample_logits
+from benchnav.models.nets.calibration import fit_temperature, sample_logits
+from benchnav.models.nets.classifier import TerrainClassifier
 from benchnav.models.training import fit as fit_module
 from benchnav.models.training import networks
+from benchnav.models.training.check import check_network
 from benchnav.models.training.data import MapData
 from benchnav.models.training.fit import FitOptions, KeepBest, default_precision, fit
-from benchnav.models.training.networks import check_network, fit_network
+from benchnav.models.training.networks import fit_network
+from tests.models.support import names, trainable
 
 EXACT = {"precision": "32-true"}
 SMALL = ClassifierConfig(encoder="mobilenet_v2", max_epochs=4, batch_size=4, jitter=0.2)
@@ -50,7 +53,7 @@ def train(
     dataset: TerrainDataset, folder: Path, resume: bool = False, **trainer: object
 ) -> TerrainClassifier:
     options = FitOptions(device="cpu", folder=folder, resume=resume, trainer={**EXACT, **trainer})
-    return fit_network(SMALL, dataset, 1, options)[0]
+    return fit_network(trainable(SMALL), dataset, 1, options)[0]
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +148,7 @@ def test_settings_of_the_optimiser_reach_it(dataset: TerrainDataset) -> None:
 
     data = MapData(dataset, 4, 0)
     config = replace(SMALL, weight_decay=0.123, learning_rate=0.045)
-    model = TerrainClassifier(config, 10, data.scale())
+    model = TerrainClassifier(config).build(data.scale(("rgb",)), names(10))
     options = FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(0.123, 0.045)]
@@ -172,7 +175,9 @@ def test_a_training_of_other_settings_is_not_gone_on_with(
     config = replace(SMALL, **other) if isinstance(other, dict) else SMALL
     options = FitOptions(device="cpu", folder=cut, resume=True, trainer=EXACT)
     with pytest.raises(CheckpointError, match="to resume it"):
-        fit_network(config, dataset, 2 if other == "seed" else 1, options, half_precision=other == "half")
+        fit_network(
+            trainable(config), dataset, 2 if other == "seed" else 1, options, half_precision=other == "half"
+        )
 
 
 OTHER_TRAINERS = {
@@ -221,9 +226,11 @@ def test_settings_of_the_trainer_that_change_nothing_are_neither_kept_nor_compar
 def test_a_trainer_that_would_learn_or_measure_nothing_is_refused_first(
     trainer: dict[str, object], why: str, dataset: TerrainDataset
 ) -> None:
-    check_network(SMALL, dataset, FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 0.5}))
+    check_network(
+        trainable(SMALL), dataset, FitOptions(device="cpu", trainer={**EXACT, "limit_train_batches": 0.5})
+    )
     with pytest.raises(ConfigError, match=why):
-        check_network(SMALL, dataset, FitOptions(device="cpu", trainer={**EXACT, **trainer}))
+        check_network(trainable(SMALL), dataset, FitOptions(device="cpu", trainer={**EXACT, **trainer}))
 
 
 def test_a_training_that_ends_before_it_was_measured_does_not_blame_the_learning_rate(
@@ -231,7 +238,7 @@ def test_a_training_that_ends_before_it_was_measured_does_not_blame_the_learning
 ) -> None:
     options = FitOptions(device="cpu", trainer={**EXACT, "max_time": {"seconds": 0}})
     with pytest.raises(ConfigError, match="before it ever was") as caught:
-        fit_network(SMALL, dataset, 1, options)
+        fit_network(trainable(SMALL), dataset, 1, options)
     assert "learning_rate" not in str(caught.value)
 
 
@@ -253,18 +260,18 @@ def test_maps_on_which_nothing_is_known_are_refused_first(
     for split in ("train", "valid"):
         lacking("class_id", split)
         with pytest.raises(DatasetError, match=f"cells with a class in split {split}"):
-            check_network(SMALL, dataset, options)
-        check_network(MDNConfig(encoder="mobilenet_v2"), dataset, options)
+            check_network(trainable(SMALL), dataset, options)
+        check_network(trainable(MDNConfig(encoder="mobilenet_v2")), dataset, options)
         lacking("traversability", split)
         with pytest.raises(DatasetError, match=f"observed traversability in split {split}"):
-            check_network(MDNConfig(encoder="mobilenet_v2"), dataset, options)
-        check_network(SMALL, dataset, options)
+            check_network(trainable(MDNConfig(encoder="mobilenet_v2")), dataset, options)
+        check_network(trainable(SMALL), dataset, options)
 
 
 def test_a_network_that_does_not_take_the_maps_is_refused_first(dataset: TerrainDataset) -> None:
     config = ClassifierConfig(architecture="dpt", encoder="tu-vit_tiny_patch16_224", batch_size=4)
     with pytest.raises(ConfigError, match=r"batches of 2 maps of 32×32 cells, got dpt"):
-        check_network(config, dataset, FitOptions(device="cpu", trainer=EXACT))
+        check_network(trainable(config), dataset, FitOptions(device="cpu", trainer=EXACT))
 
 
 def test_a_damaged_state_is_refused(dataset: TerrainDataset, cut: Path) -> None:
@@ -285,7 +292,12 @@ def test_one_process_at_a_time_trains_in_a_folder(dataset: TerrainDataset, tmp_p
 def test_a_new_training_drops_what_an_old_one_left(dataset: TerrainDataset, cut: Path) -> None:
     (cut / "classifier/.last.ckpt.1.partial").write_text("half")
     before = {path.name for path in (cut / "classifier").glob("events*")}
-    fit_network(replace(SMALL, max_epochs=1), dataset, 1, FitOptions(device="cpu", folder=cut, trainer=EXACT))
+    fit_network(
+        trainable(replace(SMALL, max_epochs=1)),
+        dataset,
+        1,
+        FitOptions(device="cpu", folder=cut, trainer=EXACT),
+    )
     assert list(pd.read_csv(cut / "classifier/metrics.csv")["epoch"]) == [1]
     assert not before & {path.name for path in (cut / "classifier").glob("events*")}
     assert not list((cut / "classifier").glob(".*partial"))
@@ -293,7 +305,7 @@ def test_a_new_training_drops_what_an_old_one_left(dataset: TerrainDataset, cut:
 
 def test_nothing_to_resume_begins_anew(dataset: TerrainDataset, tmp_path: Path) -> None:
     options = FitOptions(device="cpu", folder=tmp_path, resume=True, trainer=EXACT)
-    fit_network(replace(SMALL, max_epochs=1), dataset, 1, options)
+    fit_network(trainable(replace(SMALL, max_epochs=1)), dataset, 1, options)
     assert list(pd.read_csv(tmp_path / "classifier/metrics.csv")["epoch"]) == [1]
 
 
@@ -314,7 +326,7 @@ def test_settings_reach_the_trainer(dataset: TerrainDataset) -> None:
         device="cpu", trainer={**EXACT, "limit_train_batches": 1, "accumulate_grad_batches": 2}
     )
     data = MapData(dataset, 4, 0)
-    model = TerrainClassifier(SMALL, 10, data.scale())
+    model = TerrainClassifier(SMALL).build(data.scale(("rgb",)), names(10))
     fit(model, "x", options, {}, [KeepBest(), Watch()], {"datamodule": data}, max_epochs=1)
     assert seen == [(1, 2)]
     with pytest.raises(ConfigError, match="Lightning takes"):
@@ -345,7 +357,7 @@ def test_the_precision_is_that_of_what_is_trained_on(
     asked: list[str] = []
     monkeypatch.setattr(fit_module, "default_precision", lambda name: asked.append(name) or "bf16-mixed")
     data = MapData(dataset, 4, 0)
-    model = TerrainClassifier(SMALL, 10, data.scale())
+    model = TerrainClassifier(SMALL).build(data.scale(("rgb",)), names(10))
     options = FitOptions(device="cpu", trainer={"limit_train_batches": 1})
     fit(model, "x", options, {}, [Watch()], {"datamodule": data}, max_epochs=1)
     assert asked == ["cpu"]
@@ -362,7 +374,7 @@ def test_gradients_are_clipped_under_mixed_precision(dataset: TerrainDataset) ->
 
     data = MapData(dataset, 4, 0)
     for settings in ({}, {"gradient_clip_val": 1e-3}):
-        model = TerrainClassifier(SMALL, 10, data.scale())
+        model = TerrainClassifier(SMALL).build(data.scale(("rgb",)), names(10))
         trainer = {**EXACT, "precision": "bf16-mixed", "limit_train_batches": 1, **settings}
         fit(
             model,

@@ -49,10 +49,14 @@ def start(
 
 
 def test_members_are_counted_from_the_plain_name() -> None:
-    assert [member_name(index) for index in range(3)] == ["classifier", "classifier-2", "classifier-3"]
+    assert [member_name(index, "classifier") for index in range(3)] == [
+        "classifier",
+        "classifier-2",
+        "classifier-3",
+    ]
     found = replace(FRESH, parts=dict.fromkeys(["gp", "classifier-2", "classifier"], PART))
-    assert member_names(found) == ["classifier", "classifier-2"]
-    assert member_names(FRESH) == ["classifier"]
+    assert member_names(found, "classifier") == ["classifier", "classifier-2"]
+    assert member_names(FRESH, "classifier") == ["classifier"]
 
 
 def test_what_is_trained_is_saved_at_once_beside_what_is_there(tmp_path: Path) -> None:

@@ -1,0 +1,163 @@
+"""What is refused before anything is trained: inputs, maps, settings of the trainer, and hooks that do not fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import BenchnavError, ConfigError, expect
+from benchnav.core.settings import call, one_line
+from benchnav.datagen.files.reader import TerrainDataset
+from benchnav.models.config import TrainingConfig
+from benchnav.models.nets.inputs import check_inputs
+from benchnav.models.nets.trainable import TrainableModel, TrainableNetwork, in_single_precision
+from benchnav.models.training.data import TRAIN, VALID, MapDataset, check_maps, squares_a_map
+from benchnav.models.training.fit import FitOptions, make_trainer, quietly
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trainable:
+    """What `train_networks` trains.
+
+    Args:
+        kind: class of the network.
+        config: its settings.
+        name: of its parts; the members of an ensemble are counted behind it.
+        family: registered name of the model that checkpoints name, or the name of a user's class.
+        code: digest of its code; empty where that is ours.
+    """
+
+    kind: type[TrainableNetwork]
+    config: TrainingConfig
+    name: str
+    family: str
+    code: str = ""
+
+
+def fields_of(network: TrainableNetwork) -> tuple[str, ...]:
+    """Fields of the maps that a network is trained on: its inputs, and what it learns."""
+    return (*network.inputs, network.target)
+
+
+def class_names(dataset: TerrainDataset) -> tuple[str, ...]:
+    """Names of the terrain classes of a dataset."""
+    return tuple(item.name for item in dataset.recipe.classes)
+
+
+def check_network(trainable: Trainable, dataset: TerrainDataset, options: FitOptions) -> None:
+    """Refuses what could not be trained before anything is: builds the trainer and tries the network on a batch.
+
+    Args:
+        trainable: the network.
+        dataset: the maps.
+        options: how to train.
+
+    Raises:
+        ConfigError: Lightning or the network does not take the settings, the maps lack an input, a hook gives what it
+            should not, or nothing would be trained or measured.
+        DatasetError: there are too few maps, or none of their cells has what is learned.
+    """
+    kind, config = trainable.kind, trainable.config
+    network = call(f"a model of {kind.__name__}", kind, {"config": config})
+    check_inputs(network.inputs, ["rgb", "elevation_m", "slope_deg", *dataset.layer_names])
+    check_maps(dataset, kind.target, config.crop)
+    with quietly():
+        chosen = options.chosen(max_epochs=config.max_epochs)
+        trainer = make_trainer([], logger=False, enable_checkpointing=False, **chosen)
+    every = trainer.check_val_every_n_epoch or 0
+    expect(
+        every <= config.max_epochs,
+        f"`trainer.check_val_every_n_epoch` of at most {config.max_epochs}, the number of epochs, got {every}.",
+    )
+    squares = squares_a_map(dataset.grid.shape, config.crop)
+    for split, name in ((TRAIN, "limit_train_batches"), (VALID, "limit_val_batches")):
+        places = dataset.map_count(split) * (squares if split == TRAIN else 1)
+        limit, batches = getattr(trainer, name), -(-places // config.batch_size)
+        expect(
+            (batches * limit if isinstance(limit, float) else limit) >= 1,
+            f"`trainer.{name}` that leaves a batch of the {batches} of split {split}, got {limit}. "
+            "Leave it out to take all.",
+        )
+    places = dataset.map_count(TRAIN) * squares
+    together = min(2, places // -(-places // config.batch_size))
+    indices = [index % dataset.map_count(TRAIN) for index in range(together)]
+    maps = MapDataset(dataset.path, TRAIN, fields_of(network)).read(indices)
+    crop = config.crop or None
+    try_network(
+        network.build(map_classes=class_names(dataset)),
+        {name: values[..., :crop, :crop] for name, values in maps.items()},
+    )
+
+
+def try_network(network: TrainableNetwork, maps: Mapping[str, Tensor]) -> None:
+    """Tries the hooks of a network that has been built on one batch, without a step.
+
+    Args:
+        network: what is to be trained.
+        maps: B maps by field, its inputs and what it learns among them.
+
+    Raises:
+        ConfigError: it does not take the maps, or a hook gives what it should not.
+    """
+    batch, height, width = maps[network.target].shape
+    name, outputs = type(network).__name__, None
+    try:
+        with torch.random.fork_rng(devices=[]):
+            loss, _ = network.train().assess(maps)
+            if isinstance(network, TrainableModel):
+                with torch.no_grad():
+                    outputs = network.eval().to_distribution(in_single_precision(network(maps)))
+    except BenchnavError:
+        raise
+    except Exception as error:  # a user's code may raise anything
+        raise ConfigError(
+            f"Expected a network that takes batches of {batch} maps of {height}×{width} cells, got "
+            f"{describe(network)}, which does not: {one_line(error)} Choose another."
+        ) from error
+    got = f"shape {list(loss.shape)}" if isinstance(loss, Tensor) else type(loss).__name__
+    expect(got == "shape []", f"`configure_losses` of {name} to give a loss that is one number, got {got}.")
+    device = maps[network.target].device
+    expect(loss.device == device, f"a loss of {name} on {device}, got one on {loss.device}.")
+    expect(bool(loss.isfinite()), f"`configure_losses` of {name} to give a finite loss, got {loss.item()}.")
+    expect(
+        loss.requires_grad, f"a loss of {name} that has a gradient, got one without. Use the outputs in it."
+    )
+    if isinstance(network, TrainableModel):
+        check_distribution(outputs, (batch, height, width), device, name)
+
+
+def check_distribution(given: Any, shape: tuple[int, ...], device: torch.device, name: str) -> None:
+    """Refuses what is no distribution of λ for each cell of a batch.
+
+    Args:
+        given: what `to_distribution` gave.
+        shape: (B, H, W) of the batch.
+        device: of the batch.
+        name: of the model's class.
+
+    Raises:
+        ConfigError: it is of another type, shape or device, or its mean is not in [0, 1].
+    """
+    where = f"`to_distribution` of {name} to give"
+    expect(
+        isinstance(given, TraversabilityDistribution),
+        f"{where} a TraversabilityDistribution, got {type(given).__name__}.",
+    )
+    expect(tuple(given.shape) == shape, f"{where} one of shape {list(shape)}, got {list(given.shape)}.")
+    expect(given.device == device, f"{where} one on {device}, got one on {given.device}.")
+    mean = given.mean()
+    expect(
+        bool(((mean >= 0) & (mean <= 1)).all()),
+        f"{where} means of λ in [0, 1], got some outside or not a number.",
+    )
+
+
+def describe(network: TrainableNetwork) -> str:
+    """What a network is, for messages: architecture and encoder where it has them, and its class."""
+    config = network.config
+    if hasattr(config, "architecture") and hasattr(config, "encoder"):
+        return f"{config.architecture} of {config.encoder}"
+    return type(network).__name__
