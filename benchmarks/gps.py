@@ -35,7 +35,7 @@ from benchnav.datagen.recipe.classes import TerrainClass
 from benchnav.datagen.recipe.latent import latent_mean
 from benchnav.datagen.recipe.recipe import load_recipe
 from benchnav.models.config import LatentGPConfig
-from benchnav.models.quality.scores import coverage, crps, pit, tail_rate
+from benchnav.models.quality.scores import coverage, pit, tail_rate
 from benchnav.models.slope_gp.cells import Cells, SlopeSums, read_cells, sum_cells, sum_split
 from benchnav.models.slope_gp.table import SlopeTable
 from benchnav.models.training.gaussian_processes import fit_gps
@@ -233,7 +233,7 @@ def measure(dataset: TerrainDataset, console: Console) -> None:
             predicted, _ = distributions(gps, terrain)
             observed = terrain.traversability.double()
             nll = -float(predicted.log_prob(observed).mean())
-            likelihoods.add_row(kind, split, f"{nll:.4f}", f"{float(crps(predicted, observed).mean()):.5f}")
+            likelihoods.add_row(kind, split, f"{nll:.4f}", f"{float(predicted.crps(observed).mean()):.5f}")
     console.print(likelihoods)
     for split in ("test/std", "test/hg"):
         console.print(show_bands(tables["censored"], dataset, split, f"{split}, trained on all slopes"))

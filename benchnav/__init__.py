@@ -10,9 +10,13 @@ from benchnav.core.public_names import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "benchnav.core.conditioned": ("ConditionedDistribution",),
+        "benchnav.core.distribution": ("TraversabilityDistribution",),
         "benchnav.core.errors": ("BenchnavError", "CheckpointError", "ConfigError", "DatasetError"),
         "benchnav.core.grid": ("Grid",),
         "benchnav.core.mixture": ("TraversabilityMixture",),
+        "benchnav.core.pooled": ("pool",),
+        "benchnav.core.quantiles": ("QuantileDistribution",),
         "benchnav.core.registry": ("register",),
         "benchnav.core.terrain": ("Observation", "Terrain"),
     },

@@ -1,18 +1,26 @@
+from benchnav.core.conditioned import ConditionedDistribution
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, CheckpointError, ConfigError, DatasetError
 from benchnav.core.grid import Grid
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.pooled import pool
+from benchnav.core.quantiles import QuantileDistribution
 from benchnav.core.registry import register
 from benchnav.core.terrain import Observation, Terrain
 
 __all__ = [
     "BenchnavError",
     "CheckpointError",
+    "ConditionedDistribution",
     "ConfigError",
     "DatasetError",
     "Grid",
     "Observation",
+    "QuantileDistribution",
     "Terrain",
+    "TraversabilityDistribution",
     "TraversabilityMixture",
+    "pool",
     "register",
 ]
 

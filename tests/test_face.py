@@ -13,8 +13,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 FACES = {
-    "benchnav": "BenchnavError CheckpointError ConfigError DatasetError Grid Observation Terrain "
-    "TraversabilityMixture register",
+    "benchnav": "BenchnavError CheckpointError ConditionedDistribution ConfigError DatasetError Grid Observation "
+    "QuantileDistribution Terrain TraversabilityDistribution TraversabilityMixture pool register",
     "benchnav.datagen": "Recipe TerrainClass TerrainDataset TerrainMaps create_dataset find_dataset generate "
     "load_recipe recipe_from_dict shipped_recipes",
     "benchnav.env": "OffRoadEnv OffRoadVectorEnv",

@@ -71,7 +71,7 @@ def maps_of(problem: Problem) -> tuple[torch.Tensor, ...]:
     """Every tensor of a problem."""
     held = [
         getattr(value, f.name)
-        for value in (problem, problem.mixture, problem.observation)
+        for value in (problem, problem.distribution, problem.observation)
         for f in fields(value)
     ]
     derived = (problem.padded_ground, problem.traversability, *problem.action_bounds)

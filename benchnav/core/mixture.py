@@ -11,8 +11,8 @@ The expected time over the ground, in units of its time at λ = 1, is for a leas
 where each integrand is 0 well below m_k and 1 / x² well above, and is integrated in between by
 Gauss-Legendre quadrature over log x.
 
-Source: equation (1) of the paper. Letters in shapes: K components, H×W cells, N cells of a map, *B any leading
-dimensions.
+Sources: equation (1) of the paper; Gneiting and Raftery (2007), "Strictly proper scoring rules" (CRPS).
+Letters in shapes: K components, H×W cells, N cells of a map, *B any leading dimensions.
 """
 
 import math
@@ -24,22 +24,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchnav.core.batch import Batch, map_tensors
 from benchnav.core.cvar import Cells, added, conditional_value_at_risk, mean, value_at_risk
-from benchnav.core.errors import ConfigError, expect
+from benchnav.core.distribution import TraversabilityDistribution, check_floor, tail_of
+from benchnav.core.errors import ConfigError
 
 _SMALLEST_STD = 1e-9
 _REACH = 7.0  # standard deviations beyond which Φ is 0 or 1 to within 1e-11
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 _LEGENDRE = list(zip((0.5 + 0.5 * _NODES).tolist(), (0.5 * _WEIGHTS).tolist(), strict=True))  # on [0, 1]
+_CRPS_NODES, _CRPS_WEIGHTS = np.polynomial.legendre.leggauss(48)
+_UNDER_1 = 1 - 2**-53  # the largest float64 under 1
 _DEEP_TAIL = 1e-6  # under which F has to be exact to its own last bits
 _NUMBERS_AT_ONCE = 2**16  # of each parameter: half a MiB in float64
 _NUMBERS_ON_A_GPU = 2**24  # where few large pieces are quicker than many small ones
 
 
 @dataclass(frozen=True)
-class TraversabilityMixture(Batch):
+class TraversabilityMixture(TraversabilityDistribution):
     """A Gaussian mixture clipped to [0, 1] in each cell of a map.
 
     Args:
@@ -72,6 +74,11 @@ class TraversabilityMixture(Batch):
                 f"got {len(self.group)}."
             )
 
+    @property
+    def shape(self) -> torch.Size:
+        """[*B, H, W]."""
+        return self.weights.select(-3, 0).shape
+
     def cdf(self, value: Tensor | float) -> Tensor:
         """P(λ ≤ value), with the atoms of clipping at 0 and 1.
 
@@ -85,9 +92,22 @@ class TraversabilityMixture(Batch):
         inside = self._uncensored_cdf(value)
         return torch.where(value < 0, 0.0, torch.where(value >= 1, 1.0, inside)).to(self.weights.dtype)
 
+    def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """P(λ < value) and P(λ ≤ value), which differ at 0 and 1 alone, each of shape [*B, H, W]; see the base."""
+        value = torch.as_tensor(value, dtype=torch.float64, device=self.weights.device)
+        inside = self._uncensored_cdf(value.clamp(max=_UNDER_1)).to(self.weights.dtype)
+        lower = torch.where(value <= 0, 0.0, torch.where(value > 1, 1.0, inside))
+        return lower, torch.where(value < 0, 0.0, torch.where(value >= 1, 1.0, inside))
+
+    def quantile(self, probability: Tensor | float) -> Tensor:
+        """Least λ that is not exceeded with this probability, exact at 0 and 1, shape [*B, H, W]; see the base."""
+        share = torch.as_tensor(probability, dtype=torch.float64, device=self.weights.device)
+        share = share.expand(self.shape)
+        return torch.where(share <= 0, 0.0, self._in_cells(value_at_risk, share, deep=True))
+
     def mean(self) -> Tensor:
         """E[λ], shape [*B, H, W]."""
-        return self._in_pieces(mean)
+        return self._in_cells(mean)
 
     def var(self, level: float) -> Tensor:
         """Value at risk: λ falls below it with probability 1 − level.
@@ -98,7 +118,7 @@ class TraversabilityMixture(Batch):
         Returns:
             Traversability, shape [*B, H, W].
         """
-        tail = _tail(level)
+        tail = tail_of(level)
         return (
             torch.ones_like(self.weights.select(-3, 0)) if tail == 1 else self._in_tail(value_at_risk, tail)
         )
@@ -112,7 +132,7 @@ class TraversabilityMixture(Batch):
         Returns:
             Traversability, shape [*B, H, W].
         """
-        tail = _tail(level)
+        tail = tail_of(level)
         return self.mean() if tail == 1 else self._in_tail(conditional_value_at_risk, tail)
 
     def chance(self, value: float) -> Tensor:
@@ -126,17 +146,41 @@ class TraversabilityMixture(Batch):
         below = self._uncensored_cdf(torch.tensor(value, dtype=torch.float64, device=self.weights.device))
         return (1 - below).to(self.weights.dtype)
 
-    def harmonic_mean(self, floor: float) -> Tensor:
-        """1 / E[1 / max(λ, floor)]: the speed, as a share, that gives the expected time over the ground.
+    def expected_time(self, floor: float) -> Tensor:
+        """E[1 / max(λ, floor)]: the expected time over the ground, in units of its time at λ = 1.
 
         Args:
             floor: ε in (0, 1], least speed.
 
         Returns:
-            In [floor, 1], at most the mean of max(λ, floor); shape [*B, H, W].
+            At least 1, shape [*B, H, W], to within 1e-6.
         """
-        expect(0 < floor <= 1, f"a least speed in (0, 1], got {floor}.")
-        return self._in_pieces(lambda cells: _harmonic_mean(cells, floor))
+        check_floor(floor)
+        return self._in_cells(lambda cells: _expected_time(cells, floor))
+
+    def crps(self, observed: Tensor) -> Tensor:
+        """Continuous ranked probability score: ∫₀¹ (F(x) − 1[observed ≤ x])² dx.
+
+        As ∫₀¹ F² dx − 2·∫_observed^1 F dx + 1 − observed: the second integral is of closed form, and the
+        first is smooth, so that Gauss-Legendre quadrature with 48 nodes is off by less than 10⁻⁵ for
+        components with standard deviations from 0.03, and by up to 0.02 for much narrower ones. The nodes are
+        computed in the dtype of the parameters.
+
+        Args:
+            observed: λ in [0, 1], shape [*B, H, W].
+
+        Returns:
+            Shape [*B, H, W]; 0 is perfect.
+        """
+        stds = self.stds.clamp(min=_SMALLEST_STD)
+        narrowness = 1 / (stds * math.sqrt(2))
+        squared = torch.zeros_like(observed, dtype=stds.dtype)
+        for node, share in zip((_CRPS_NODES + 1) / 2, _CRPS_WEIGHTS / 2, strict=True):
+            weighted = torch.erf_((node - self.means) * narrowness).mul_(self.weights)
+            squared += share * (0.5 + 0.5 * weighted.sum(-3)) ** 2
+        at = observed.double()
+        above = self._integrated_cdf(torch.ones_like(at)) - self._integrated_cdf(at)
+        return (squared - 2 * above + 1 - at).clamp(min=0).to(observed.dtype)
 
     def from_normal(self, normal: Tensor) -> Tensor:
         """λ of the rank that a standard normal number has: clip(F⁻¹(Φ(z)), 0, 1).
@@ -152,15 +196,28 @@ class TraversabilityMixture(Batch):
         """
         if self.weights.shape[-3] == 1:
             return (self.means.squeeze(-3) + self.stds.squeeze(-3) * normal).clamp(0, 1)
-        return self._in_pieces(value_at_risk, _probability(normal.double()))
+        return self._in_cells(value_at_risk, _probability(normal.double()))
 
-    def at(self, cells: Tensor) -> "TraversabilityMixture":
-        """Keeps some cells as a map of one row, [K, 1, N].
+    def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The interval of standard normal numbers that `from_normal` takes to λ, each of shape [*B, H, W].
+
+        A single number within (0, 1), and finite there however unlikely λ is; from −∞ at 0, to ∞ at 1.
 
         Args:
-            cells: which of them, bool, shape [B, H, W].
+            value: traversability, a number or shape [*B, H, W].
         """
-        return map_tensors(self, lambda values: values.movedim(1, 0)[:, cells].unsqueeze(1))
+        value = torch.as_tensor(value, dtype=torch.float64, device=self.weights.device)
+        weights, means, stds = self._parameters()
+        z = ((value.unsqueeze(-3) if value.ndim else value) - means) / stds
+        if z.shape[-3] == 1:
+            score = z.squeeze(-3)
+        else:  # by the smaller of F and 1 − F, so that neither tail is lost to rounding
+            below, above = ((weights * _probability(side * z)).sum(-3) for side in (1, -1))
+            least = torch.minimum(below, above).clamp(min=torch.finfo(torch.float64).tiny)
+            score = torch.special.ndtri(least) * torch.where(below <= above, 1.0, -1.0)
+        ends = (value <= 0, value > 1), (value < 0, value >= 1)
+        lower, upper = (torch.where(no, -math.inf, torch.where(all_, math.inf, score)) for no, all_ in ends)
+        return lower.to(self.weights.dtype), upper.to(self.weights.dtype)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log density on (0, 1); log probability mass at 0 and at 1; −∞ elsewhere.
@@ -216,7 +273,7 @@ class TraversabilityMixture(Batch):
         kept = torch.where(is_best, self.weights, 0.0)
         return replace(self, weights=kept / kept.sum(-3, keepdim=True))
 
-    def _in_pieces(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
+    def _in_cells(self, work: Callable[..., Tensor], *layers: Tensor, deep: bool = False) -> Tensor:
         """Does some work on so many cells at a time that all stays near the processor.
 
         Args:
@@ -239,13 +296,21 @@ class TraversabilityMixture(Batch):
 
     def _in_tail(self, work: Callable[[Cells, Tensor], Tensor], tail: float) -> Tensor:
         """Does some work on the worst share `tail` of λ."""
-        return self._in_pieces(
+        return self._in_cells(
             lambda cells: work(cells, torch.full_like(cells.means[0], tail)), deep=tail < _DEEP_TAIL
         )
 
     def _parameters(self) -> tuple[Tensor, Tensor, Tensor]:
         weights, means, stds = (values.double() for values in (self.weights, self.means, self.stds))
         return weights / weights.sum(-3, keepdim=True), means, stds.clamp(min=_SMALLEST_STD)
+
+    def _integrated_cdf(self, value: Tensor) -> Tensor:
+        """∫_{−∞}^value F before clipping, float64."""
+        weights, means, stds = (values.double() for values in (self.weights, self.means, self.stds))
+        stds = stds.clamp(min=_SMALLEST_STD)
+        z = (value.unsqueeze(-3) - means) / stds
+        density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
+        return (weights * stds * (z * torch.special.ndtr(z) + density)).sum(-3)
 
     def _uncensored_cdf(self, value: Tensor) -> Tensor:
         weights, means, stds = self._parameters()
@@ -290,8 +355,8 @@ def component_log_prob(means: Tensor, stds: Tensor, value: Tensor) -> Tensor:
     return torch.where((value <= 0) | (value >= 1), mass, density)
 
 
-def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
-    """`harmonic_mean` of N cells, in float32: to within 1e-6."""
+def _expected_time(cells: Cells, floor: float) -> Tensor:
+    """`expected_time` of N cells, in float32: to within 1e-6."""
     short = cells.float()
     # Beyond [low, high] the CDF of a component is 0 or 1, and the integral of 1 / x² is known.
     reach = _REACH * math.sqrt(0.5) / short.scales
@@ -302,14 +367,9 @@ def _harmonic_mean(cells: Cells, floor: float) -> Tensor:
         log_x = start + span * node
         below = torch.erf((log_x.exp() - short.means).mul_(short.scales)).add_(1)
         time = torch.addcmul(time, span * (0.5 * share), below.mul_(torch.exp(-log_x)))
-    return (1 / added(short.weights * time)).clamp(floor, 1)
+    return added(short.weights * time).clamp(min=1)
 
 
 def _probability(z: Tensor) -> Tensor:
     """Φ(z); several times quicker than `torch.special.ndtr`."""
     return 0.5 * torch.erfc(z * -math.sqrt(0.5))
-
-
-def _tail(level: float) -> float:
-    expect(0 <= level < 1, f"`level` in [0, 1), got {level}. CVaR at level 0 is the mean.")
-    return 1 - float(level)

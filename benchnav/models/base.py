@@ -1,7 +1,7 @@
 """What a model is: the base classes of models, and the one way to ask any of them for a prediction.
 
-A model sees an `Observation` and gives a `TraversabilityMixture`; privileged models alone are given the
-Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes, K components.
+A model sees an `Observation` and gives a `TraversabilityDistribution`; privileged models alone are given the
+Terrain. Source: paper III-B. Letters in shapes: M members, B maps, H×W cells, C classes.
 """
 
 import inspect
@@ -12,8 +12,8 @@ from typing import Any, TypeGuard
 from torch import Tensor
 
 from benchnav.core.device import exact_convolutions
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import ConfigError, expect
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation, Terrain
 from benchnav.models.checkpoint import Checkpoint
 
@@ -22,18 +22,19 @@ class TraversabilityModel(ABC):
     """The base class of models; `benchnav.testing.check_model` tries whether one keeps its contract."""
 
     class_names: tuple[str, ...] = ()
-    """Classes in the order of their ids, of a model that tells them: its weights, summed by `group`, are their
-    probabilities."""
+    """Classes in the order of their ids, of a model that tells them: `class_probabilities` of its predictions are
+    theirs."""
 
     @abstractmethod
-    def predict(self, observation: Observation) -> TraversabilityMixture:
+    def predict(self, observation: Observation) -> TraversabilityDistribution:
         """Predicts the distribution of traversability in every cell.
 
         Args:
             observation: B maps of any size; nothing else is to be known of them.
 
         Returns:
-            Mixture with parameters of shape [B, K, H, W], on the observation's device.
+            The distribution, of shape [B, H, W], on the observation's device: a `TraversabilityMixture`, a
+            `QuantileDistribution`, or any other.
         """
 
     def member_probabilities(self, observation: Observation) -> Tensor | None:
@@ -65,10 +66,10 @@ class PrivilegedModel(TraversabilityModel):
     """The base class of this package's models that are given the truth, to tell what failures come from."""
 
     @abstractmethod
-    def predict_terrain(self, terrain: Terrain) -> TraversabilityMixture:
+    def predict_terrain(self, terrain: Terrain) -> TraversabilityDistribution:
         """As `predict`, from the truth."""
 
-    def predict(self, observation: Observation) -> TraversabilityMixture:
+    def predict(self, observation: Observation) -> TraversabilityDistribution:
         """Refuses: what a privileged model knows is in no observation."""
         raise ConfigError(
             f"Expected the Terrain for the privileged model {type(self).__name__}, got an Observation. "
@@ -102,7 +103,7 @@ def layers_of(observation: Observation, names: Iterable[str]) -> dict[str, Tenso
     return {name: known[name] for name in names}
 
 
-def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityMixture:
+def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityDistribution:
     """Lets a model predict: the privileged ones from the Terrain, every other from its Observation alone.
 
     Args:
@@ -110,7 +111,7 @@ def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityMixtu
         terrain: B maps.
 
     Returns:
-        Mixture with parameters of shape [B, K, H, W].
+        The distribution, of shape [B, H, W].
 
     Raises:
         ConfigError: the model's answer does not fit the maps.
@@ -118,14 +119,13 @@ def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityMixtu
     if isinstance(model, PrivilegedModel):
         return model.predict_terrain(terrain)
     with exact_convolutions():
-        mixture: Any = model.predict(terrain.observe())
-    height, width = terrain.grid.shape
-    got: Any = type(mixture).__name__
-    if isinstance(mixture, TraversabilityMixture):
-        got = list(mixture.weights.shape)
-        if [*got[:-3], *got[-2:]] == [len(terrain), height, width]:
-            return mixture
+        predicted: Any = model.predict(terrain.observe())
+    shape, got = [len(terrain), *terrain.grid.shape], type(predicted).__name__
+    if isinstance(predicted, TraversabilityDistribution):
+        if list(predicted.shape) == shape:
+            return predicted
+        got += f" of shape {list(predicted.shape)}"
     raise ConfigError(
-        f"Expected the model to give a TraversabilityMixture of shape [{len(terrain)}, K, {height}, {width}], "
-        f"got {got}."
+        f"Expected the model to give a TraversabilityDistribution of shape {shape}, got {got}. "
+        "Return a TraversabilityMixture, a QuantileDistribution or a subclass of your own."
     )

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
 
 # Of a step, and of a metre, on ground that is not free; the paper's penalty a step. Higher than what any
 # way over free ground costs.
@@ -38,9 +38,9 @@ class FreeSpace:
         expect(self.by in ("risk", "mean"), f"`free_space.by` 'risk' or 'mean', got {self.by!r}.")
         expect(0 <= self.above < 1, f"`free_space.above` in [0, 1), got {self.above}.")
 
-    def mask(self, risk_map: Tensor, mixture: TraversabilityMixture) -> Tensor:
+    def mask(self, risk_map: Tensor, distribution: TraversabilityDistribution) -> Tensor:
         """Tells which cells are free, bool [B, H, W], from λ̂ [B, H, W] and the prediction."""
-        return (risk_map if self.by == "risk" else mixture.mean()) > self.above
+        return (risk_map if self.by == "risk" else distribution.mean()) > self.above
 
 
 @dataclass(frozen=True, kw_only=True)

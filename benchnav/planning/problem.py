@@ -1,7 +1,7 @@
 """The navigation problem that a planner is given (paper, equation 2).
 
 It holds what is *predicted* alone: the truth stays with the simulation. Letters in shapes: B episodes, H×W
-cells, K components, S state and A action dimensions, *K any further dimensions.
+cells, S state and A action dimensions, *K any further dimensions.
 """
 
 from dataclasses import dataclass, field
@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from benchnav.core.batch import Batch
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
 from benchnav.core.grid import Grid
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Observation
 from benchnav.planning.free_space import PENALTY, Rules, cells_at_goal
 from benchnav.planning.objective import Objective
@@ -45,7 +45,7 @@ class Problem(Batch):
     Args:
         task: what is to be done.
         observation: what the robots saw.
-        mixture: the predicted distribution of λ, parameters of shape [B, K, H, W].
+        distribution: the predicted distribution of λ, shape [B, H, W].
         risk_map: λ̂ as the risk setting gives it, in [0, 1], shape [B, H, W].
         free: S_free, the goal's disc included, bool, shape [B, H, W].
         start: initial states, shape [B, S].
@@ -55,7 +55,7 @@ class Problem(Batch):
 
     task: Task
     observation: Observation
-    mixture: TraversabilityMixture
+    distribution: TraversabilityDistribution
     risk_map: Tensor
     free: Tensor
     start: Tensor
@@ -66,6 +66,7 @@ class Problem(Batch):
         """Checks that the batch is one batch."""
         batch = self.start.shape[0]
         expected = {
+            "distribution": (batch, *self.grid.shape),
             "risk_map": (batch, *self.grid.shape),
             "free": (batch, *self.grid.shape),
             "goal_m": (batch, 2),
@@ -198,7 +199,7 @@ def terminal_cost(objective: Objective, state: Tensor, ground: Tensor, target: T
 def pose_problem(
     task: Task,
     observation: Observation,
-    mixture: TraversabilityMixture,
+    distribution: TraversabilityDistribution,
     risk_map: Tensor,
     start_m: Tensor,
     goal_m: Tensor,
@@ -209,7 +210,7 @@ def pose_problem(
     Args:
         task: what is to be done.
         observation: what the robots saw, B maps.
-        mixture: the predicted distribution of λ.
+        distribution: the predicted distribution of λ, shape [B, H, W].
         risk_map: λ̂ as the risk setting gives it, shape [B, H, W].
         start_m: (x, y), shape [B, 2].
         goal_m: (x, y), shape [B, 2].
@@ -220,9 +221,9 @@ def pose_problem(
     return Problem(
         task=task,
         observation=observation,
-        mixture=mixture,
+        distribution=distribution,
         risk_map=risk_map,
-        free=rules.free_space.mask(risk_map, mixture) | at_goal,
+        free=rules.free_space.mask(risk_map, distribution) | at_goal,
         start=task.robot.initial_state(heading_to(start_m, goal_m)),
         goal_m=goal_m,
         time_budget_s=torch.as_tensor(time_budget_s, dtype=torch.float64, device=goal_m.device)

@@ -1,10 +1,9 @@
 """Risk measures: from the distribution of traversability to the one map a planner is given.
 
-A measure is a function of a `TraversabilityMixture` with parameters of shape [B, K, H, W] that gives λ̂ in
-[0, 1] of shape [B, H, W]; its further keyword parameters are its options. A setting is written
-`name` or `name:level`: `cvar:0.9`, `var:0.95`, `expected-time:0.05`, `mean`. Risk means the lower tail of λ;
-a higher level of CVaR or VaR is more cautious. The integrals are the mixture's own, the names are given in
-`pyproject.toml`, and the registry reads what is written.
+A measure is a function of a `TraversabilityDistribution` of shape [B, H, W] that gives λ̂ in [0, 1] of that shape; its
+further keyword parameters are its options. A setting is written `name` or `name:level`: `cvar:0.9`, `var:0.95`,
+`expected-time:0.05`, `mean`. Risk means the lower tail of λ; a higher level of CVaR or VaR is more cautious. The
+integrals are the distribution's own, the names are given in `pyproject.toml`, and the registry reads what is written.
 Source: paper II and III-B; `expected_time` and `chance` go beyond it.
 """
 
@@ -12,77 +11,77 @@ from collections.abc import Callable
 
 from torch import Tensor
 
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import expect
-from benchnav.core.mixture import TraversabilityMixture
 
-RiskMeasure = Callable[[TraversabilityMixture], Tensor]
+RiskMeasure = Callable[[TraversabilityDistribution], Tensor]
 
 
-def mean(mixture: TraversabilityMixture) -> Tensor:
+def mean(distribution: TraversabilityDistribution) -> Tensor:
     """E[λ], which looks at no tail."""
-    return mixture.mean()
+    return distribution.mean()
 
 
-def var(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+def var(distribution: TraversabilityDistribution, level: float = 0.9) -> Tensor:
     """Value at risk: λ falls below it with probability 1 − level.
 
     Args:
-        mixture: distribution a cell.
+        distribution: of λ in each cell.
         level: α in [0, 1).
     """
-    return mixture.var(level)
+    return distribution.var(level)
 
 
-def cvar(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+def cvar(distribution: TraversabilityDistribution, level: float = 0.9) -> Tensor:
     """Conditional value at risk: the mean of λ over its worst share 1 − level.
 
     Args:
-        mixture: distribution a cell.
+        distribution: of λ in each cell.
         level: α in [0, 1).
     """
-    return mixture.cvar(level)
+    return distribution.cvar(level)
 
 
-def expected_time(mixture: TraversabilityMixture, floor: float = 0.05) -> Tensor:
+def expected_time(distribution: TraversabilityDistribution, floor: float = 0.05) -> Tensor:
     """1 / E[1 / max(λ, floor)], by which a path's length gives its expected time.
 
     What a risk-neutral robot plans with where λ stays what it is at a place: it holds against the mean that
     time is lost on slow ground, and looks at no tail. A lower floor makes ground that immobilises a robot dearer.
 
     Args:
-        mixture: distribution a cell.
+        distribution: of λ in each cell.
         floor: least speed, as a share of the commanded one, in (0, 1].
     """
-    return mixture.harmonic_mean(floor)
+    return (1 / distribution.expected_time(floor)).clamp(floor, 1)
 
 
-def chance(mixture: TraversabilityMixture, bound: float = 0.1) -> Tensor:
+def chance(distribution: TraversabilityDistribution, bound: float = 0.1) -> Tensor:
     """P(λ ≥ bound), the chance that the ground carries the robot.
 
     Args:
-        mixture: distribution a cell.
+        distribution: of λ in each cell.
         bound: traversability in [0, 1].
     """
     expect(0 <= bound <= 1, f"`bound` in [0, 1], got {bound}.")
-    return mixture.chance(bound)
+    return distribution.chance(bound)
 
 
-def single_class(mixture: TraversabilityMixture, level: float = 0.9) -> Tensor:
+def single_class(distribution: TraversabilityDistribution, level: float = 0.9) -> Tensor:
     """The CVaR of the most likely class alone, its soft spots with it.
 
     Args:
-        mixture: distribution a cell, whose components belong to classes.
+        distribution: one that knows of classes.
         level: α in [0, 1).
     """
-    return mixture.most_likely().cvar(level)
+    return distribution.most_likely().cvar(level)
 
 
-def apply(measure: RiskMeasure, mixture: TraversabilityMixture) -> Tensor:
+def apply(measure: RiskMeasure, distribution: TraversabilityDistribution) -> Tensor:
     """Infers λ̂ and checks it.
 
     Args:
         measure: any risk measure.
-        mixture: distribution a cell, parameters of shape [B, K, H, W].
+        distribution: of λ in each cell, shape [B, H, W].
 
     Returns:
         λ̂ in [0, 1], shape [B, H, W].
@@ -90,8 +89,8 @@ def apply(measure: RiskMeasure, mixture: TraversabilityMixture) -> Tensor:
     Raises:
         ConfigError: the measure gave something else.
     """
-    risk_map = measure(mixture)
-    shape = mixture.weights.select(-3, 0).shape
+    risk_map = measure(distribution)
+    shape = distribution.shape
     got = list(risk_map.shape) if isinstance(risk_map, Tensor) else type(risk_map).__name__
     expect(got == list(shape), f"a risk measure to give λ̂ of shape {list(shape)}, got {got}.")
     expect(
@@ -102,4 +101,4 @@ def apply(measure: RiskMeasure, mixture: TraversabilityMixture) -> Tensor:
         ((risk_map >= 0) & (risk_map <= 1)).all(),
         "a risk measure to give λ̂ in [0, 1], got values outside or not a number.",
     )
-    return risk_map.to(mixture.weights.dtype)
+    return risk_map.to(distribution.dtype)

@@ -4,6 +4,7 @@ import pickle
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -169,6 +170,8 @@ def same(first: Any, second: Any, tolerance: float = 0.0) -> bool:
     """
     if is_dataclass(first) and type(first) is type(second):
         return all(same(getattr(first, f.name), getattr(second, f.name), tolerance) for f in fields(first))
+    if isinstance(first, tuple) and isinstance(second, tuple):
+        return len(first) == len(second) and all(map(partial(same, tolerance=tolerance), first, second))
     if not isinstance(first, Tensor) or not isinstance(second, Tensor):
         return type(first) is type(second) and bool(first == second)
     if first.shape != second.shape or not (tolerance or first.dtype == second.dtype):

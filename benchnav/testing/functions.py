@@ -12,7 +12,10 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.planning import risk
 from benchnav.planning.free_space import Rules
 from benchnav.planning.robots import Robot, Unicycle
@@ -126,14 +129,15 @@ def check_objective(objective: Any, robot: Any = None, device: torch.device | st
 
 
 def check_risk(measure: Any, device: torch.device | str = "cpu", tolerance: float = 1e-4) -> None:
-    """Tries whether a risk measure keeps the contract, on mixtures of one component and of three.
+    """Tries whether a risk measure keeps the contract, on mixtures of one component and of three, and on quantiles.
 
-    The contract: λ̂ in [0, 1] of shape [B, H, W], floating-point, on the mixture's device; the same when asked again,
-    and for a map alone what it is in a batch; the mixture and the global generators left as they were.
+    The contract: λ̂ in [0, 1] of shape [B, H, W], floating-point, on the distribution's device; the same when asked
+    again, and for a map alone what it is in a batch; the distribution and the global generators left as they were. A
+    measure that needs a mixture, or classes, refuses other distributions by a ConfigError that names their class.
 
     Args:
-        measure: a function of a mixture, or the name, file or mapping of one as suites have it, such as `cvar:0.9`.
-        device: where the mixtures are.
+        measure: a function of a distribution, or the name, file or mapping of one as suites have it: `cvar:0.9`.
+        device: where the distributions are.
         tolerance: by how much λ̂ of a map alone and in a batch may differ.
 
     Raises:
@@ -144,10 +148,30 @@ def check_risk(measure: Any, device: torch.device | str = "cpu", tolerance: floa
     breaches = Breaches("risk", name)
     for group in ((0,), (0, 1, 0)):
         breaches.place = f"K = {len(group)}"
-        mixture = _make_mixture(group, torch.device(device))
-        is_map = breaches.is_tensor("λ̂", mixture.weights, mixture.weights[:, 0].shape)
-        breaches.try_function("risk", partial(risk.apply, made), {"mixture": mixture}, is_map, tolerance)
+        _try_measure(made, _make_mixture(group, torch.device(device)), tolerance, breaches)
+    breaches.place = "quantiles"
+    quantiles = _make_quantiles(torch.device(device))
+    if not _refuses_by_name(made, quantiles):
+        _try_measure(made, quantiles, tolerance, breaches)
     breaches.refuse()
+
+
+def _try_measure(
+    measure: Any, distribution: TraversabilityDistribution, tolerance: float, breaches: Breaches
+) -> None:
+    like = torch.zeros(1, dtype=distribution.dtype, device=distribution.device)
+    is_map, given = breaches.is_tensor("λ̂", like, distribution.shape), {"distribution": distribution}
+    breaches.try_function("risk", partial(risk.apply, measure), given, is_map, tolerance)
+
+
+def _refuses_by_name(measure: Any, distribution: TraversabilityDistribution) -> bool:
+    try:
+        measure(distribution)
+    except ConfigError as error:
+        return type(distribution).__name__ in str(error)
+    except Exception:
+        return False  # which is noted where it is tried
+    return False
 
 
 def _make_mixture(group: tuple[int, ...], device: torch.device) -> TraversabilityMixture:
@@ -157,3 +181,13 @@ def _make_mixture(group: tuple[int, ...], device: torch.device) -> Traversabilit
     weights, means, stds = drawn / drawn.sum(2, keepdim=True), 1.4 * drawn - 0.2, 0.3 * drawn
     stds[2, :, :, :2] = 0
     return TraversabilityMixture(weights[0], means[1], stds[2], group)
+
+
+def _make_quantiles(device: torch.device) -> QuantileDistribution:
+    """Quantiles with atoms at 0, inside and at 1, shape [3, Q, 8, 11]."""
+    generator = torch.Generator().manual_seed(0)
+    least, most = torch.rand(2, 3, 1, 8, 11, generator=generator)
+    levels = torch.tensor(LEVELS).view(-1, 1, 1)
+    values = (1.4 * torch.lerp(least.minimum(most), least.maximum(most), levels) - 0.2).clamp(0, 1)
+    values[:, 30:40] = values[:, 30:31]
+    return QuantileDistribution(values.to(device))

@@ -14,20 +14,26 @@ import torch
 from torch import Tensor
 
 from benchnav.core import registry
+from benchnav.core.distribution import TraversabilityDistribution
+from benchnav.core.errors import ConfigError
 from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.stored_terrain import terrain_of
 from benchnav.datagen.recipe.recipe import Split, load_recipe
 from benchnav.datagen.synth.generate import generate
 from benchnav.models.base import TraversabilityModel, predict
+from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.predictor import load_model
 from benchnav.testing.breaches import NOTHING, Breaches, same
+from benchnav.testing.trainable import try_training, untrained, with_inputs
+from benchnav.testing.distribution import check_functions
 
 _MAPS = 3
+_CLASSES = tuple(map(str, range(10)))  # more than any map of the contract shows
 
 
 def check_model(
-    model: TraversabilityModel | str | Path | Mapping[str, Any],
+    model: TraversabilityModel | type[TraversabilityModel] | str | Path | Mapping[str, Any],
     shapes: Sequence[tuple[int, int]] = ((32, 32), (20, 37)),
     recipe: str = "tiny-v1",
     device: torch.device | str = "cpu",
@@ -35,89 +41,133 @@ def check_model(
 ) -> None:
     """Tries whether a model keeps the contract, by letting it predict one map and three.
 
-    A model that passes can be evaluated and planned with like any other. The contract: a TraversabilityMixture
-    of shape [B, K, H, W] for maps of any size, on the observation's device, of one floating-point dtype; finite
+    A model that passes can be evaluated and planned with like any other. The contract: a TraversabilityDistribution
+    of shape [B, H, W] for maps of any size, on the observation's device, of one floating-point dtype; a CDF that
+    ascends from 0 to 1, quantiles in [0, 1] that are its inverse, and integrals that are theirs; of a mixture finite
     parameters, weights ≥ 0 that sum to 1, standard deviations ≥ 0; the observation left as it was, and with it
     the global generators of Python, NumPy and PyTorch; the same answer when asked again, and for a map alone
-    what it is in a batch; `class_names`, where given, one a class, which is a component, or what `group` sums
-    up; `member_probabilities`, where given, of shape [M, B, C, H, W], and the class probabilities, in each
-    cell, in the order of their average, which may have been calibrated as a whole.
+    what it is in a batch; `class_names`, where given, one a class, whose probabilities the distribution gives: of a
+    mixture a component, or what `group` sums up; `member_probabilities`, where given, of shape [M, B, C, H, W],
+    and the class probabilities, in each cell, in the order of their average, which may have been calibrated as a
+    whole.
+
+    A class of trainable models is tried as training uses it: its hooks fit, a step changes its weights, cells whose λ
+    was not observed are left out of a finite loss, and settings and tensors give the same model back. Layers that it
+    asks for and the recipe's maps do not have are drawn at random.
 
     Args:
-        model: any model, or what `load_model` takes; the oracle is given the Terrain.
+        model: any model, or what `load_model` takes; the oracle is given the Terrain. Or a class of trainable models,
+            by itself, as path/to/file.py:Class or by name.
         shapes: (H, W) of the maps to try; a model that takes maps of one size alone names it here.
         recipe: of the maps, a shipped id or the path of a YAML file; its first scenario is used.
         device: where the observations are.
-        tolerance: by how much sums, averages, and a map's parameters alone and in a batch may differ;
+        tolerance: by how much sums, averages, λ, probabilities, and a map's parameters alone and in a batch may differ;
             batches of other sizes are worked out in another order.
 
     Raises:
         ConfigError: the model breaks the contract; every breach is named.
     """
-    made = load_model(model) if isinstance(model, str | Path | Mapping) else registry.take("model", model)
+    fresh = untrained(model)
+    made: Any = fresh
+    if fresh is None:
+        made = load_model(model) if isinstance(model, str | Path | Mapping) else registry.take("model", model)
     breaches = Breaches("model", type(made).__name__)
     for height, width in shapes:
         breaches.place = f"{height}×{width}"
         terrain = _make_terrain(recipe, height, width, torch.device(device))
+        if isinstance(made, TrainableModel):
+            terrain = with_inputs(terrain, made)
+        if fresh is not None and not try_training(fresh, terrain, _CLASSES, breaches):
+            continue
         is_sound = partial(_is_sound, device=terrain.rgb.device, tolerance=tolerance, breaches=breaches)
-        mixture = breaches.try_function(
+        predicted = breaches.try_function(
             "predict",
             lambda observation: predict(made, observation),
             {"observation": terrain},
             is_sound,
             tolerance,
         )
-        if mixture is not NOTHING:
-            _check_classes(made, terrain, mixture, tolerance, breaches)
+        if predicted is not NOTHING:
+            _check_classes(made, terrain, predicted, tolerance, breaches)
     breaches.refuse()
 
 
 def _is_sound(
-    mixture: TraversabilityMixture, device: torch.device, tolerance: float, breaches: Breaches
+    predicted: TraversabilityDistribution, device: torch.device, tolerance: float, breaches: Breaches
 ) -> bool:
-    """Tells what is wrong with a mixture by itself, whose shape is known to fit; false where it lies elsewhere."""
-    expect = breaches.expect
-    values = {"weights": mixture.weights, "means": mixture.means, "stds": mixture.stds}
-    for value in values.values():
-        if not expect(
-            value.device == device,
-            f"Expected parameters on the observation's device {device}, got {value.device}.",
-        ):
+    """Tells what is wrong with a distribution whose shape is known to fit; false where it lies elsewhere."""
+    if isinstance(predicted, TraversabilityMixture):
+        values = {"weights": predicted.weights, "means": predicted.means, "stds": predicted.stds}
+        if not _are_on(device, list(values.values()), breaches):
             return False
+        if not _are_parameters(values, tolerance, breaches):
+            return True
+    elif not _are_on(device, [predicted], breaches):
+        return False
+    check_functions(predicted, tolerance, breaches)
+    return True
+
+
+def _are_on(
+    device: torch.device, values: Sequence[Tensor | TraversabilityDistribution], breaches: Breaches
+) -> bool:
+    others = [value.device for value in values if value.device != device]
+    found = f"Expected parameters on the observation's device {device}, got {others[0] if others else ''}."
+    return breaches.expect(not others, found)
+
+
+def _are_parameters(values: Mapping[str, Tensor], tolerance: float, breaches: Breaches) -> bool:
+    """Tells whether a mixture can be made of its parameters."""
+    expect, weights = breaches.expect, values["weights"]
     dtypes = sorted({str(value.dtype) for value in values.values()})
-    expect(
-        len(dtypes) == 1 and mixture.weights.is_floating_point(),
+    sound = expect(
+        len(dtypes) == 1 and weights.is_floating_point(),
         f"Expected parameters of one floating-point dtype, got {', '.join(dtypes)}.",
     )
     for name, value in values.items():
-        expect(bool(value.isfinite().all()), f"Expected finite `{name}`, got some that are not.")
+        sound &= expect(bool(value.isfinite().all()), f"Expected finite `{name}`, got some that are not.")
         below = name != "means" and bool((value < 0).any())
-        expect(not below, f"Expected `{name}` ≥ 0, got some below.")
-    sums = mixture.weights.double().sum(1)
-    expect(
+        sound &= expect(not below, f"Expected `{name}` ≥ 0, got some below.")
+    sums = weights.double().sum(1)
+    return sound & expect(
         same(sums, torch.ones_like(sums), tolerance),
         "Expected `weights` that sum to 1 over the components, got other sums.",
     )
-    return True
+
+
+def _fit_names(names: int, predicted: TraversabilityDistribution) -> str:
+    """Says where a distribution does not have the classes that a model names; empty where it does."""
+    if not isinstance(predicted, TraversabilityMixture):
+        try:
+            got: Any = list(predicted.class_probabilities(names).shape) if names else []
+        except ConfigError:
+            got = f"a {type(predicted).__name__} without classes"
+        shape = [*predicted.shape[:-2], names, *predicted.shape[-2:]] if names else []
+        return "" if got == shape else f"Expected class probabilities of shape {shape}, got {got}."
+    group, components = predicted.group, predicted.weights.shape[1]
+    if group is None:
+        fits = names in (0, components)
+        return (
+            ""
+            if fits
+            else f"Expected a name in `class_names` for each of {components} components, got {names}."
+        )
+    fits = names == 0 or names > max(group)
+    breach = f"Expected classes in `group` under {names}, the number of `class_names`, got {max(group)}."
+    return "" if fits else breach
 
 
 def _check_classes(
     model: TraversabilityModel,
     terrain: Terrain,
-    mixture: TraversabilityMixture,
+    predicted: TraversabilityDistribution,
     tolerance: float,
     breaches: Breaches,
 ) -> None:
-    """Tells where what a model says of classes does not fit its mixture."""
-    names, group, expect = len(model.class_names), mixture.group, breaches.expect
-    components = mixture.weights.shape[1]
-    if group is None:
-        fits = names in (0, components)
-        breach = f"Expected a name in `class_names` for each of {components} components, got {names}."
-    else:
-        fits = names == 0 or names > max(group)
-        breach = f"Expected classes in `group` under {names}, the number of `class_names`, got {max(group)}."
-    if not expect(fits, breach):
+    """Tells where what a model says of classes does not fit its distribution."""
+    names, expect = len(model.class_names), breaches.expect
+    breach = _fit_names(names, predicted)
+    if not expect(not breach, breach):
         return
     seen = terrain.observe()
     members = breaches.watch(
@@ -126,7 +176,12 @@ def _check_classes(
     if members is None or members is NOTHING:
         return
     expect(names > 0, "Expected `class_names` beside `member_probabilities`, got none.")
-    weights = mixture.class_probabilities(names) if names else mixture.weights
+    if names:
+        weights = predicted.class_probabilities(names)
+    elif isinstance(predicted, TraversabilityMixture):
+        weights = predicted.weights
+    else:
+        return
     got = list(members.shape) if isinstance(members, Tensor) else type(members).__name__
     fits = isinstance(members, Tensor) and members.shape[1:] == weights.shape and len(members) > 0
     shape = f"[M, {str(list(weights.shape))[1:]}"

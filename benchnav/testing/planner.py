@@ -225,9 +225,11 @@ class _Trial:
 
 def _with_other_prediction(problem: Problem) -> Problem:
     """Firm ground for soft and soft for firm."""
+    mixture = problem.distribution
+    assert isinstance(mixture, TraversabilityMixture)  # of `_make_problem`
     return replace(
         problem,
-        mixture=replace(problem.mixture, means=1 - problem.mixture.means),
+        distribution=replace(mixture, means=1 - mixture.means),
         risk_map=1 - problem.risk_map,
         free=~problem.free,
     )

@@ -147,7 +147,7 @@ def test_large_maps_are_worked_on_in_pieces_without_seams(monkeypatch: pytest.Mo
 
     def maps() -> tuple[torch.Tensor, ...]:
         return (
-            mixture.cvar(0.7), mixture.var(0.7), mixture.mean(), mixture.harmonic_mean(0.05), mixture.from_normal(noise)
+            mixture.cvar(0.7), mixture.var(0.7), mixture.mean(), mixture.expected_time(0.05), mixture.from_normal(noise)
         )  # fmt: skip
 
     whole = maps()

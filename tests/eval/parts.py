@@ -35,7 +35,7 @@ class Spy(Planner[Any]):
             "start": problem.start,
             "goal_m": problem.goal_m,
             "time_budget_s": problem.time_budget_s,
-            "components": problem.mixture.weights.shape[1],
+            "components": problem.distribution.weights.shape[1],
             "rgb": problem.observation.rgb,
             "robot": repr(problem.robot),
             "objective": type(problem.objective).__name__,

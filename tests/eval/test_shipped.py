@@ -171,7 +171,7 @@ def test_the_shipped_model_of_ground_with_stakes() -> None:
     for found, best, most in (
         (predicted.mean(), ideal.mean(), 0.02),
         (predicted.cvar(0.9), ideal.cvar(0.9), 0.02),
-        (predicted.harmonic_mean(0.05), ideal.harmonic_mean(0.05), 0.02),
+        (1 / predicted.expected_time(0.05), 1 / ideal.expected_time(0.05), 0.02),
         (predicted.chance(0.1), ideal.chance(0.1), 0.02),
     ):
         assert (found - best).abs().mean() < most

@@ -90,7 +90,7 @@ def test_objectives(name: str) -> None:
 
 @pytest.mark.parametrize("name", registry.names("risk"))
 def test_risk_maps(name: str) -> None:
-    mixture = make_problem().mixture
+    mixture = make_problem().distribution
     expect(registry.make("risk", name)(mixture), BATCH, 12, 20)
 
 
@@ -112,13 +112,13 @@ def test_lookups_and_costs_of_a_problem(robot: str) -> None:
 def test_a_problem_is_posed_selected_and_copied_where_it_is() -> None:
     made = make_problem()
     posed = pose_problem(
-        made.task, made.observation, made.mixture, made.risk_map, made.start[:, :2], made.goal_m, 100.0
+        made.task, made.observation, made.distribution, made.risk_map, made.start[:, :2], made.goal_m, 100.0
     )
     chosen = posed.select(torch.empty(2, dtype=torch.int64, device="cuda"))
     for one, batch in ((posed, BATCH), (posed.clone(), BATCH), (chosen, 2)):
         expect(one.start, batch, 3)
         expect(one.free, batch, 12, 20, dtype=torch.bool)
-        expect(one.mixture.means, batch, 1, 12, 20)
+        expect(one.distribution.means, batch, 1, 12, 20)
 
 
 @pytest.mark.parametrize("noise", ["resampled", "stored"])

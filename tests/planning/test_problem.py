@@ -38,7 +38,7 @@ def tensors(problem: Problem) -> dict[str, Tensor]:
         f"{owner}{field.name}": getattr(value, field.name)
         for owner, value in (
             ("", problem),
-            ("mixture.", problem.mixture),
+            ("distribution.", problem.distribution),
             ("observation.", problem.observation),
         )
         for field in fields(value)  # type: ignore[arg-type]
@@ -56,7 +56,7 @@ def test_a_problem_is_posed_from_what_is_predicted() -> None:
     # The robot says what stands beside the pose.
     assert problem.start[:, 3:].tolist() == [[0.0, 0.0]] * 3
     assert problem.time_budget_s.tolist() == [42.0] * BATCH
-    assert torch.equal(problem.risk_map, problem.mixture.cvar(0.5))
+    assert torch.equal(problem.risk_map, problem.distribution.cvar(0.5))
     assert problem.dt_s == 0.1
     assert torch.equal(problem.elevation_m, problem.observation.elevation_m)
     low, high = problem.action_bounds
@@ -75,7 +75,7 @@ def test_headings_look_at_the_goal() -> None:
 
 def test_no_truth_is_in_it() -> None:
     assert {field.name for field in fields(Problem)} == {
-        "task", "observation", "mixture", "risk_map", "free", "start", "goal_m", "time_budget_s",
+        "task", "observation", "distribution", "risk_map", "free", "start", "goal_m", "time_budget_s",
     }  # fmt: skip
     assert not any("class_id" in name or "truth" in name for name in tensors(varied()))
 

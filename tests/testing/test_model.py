@@ -153,14 +153,14 @@ BAD = {
     "an error": (Needy(), "ValueError: sides differ [20×37]"),
     "no mixture": (
         changed(lambda mixture, _: mixture.weights),
-        "TraversabilityMixture of shape [3, K, 32, 32], got Tensor",
+        "TraversabilityDistribution of shape [3, 32, 32], got Tensor",
     ),
     "one map for all": (
         changed(lambda m, _: TraversabilityMixture(m.weights[:1], m.means[:1], m.stds[:1])),
-        "[3, K, 32, 32], got [1, 2, 32, 32]",
+        "[3, 32, 32], got TraversabilityMixture of shape [1, 32, 32]",
     ),
-    "a row short": (changed(crop), "[3, K, 32, 32], got [3, 2, 31, 32]"),
-    "height for width": (changed(transpose), "[3, K, 20, 37], got [3, 2, 37, 20]"),
+    "a row short": (changed(crop), "[3, 32, 32], got TraversabilityMixture of shape [3, 31, 32]"),
+    "height for width": (changed(transpose), "[3, 20, 37], got TraversabilityMixture of shape [3, 37, 20]"),
     "integers": (changed(whole), "one floating-point dtype, got torch.int64"),
     "two dtypes": (changed(lambda m, _: replace(m, means=m.means.double())), "got torch.float32, torch.float64"),
     "elsewhere": (changed(elsewhere), "parameters on the observation's device cpu, got meta"),

@@ -178,7 +178,7 @@ BAD: dict[str, tuple[Any, str]] = {
     ),
     "writes into the map": (acting(lambda _, s: s.problem.risk_map.mul_(0.5)), "got another problem.risk_map."),
     "writes into the goal": (preparing(lambda p, _: p.goal_m.add_(1)), "`init` to leave its arguments as they were"),
-    "writes into the prediction": (preparing(lambda p, _: p.mixture.means.zero_()), "problem.mixture.means"),
+    "writes into the prediction": (preparing(lambda p, _: p.distribution.means.zero_()), "problem.distribution.means"),
     "writes into the image": (preparing(lambda p, _: p.observation.rgb.add_(1)), "problem.observation.rgb"),
     "writes into the plan state": (acting(lambda _, s: s.last.add_(0.1)), "got another plan_state.last."),
     "counts in the plan state": (acting(lambda _, s: count_up(s)), "got another plan_state.count."),

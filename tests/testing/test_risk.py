@@ -42,7 +42,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "slip": (changed(lambda mean, m: (m.stds[:, 0] > 0) / mean.new_zeros(())), "λ̂ in [0, 1]"),
     "λ̂ of the batch": (changed(lambda mean, _: mean / (1 + mean.mean())), "the same from `risk` for one alone"),
     "another λ̂": (Forgetful(), "Expected the same from `risk` when asked again"),
-    "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another mixture"),
+    "writes into the mixture": (changed(lambda mean, m: [m.means.zero_()] and mean), "got another distribution"),
     "PyTorch's generator": (changed(lambda mean, _: mean + 0 * torch.rand(1)), "PyTorch's global generator"),
     "NumPy's generator": (changed(lambda mean, _: mean + 0 * np.random.rand()), "NumPy's global"),  # noqa: NPY002
     "knows one component alone": (changed(lambda mean, m: mean + 2 * (m.means.shape[1] - 1)), "[K = 3]"),

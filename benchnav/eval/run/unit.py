@@ -19,8 +19,8 @@ from torch import Tensor
 
 from benchnav.core import registry, rng
 from benchnav.core.device import CPU, GPU_FAULTS, gpu_failed
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import BenchnavError, ConfigError
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.registry import Part
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
@@ -174,8 +174,8 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
     noise = noise_key(unit.seed, condition.split, unit.realisation)
     simulation = Simulation(block.terrain, task, condition.world, block.places, noise, unit.maps)
     try:
-        mixture = _predict(unit, origin, device, simulation.field)
-        risk_map = risk.apply(registry.make("risk", condition.risk), mixture)
+        predicted = _predict(unit, origin, device, simulation.field)
+        risk_map = risk.apply(registry.make("risk", condition.risk), predicted)
     except GPU_FAULTS as error:
         raise gpu_failed(error) from error
     except (Exception, SystemExit) as error:
@@ -183,7 +183,7 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
     problem = pose_problem(
         task,
         block.terrain.observe(),
-        mixture,
+        predicted,
         risk_map,
         block.places.start_m,
         block.places.goal_m,
@@ -192,7 +192,9 @@ def build(unit: Unit, origin: Origin, device: torch.device = CPU) -> tuple[Probl
     return problem, simulation
 
 
-def _predict(unit: Unit, origin: Origin, device: torch.device, field: Tensor | None) -> TraversabilityMixture:
+def _predict(
+    unit: Unit, origin: Origin, device: torch.device, field: Tensor | None
+) -> TraversabilityDistribution:
     """The prediction of a unit's block, kept for other settings; of the clairvoyant's λ, of this unit alone."""
     part, block = unit.condition.model, read_block(unit, origin, device)
     digest = origin.code["parts"].get(f"model {part.part}", "")
@@ -276,7 +278,7 @@ def _block(
 
 
 @lru_cache(maxsize=2)
-def _prediction(model: str, block: Block) -> TraversabilityMixture:
+def _prediction(model: str, block: Block) -> TraversabilityDistribution:
     return predict(_model(model), block.terrain)
 
 

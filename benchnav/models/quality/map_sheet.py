@@ -77,19 +77,19 @@ def read_sheet(
     """
     terrain = dataset.terrain(split, indices)
     with torch.inference_mode():
-        mixture = predict(model, terrain)
+        predicted = predict(model, terrain)
         known = dataset.truth_of(split) == "generated"
         true = Oracle().predict_terrain(terrain).mean() if known else terrain.traversability
         layers = {"rgb": terrain.rgb.movedim(1, -1)}
         if model.class_names:
-            classes = mixture.class_probabilities(len(model.class_names))
+            classes = predicted.class_probabilities(len(model.class_names))
             layers |= {"class_true": terrain.class_id, "class_found": classes.argmax(1)}
             layers["entropy"] = predictive_entropy(classes)
         layers |= {
             "expected_true" if known else "observed": true,
-            "expected": mixture.mean(),
-            "error" if known else "error_observed": mixture.mean() - true,
-            "width": mixture.var(0.05) - mixture.var(0.95),
+            "expected": predicted.mean(),
+            "error" if known else "error_observed": predicted.mean() - true,
+            "width": predicted.var(0.05) - predicted.var(0.95),
         }
         members = model.member_probabilities(terrain.observe())
         if members is not None and len(members) > 1:

@@ -17,8 +17,8 @@ from torchmetrics.functional.classification import multiclass_confusion_matrix
 
 from benchnav.core import rng
 from benchnav.core.device import CPU, exact_convolutions
+from benchnav.core.distribution import TraversabilityDistribution
 from benchnav.core.errors import CheckpointError, DatasetError
-from benchnav.core.mixture import TraversabilityMixture
 from benchnav.core.terrain import Terrain
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.classes import look_alike_classes
@@ -36,7 +36,6 @@ from benchnav.models.quality.scores import (
     calibration_error,
     class_scores,
     coverage,
-    crps,
     mutual_information,
     pit,
     pit_counts,
@@ -92,7 +91,8 @@ class TraversabilityQuality:
         rmse_observed: root mean square of E[λ] − λ as realised.
         rmse_expected: root mean square of E[λ] − E[λ] in truth, of labelled cells; not a number where there is none
             or the truth is not known.
-        nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1.
+        nll: negative log likelihood of λ as realised, density inside (0, 1) and mass at 0 and 1; not a number for
+            distributions without a density.
         crps: continuous ranked probability score of λ as realised.
         coverage: share of λ in the central 90 % of its prediction; ideally 0.9.
         tail_rate: share of λ under the VaR at level 0.9; ideally 0.1.
@@ -200,14 +200,16 @@ def measure(
     sums: dict[str, float] = defaultdict(float)
     tally = _ClassTally(len(model.class_names), alike)
     for terrain in chunks:
-        mixture, members = _predict(model, terrain)
-        scores, transformed = _score_cells(mixture, terrain, generator, isinstance(model, PrivilegedModel))
+        predicted, members = _predict(model, terrain)
+        scores, transformed = _score_cells(predicted, terrain, generator, isinstance(model, PrivilegedModel))
         for name, score in scores.items():
             sums[name] += score
         histogram += pit_counts(transformed)
         maps += len(terrain)
         if tally.count:
-            tally.add(mixture.class_probabilities(tally.count), members, terrain.class_id, terrain.slope_deg)
+            tally.add(
+                predicted.class_probabilities(tally.count), members, terrain.class_id, terrain.slope_deg
+            )
     cells = sums["cells"]
     if not cells:
         raise DatasetError("Expected maps with an observed λ to measure on, got none.")
@@ -225,7 +227,7 @@ def measure(
     )
 
 
-def _predict(model: TraversabilityModel, terrain: Terrain) -> tuple[TraversabilityMixture, Tensor]:
+def _predict(model: TraversabilityModel, terrain: Terrain) -> tuple[TraversabilityDistribution, Tensor]:
     """The prediction, and the class probabilities of M members, shape [M, B, C, H, W], M = 0 where there are none."""
     observation = terrain.observe()
     with exact_convolutions():
@@ -306,7 +308,7 @@ def _in_a_row(layers: Tensor, which: Tensor) -> Tensor:
 
 
 def _score_cells(
-    mixture: TraversabilityMixture, terrain: Terrain, generator: torch.Generator, privileged: bool
+    predicted: TraversabilityDistribution, terrain: Terrain, generator: torch.Generator, privileged: bool
 ) -> tuple[dict[str, float], Tensor]:
     """What is summed over cells, by name; and every PIT.
 
@@ -318,15 +320,15 @@ def _score_cells(
     known = known & labelled if privileged else known
     if not bool(known.any()):
         return {}, torch.zeros(0)
-    mixture, observed = mixture.at(known), terrain.traversability[known].unsqueeze(0)
-    expected, transformed = mixture.mean(), pit(mixture, observed, generator)
+    predicted, observed = predicted.at(known), terrain.traversability[known].unsqueeze(0)
+    expected, transformed = predicted.mean(), pit(predicted, observed, generator)
     cells = transformed.numel()
     errors = (expected - terrain.truth.at(known).mean())[0, labelled[known]].double().square()
     sums: dict[str, Any] = {
         "cells": cells,
         "squares": (expected - observed).double().square().sum(),
-        "nll": -mixture.log_prob(observed).double().sum(),
-        "crps": crps(mixture, observed).double().sum(),
+        "nll": -predicted.log_prob(observed).double().sum(),
+        "crps": predicted.crps(observed).double().sum(),
         "coverage": coverage(transformed) * cells,
         "tail_rate": tail_rate(transformed) * cells,
         "expected_squares": errors.sum(),

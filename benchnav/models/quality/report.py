@@ -95,8 +95,8 @@ COLUMNS = {
     ),
     "nll": (
         "NLL\nλ",
-        "minus the logarithm of the predicted density at λ as observed, in the mean; lower is better, and it may "
-        "be negative.",
+        "minus the logarithm of the predicted density at λ as observed, in the mean; lower is better, it may be "
+        "negative, and – stands where the predicted distribution has no density.",
     ),
     "crps": (
         "CRPS\nλ",
@@ -173,8 +173,8 @@ def quality_table(title: str, qualities: Mapping[str, Quality], whole: bool = Fa
         whole: with the numbers that a terminal is too narrow for.
     """
     table = pd.DataFrame([numbers(quality) for quality in qualities.values()], index=list(qualities))
-    # Those that some split has, and the one whose truth may be unknown.
-    kept = table.columns[np.isfinite(table).any() | (table.columns == "rmse_expected")]
+    # Those that some split has, and those that the truth or the prediction may lack.
+    kept = table.columns[np.isfinite(table).any() | table.columns.isin(["rmse_expected", "nll"])]
     names = [name for name in COLUMNS if name in kept and (whole or name not in _FILES_ONLY)]
     explained = [(" ".join(heading.split()), text) for heading, text in (COLUMNS[name] for name in names)]
     return Table(

@@ -1,9 +1,9 @@
 """Scores of predicted probabilities: of distributions of traversability, of classes, and of their uncertainty.
 
 Calibration of λ is read off the probability integral transform (PIT) of what was observed: uniform
-when the predicted distributions are right. Where λ was clipped the distribution has an atom, and the
+when the predicted distributions are right. Where the distribution has an atom, as where λ was clipped, the
 PIT is drawn uniformly within it, so it is uniform there too. Sources: Gneiting and Raftery (2007),
-"Strictly proper scoring rules" (CRPS, Brier score); Czado et al. (2009), "Predictive model assessment
+"Strictly proper scoring rules" (Brier score); Czado et al. (2009), "Predictive model assessment
 for count data" (randomised PIT); Guo et al. (2017), "On calibration of modern neural networks"
 (reliability, ECE).
 
@@ -17,7 +17,7 @@ Of classes that look alike, which are shown together, a perfect classifier says 
 also given with them merged into one class, and of the shares of the single classes within that one whether
 they are what they should be.
 
-Letters in shapes: K components, M members, B maps, C classes, G look-alikes, H×W cells, *B any leading
+Letters in shapes: M members, B maps, C classes, G look-alikes, H×W cells, *B any leading
 dimensions.
 """
 
@@ -25,64 +25,32 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torchmetrics.functional.classification import multiclass_confusion_matrix
 
-from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.distribution import TraversabilityDistribution
 
 LEVEL = 0.9
 CONFIDENCE_BINS = 15
 PIT_BINS = 20
 
-_QUADRATURE_NODES = 48
-_SMALLEST_STD = 1e-9
-_UNDER_1 = 1 - 2**-53  # the largest float64 under 1
 _DROPPED_BITS = 13  # of a float32's 23 fraction bits: scores that differ by over 0.1 % are distinct
 _PLACES = 2 ** (31 - _DROPPED_BITS)
 
 
-def crps(mixture: TraversabilityMixture, observed: Tensor) -> Tensor:
-    """Continuous ranked probability score: ∫₀¹ (F(x) − 1[observed ≤ x])² dx.
-
-    As ∫₀¹ F² dx − 2·∫_observed^1 F dx + 1 − observed: the second integral is of closed form, and the
-    first is smooth, so that Gauss-Legendre quadrature with 48 nodes is off by less than 10⁻⁵ for
-    components with standard deviations from 0.03, and by up to 0.02 for much narrower ones.
-
-    Args:
-        mixture: predicted, parameters of shape [*B, K, H, W], whose dtype the nodes are computed in.
-        observed: λ in [0, 1], shape [*B, H, W].
-
-    Returns:
-        Shape [*B, H, W]; 0 is perfect.
-    """
-    stds = mixture.stds.clamp(min=_SMALLEST_STD)
-    narrowness = 1 / (stds * math.sqrt(2))
-    nodes, shares = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
-    squared = torch.zeros_like(observed, dtype=stds.dtype)
-    for node, share in zip((nodes + 1) / 2, shares / 2, strict=True):
-        weighted = torch.erf_((node - mixture.means) * narrowness).mul_(mixture.weights)
-        squared += share * (0.5 + 0.5 * weighted.sum(-3)) ** 2
-    at = observed.double()
-    above = _integrated_cdf(mixture, torch.ones_like(at)) - _integrated_cdf(mixture, at)
-    return (squared - 2 * above + 1 - at).clamp(min=0).to(observed.dtype)
-
-
-def pit(mixture: TraversabilityMixture, observed: Tensor, generator: torch.Generator) -> Tensor:
+def pit(distribution: TraversabilityDistribution, observed: Tensor, generator: torch.Generator) -> Tensor:
     """Randomised probability integral transform of what was observed.
 
     Args:
-        mixture: predicted, parameters of shape [*B, K, H, W].
+        distribution: predicted, of shape [*B, H, W].
         observed: λ in [0, 1], shape [*B, H, W].
-        generator: of the draws within the atoms at 0 and 1, on the CPU.
+        generator: of the draws within atoms, on the CPU.
 
     Returns:
         Shape [*B, H, W]; uniform on [0, 1] when the prediction is right.
     """
-    inside = mixture.cdf(observed.double().clamp(max=_UNDER_1))
-    lower = torch.where(observed <= 0, 0.0, inside)
-    upper = torch.where(observed >= 1, 1.0, inside)
+    lower, upper = distribution.cdf_limits(observed)
     drawn = torch.rand(observed.shape, generator=generator).to(observed.device)
     return lower + drawn * (upper - lower)
 
@@ -190,15 +158,6 @@ def calibration_error(curve: Tensor) -> float:
 def _bin(values: Tensor, count: int) -> Tensor:
     """The bin of each value among equal ones of [0, 1], int64, shape [N]."""
     return (values * count).floor().long().clamp(0, count - 1).flatten()
-
-
-def _integrated_cdf(mixture: TraversabilityMixture, value: Tensor) -> Tensor:
-    """∫_{−∞}^value F of the mixture before clipping, float64."""
-    weights, means, stds = (t.double() for t in (mixture.weights, mixture.means, mixture.stds))
-    stds = stds.clamp(min=_SMALLEST_STD)
-    z = (value.unsqueeze(-3) - means) / stds
-    density = torch.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
-    return (weights * stds * (z * torch.special.ndtr(z) + density)).sum(-3)
 
 
 def predictive_entropy(probabilities: Tensor) -> Tensor:

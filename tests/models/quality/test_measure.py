@@ -24,7 +24,7 @@ from benchnav.models.quality.measure import (
     nearest_colour,
     nearest_colour_accuracy,
 )
-from benchnav.models.quality.scores import crps, mutual_information, predictive_entropy
+from benchnav.models.quality.scores import mutual_information, predictive_entropy
 from benchnav.models.slope_gp.cells import measure_latent
 from benchnav.models.slope_gp.table import SoftModes
 from tests.factories import normal, tiny_dataset, tiny_recipe
@@ -50,7 +50,7 @@ def test_the_oracle_is_calibrated_and_has_no_class_metrics() -> None:
     assert figures.nll == pytest.approx(float(by_hand), rel=1e-5)
     error = (truth.mean() - terrain.traversability).square().mean().sqrt()
     assert figures.rmse_observed == pytest.approx(float(error), rel=1e-5)
-    assert figures.crps == pytest.approx(float(crps(truth, terrain.traversability).mean()), rel=1e-5)
+    assert figures.crps == pytest.approx(float(truth.crps(terrain.traversability).mean()), rel=1e-5)
     cells = terrain.traversability.numel()
     assert sum(figures.pit) == cells
     assert sum(figures.pit[1:-1]) / cells == pytest.approx(figures.coverage, abs=1e-4)

@@ -29,7 +29,6 @@ from benchnav.models.quality.scores import (
     brier_score,
     calibration_error,
     coverage,
-    crps,
     mutual_information,
     pit,
     pit_counts,
@@ -59,7 +58,7 @@ def test_crps_is_the_closed_form_of_a_gaussian_far_from_the_bounds() -> None:
     z = ((observed - 0.5) / 0.05).numpy()
     density = torch.exp(-0.5 * torch.from_numpy(z) ** 2) / math.sqrt(2 * math.pi)
     exact = 0.05 * (torch.from_numpy(z * (2 * ndtr(z) - 1)) + 2 * density - 1 / math.sqrt(math.pi))
-    torch.testing.assert_close(crps(mixture, observed), exact, rtol=0, atol=1e-6)
+    torch.testing.assert_close(mixture.crps(observed), exact, rtol=0, atol=1e-6)
 
 
 @settings(max_examples=25, deadline=None)
@@ -83,14 +82,14 @@ def test_crps_is_the_integral_that_defines_it(
 
     points = sorted({observed, *(m for m in means if 0 < m < 1)})
     exact = quad(gap, 0, 1, points=points, limit=200, epsabs=1e-8)[0]
-    score = crps(mixture, torch.tensor([[observed]], dtype=torch.float64))
+    score = mixture.crps(torch.tensor([[observed]], dtype=torch.float64))
     assert float(score) == pytest.approx(exact, abs=1e-5)
 
 
 def test_crps_of_certain_predictions_is_their_distance() -> None:
     mixture, observed = single(0.3, 0.0, (1, 3)), torch.tensor([[0.0, 0.3, 1.0]], dtype=torch.float64)
     expected = torch.tensor([[0.3, 0.0, 0.7]], dtype=torch.float64)
-    torch.testing.assert_close(crps(mixture, observed), expected, rtol=0, atol=0.02)
+    torch.testing.assert_close(mixture.crps(observed), expected, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("mean", [0.5, 0.95, 0.05, 1.2])

@@ -71,8 +71,8 @@ def test_what_a_planner_does_to_its_arguments_reaches_nobody() -> None:
     def tensors(value: Problem) -> list[Tensor]:
         return [
             value.start, value.goal_m, value.risk_map, value.free, value.elevation_m, value.traversability,
-            value.observation.rgb, value.observation.slope_deg, value.mixture.weights, value.mixture.means,
-            value.mixture.stds, value.padded_ground, *value.action_bounds,
+            value.observation.rgb, value.observation.slope_deg, value.distribution.weights, value.distribution.means,
+            value.distribution.stds, value.padded_ground, *value.action_bounds,
         ]  # fmt: skip
 
     given = problem()

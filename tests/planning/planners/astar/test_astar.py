@@ -165,7 +165,7 @@ def test_a_goal_at_a_corner_of_coarse_cells_is_reached() -> None:
     made = factories.problem(torch.full((1, 8, 8), 0.9))
     observation = replace(made.observation, grid=Grid(8, 8, 2.0))
     start, goal = torch.tensor([[3.0, 3.0]]), torch.tensor([[12.0, 12.0]])
-    problem = pose_problem(made.task, observation, made.mixture, made.risk_map, start, goal, 100.0)
+    problem = pose_problem(made.task, observation, made.distribution, made.risk_map, start, goal, 100.0)
     field = astar.search(problem)
     assert field.following[0, 6 * 8 + 6] == 6 * 8 + 6
     # Five diagonal steps of 2√2 m.

@@ -1,0 +1,109 @@
+"""A distribution whose normal score is known better than before: what observations nearby tell of a cell.
+
+A field of λ goes through correlated standard normals, λ = Q(Φ(z)). Where observations give z a posterior N(μ, σ²), λ
+has the quantile function Q(Φ(μ + σ Φ⁻¹(u))) and the CDF Φ((Φ⁻¹(F(x)) − μ) / σ).
+Letters in shapes: H×W cells, *B any leading dimensions.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from benchnav.core.distribution import MOST_SCORE, TraversabilityDistribution
+from benchnav.core.errors import ConfigError
+from benchnav.core.mixture import TraversabilityMixture
+
+_SMALLEST_STD = 1e-9
+
+
+@dataclass(frozen=True)
+class ConditionedDistribution(TraversabilityDistribution):
+    """A distribution given a posterior of its normal score in each cell.
+
+    Args:
+        base: what is known without the observations, of shape [*B, H, W].
+        score_mean: μ, shape [*B, H, W].
+        score_std: σ ≥ 0, shape [*B, H, W]; where it is 0, all of λ is Q(Φ(μ)).
+
+    Raises:
+        ConfigError: the shapes differ.
+    """
+
+    base: TraversabilityDistribution
+    score_mean: Tensor
+    score_std: Tensor
+
+    def __post_init__(self) -> None:
+        """Checks the shapes."""
+        if not self.score_mean.shape == self.score_std.shape == self.base.shape:
+            raise ConfigError(
+                f"Expected `score_mean` and `score_std` of the base's shape {list(self.base.shape)}, got "
+                f"{list(self.score_mean.shape)} and {list(self.score_std.shape)}."
+            )
+
+    @property
+    def shape(self) -> torch.Size:
+        """[*B, H, W]."""
+        return self.base.shape
+
+    def cdf(self, value: Tensor | float) -> Tensor:
+        """P(λ ≤ value), shape [*B, H, W]; see the base."""
+        return torch.special.ndtr(self._scores(value)[1]).to(self.dtype)
+
+    def cdf_limits(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """P(λ < value) and P(λ ≤ value), each of shape [*B, H, W]; see the base."""
+        lower, upper = self._scores(value)
+        return torch.special.ndtr(lower).to(self.dtype), torch.special.ndtr(upper).to(self.dtype)
+
+    def quantile(self, probability: Tensor | float) -> Tensor:
+        """Least λ that is not exceeded with this probability, shape [*B, H, W]; see the base."""
+        share = torch.as_tensor(probability, dtype=torch.float64, device=self.device)
+        score = torch.special.ndtri(share).clamp(-MOST_SCORE, MOST_SCORE)
+        return self.from_normal(score.expand(self.shape))
+
+    def from_normal(self, normal: Tensor) -> Tensor:
+        """λ of the rank that a standard normal number has, shape [*B, H, W]; see the base."""
+        return self.base.from_normal(self.score_mean + self.score_std * normal).to(self.dtype)
+
+    def to_normal(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The interval of standard normal numbers that `from_normal` takes to λ, each of shape [*B, H, W]."""
+        lower, upper = self._scores(value)
+        return lower.to(self.dtype), upper.to(self.dtype)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log density on (0, 1), log mass at 0 and at 1, shape [*B, H, W]; not a number where the base has none."""
+        value, std = value.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
+        lower, upper = self._scores(value)
+        prior = upper * std + self.score_mean.double()  # z of the base, whose density there is known
+        inside = (
+            self.base._exact().log_prob(value).double() + (prior.square() - upper.square()) / 2 - std.log()
+        )
+        mass = torch.where(value <= 0, upper, -lower)
+        total = torch.where((value <= 0) | (value >= 1), torch.special.log_ndtr(mass), inside)
+        return torch.where((value < 0) | (value > 1), -math.inf, total).to(self.dtype)
+
+    def _scores(self, value: Tensor | float) -> tuple[Tensor, Tensor]:
+        """Standard normal numbers in float64, whose Φ are P(λ < value) and P(λ ≤ value)."""
+        lower, upper = self.base._exact().to_normal(value)
+        mean, std = self.score_mean.double(), self.score_std.double().clamp(min=_SMALLEST_STD)
+        return (lower - mean) / std, (upper - mean) / std
+
+
+def conditioned(base: TraversabilityDistribution, mean: Tensor, std: Tensor) -> TraversabilityDistribution:
+    """The distribution of λ where its normal score has a posterior.
+
+    Args:
+        base: what is known without the observations, of shape [*B, H, W].
+        mean: μ of the score, shape [*B, H, W].
+        std: σ ≥ 0 of the score, shape [*B, H, W].
+
+    Returns:
+        A mixture again, exactly, where the base is one of a single component: clip(m + s (μ + σ z)); else a
+        `ConditionedDistribution`.
+    """
+    if not isinstance(base, TraversabilityMixture) or base.weights.shape[-3] > 1:
+        return ConditionedDistribution(base, mean, std)
+    means = base.means + base.stds * mean.unsqueeze(-3)
+    return TraversabilityMixture(base.weights, means, base.stds * std.unsqueeze(-3), base.group)
