@@ -1,6 +1,6 @@
 """Batches: frozen dataclasses of tensors whose first dimension is that of the members, episodes or maps."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from typing import Any, Self, TypeVar, cast
 
@@ -27,25 +27,29 @@ class Batch:
 
 
 def map_tensors(value: Value, change: Callable[..., Tensor], *others: Value) -> Value:
-    """Changes each tensor of a dataclass, and of the batches and tuples of batches in it; all else stays.
+    """Changes each tensor of a dataclass, and of the batches, tuples of batches and mappings in it; all else stays.
 
     Args:
         value: the dataclass.
         change: is given a tensor, and those that have its place in the others.
         others: more of the same kind.
     """
-    changed: dict[str, Any] = {}
-    for name in (each.name for each in fields(value)):
-        first, *rest = (getattr(one, name) for one in (value, *others))
-        if isinstance(first, Tensor):
-            changed[name] = change(first, *rest)
-        elif isinstance(first, Batch):
-            changed[name] = map_tensors(first, change, *rest)
-        elif isinstance(first, tuple) and first and isinstance(first[0], Batch):
-            changed[name] = tuple(
-                map_tensors(own, change, *same) for own, *same in zip(first, *rest, strict=True)
-            )
-    return replace(value, **changed)
+    names = [each.name for each in fields(value)]
+    return replace(
+        value, **{n: _changed(getattr(value, n), change, [getattr(one, n) for one in others]) for n in names}
+    )
+
+
+def _changed(first: Any, change: Callable[..., Tensor], rest: list[Any]) -> Any:
+    if isinstance(first, Tensor):
+        return change(first, *rest)
+    if isinstance(first, Batch):
+        return map_tensors(first, change, *rest)
+    if isinstance(first, tuple) and first and isinstance(first[0], Batch):
+        return tuple(map_tensors(own, change, *same) for own, *same in zip(first, *rest, strict=True))
+    if isinstance(first, Mapping):
+        return {key: _changed(inner, change, [other[key] for other in rest]) for key, inner in first.items()}
+    return first
 
 
 def first_tensor(value: Batch) -> Tensor:
@@ -61,7 +65,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
     if isinstance(value, Tensor):
         yield value
     parts = (
-        [getattr(value, field.name) for field in fields(cast(Any, value))]
+        [getattr(value, each.name) for each in fields(cast(Any, value))]
         if isinstance(value, Batch)
         else value
     )

@@ -77,8 +77,22 @@ OPTIONAL: dict[str, Field] = {
     ),
 }
 
-KNOWN = FIELDS | OPTIONAL
+# Layers, what a model may see of the ground beside colour and shape. NaN is where nothing is known.
+LAYERS: dict[str, Field] = {
+    "vegetation_m": Field("<f4", ("H", "W"), "m", 0, 200, "height of the vegetation; 0 on bare ground"),
+}
+
+KNOWN = FIELDS | OPTIONAL | LAYERS
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
+
+
+def layer_names(fields: Fields) -> tuple[str, ...]:
+    """Names of the layers among fields: those of `LAYERS`, and float32 maps of a dataset's own."""
+    return tuple(
+        name
+        for name, field in fields.items()
+        if name in LAYERS or (name not in KNOWN and (field.dtype, field.shape) == ("<f4", ("H", "W")))
+    )
 
 
 def quantise(values: ndarray, bits: int) -> ndarray:

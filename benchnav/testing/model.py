@@ -25,8 +25,8 @@ from benchnav.models.base import TraversabilityModel, predict
 from benchnav.models.nets.trainable import TrainableModel
 from benchnav.models.predictor import load_model
 from benchnav.testing.breaches import NOTHING, Breaches, same
-from benchnav.testing.trainable import try_training, untrained, with_inputs
 from benchnav.testing.distribution import check_functions
+from benchnav.testing.trainable import try_training, untrained, with_inputs
 
 _MAPS = 3
 _CLASSES = tuple(map(str, range(10)))  # more than any map of the contract shows

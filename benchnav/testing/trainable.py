@@ -44,7 +44,9 @@ def with_inputs(terrain: Terrain, model: TrainableModel) -> Terrain:
     return replace(terrain, layers=layers)
 
 
-def try_training(model: TrainableModel, terrain: Terrain, classes: tuple[str, ...], breaches: Breaches) -> bool:
+def try_training(
+    model: TrainableModel, terrain: Terrain, classes: tuple[str, ...], breaches: Breaches
+) -> bool:
     """Builds a model, tries its hooks and takes a step; tells what breaks the contract, and whether it can predict."""
     try:
         maps = _maps(model, terrain)
@@ -55,7 +57,8 @@ def try_training(model: TrainableModel, terrain: Terrain, classes: tuple[str, ..
         for what, batch in (("in part", some), ("anywhere", hidden)):
             loss, _ = model.train().assess(batch)
             breaches.expect(
-                bool(loss.isfinite()), f"Expected a finite loss where λ is not observed {what}, got {loss.item()}."
+                bool(loss.isfinite()),
+                f"Expected a finite loss where λ is not observed {what}, got {loss.item()}.",
             )
         before = {name: value.clone() for name, value in model.named_parameters()}
         loss, _ = model.train().assess(maps)

@@ -38,7 +38,8 @@ def test_rows_are_y_and_off_the_map_is_outside() -> None:
 def test_observation_holds_what_a_robot_sees_and_nothing_else() -> None:
     observation = factories.terrain(torch.rand(2, 16, 16)).observe()
     assert isinstance(observation, Observation)
-    assert set(vars(observation)) == {"rgb", "elevation_m", "slope_deg", "grid"}
+    assert set(vars(observation)) == {"rgb", "elevation_m", "slope_deg", "grid", "layers"}
+    assert observation.layers == {}
 
 
 def test_layers_that_do_not_fit_are_named() -> None:
