@@ -1,45 +1,41 @@
 """The card of a checkpoint, README.md, for hubs and people: what it is, what it was trained on, how to load it."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import yaml
 
 from benchnav.core.tables import Table, to_markdown
 
-if TYPE_CHECKING:
-    from benchnav.models.checkpoint import Checkpoint, Part
-
 CARD = "README.md"
 
 
-def card_of(checkpoint: "Checkpoint", name: str) -> str:
+def card_of(name: str, model: str, parts: Mapping[str, Any], classes: Sequence[str], code: str) -> str:
     """Writes the card of a checkpoint.
 
     Args:
-        checkpoint: with one part or more.
         name: of its folder.
+        model: of what kind it is.
+        parts: its parts by name, each a `models.checkpoint.Part`; one or more.
+        classes: names of the terrain classes.
+        code: digest of the code of a user's own class; empty where it is ours.
 
     Returns:
         Markdown, with the front matter that model hubs read.
     """
-    parts = checkpoint.parts
     datasets = sorted({part.data_id for part in parts.values()})
     head = {"library_name": "benchnav", "tags": ["traversability", "robotics"], "datasets": datasets}
-    place = f"path/to/file.py:{checkpoint.model}@{name}" if checkpoint.code else name
+    place = f"path/to/file.py:{model}@{name}" if code else name
     own = (
-        f"The class `{checkpoint.model}` is a user's own and not in this folder: name the file that holds it. The "
-        f"SHA-256 of its code was `{checkpoint.code}`.\n\n"
-        if checkpoint.code
+        f"The class `{model}` is a user's own and not in this folder: name the file that holds it. The "
+        f"SHA-256 of its code was `{code}`.\n\n"
+        if code
         else ""
     )
-    classes = (
-        f"Terrain classes of the maps: {', '.join(checkpoint.class_names)}.\n\n"
-        if checkpoint.class_names
-        else ""
-    )
+    classes = f"Terrain classes of the maps: {', '.join(classes)}.\n\n" if classes else ""
     return (
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---\n\n# {name}\n\n"
-        f"A model of traversability of the kind `{checkpoint.model}`, trained on {' and '.join(datasets)}. It predicts "
+        f"A model of traversability of the kind `{model}`, trained on {' and '.join(datasets)}. It predicts "
         "the distribution of traversability in every cell of a map. Reading it runs no code.\n\n"
         f"```sh\nbenchnav-train evaluate {place} --data DATASET\n"
         f"benchnav-eval run --model {place} --data DATASET\n```\n\n"
@@ -51,7 +47,7 @@ def card_of(checkpoint: "Checkpoint", name: str) -> str:
     )
 
 
-def _parts_table(parts: Any) -> str:
+def _parts_table(parts: Mapping[str, Any]) -> str:
     rows = []
     for name, part in parts.items():
         measured = ", ".join(
@@ -64,8 +60,8 @@ def _parts_table(parts: Any) -> str:
     return to_markdown(Table(title="", headings=headings, rows=tuple(rows)))
 
 
-def _settings_table(parts: Any) -> str:
-    first: dict[str, Part] = {name.partition("-")[0]: part for name, part in reversed(parts.items())}
+def _settings_table(parts: Mapping[str, Any]) -> str:
+    first = {name.partition("-")[0]: part for name, part in reversed([*parts.items()])}
     rows = [
         (stem, setting, str(value)) for stem, part in sorted(first.items()) for setting, value in part.config.items()
         if setting not in ("steepest_deg",)

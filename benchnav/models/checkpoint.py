@@ -295,8 +295,11 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
             "data": {"id": part.data_id, "digest": part.data_digest},
             "sha256": digest,
         }
-    optional = {} if checkpoint.pool_temperature == 1 else {"pool_temperature": checkpoint.pool_temperature}
-    optional |= {"code": checkpoint.code} if checkpoint.code else {}
+    optional: dict[str, Any] = {}
+    if checkpoint.pool_temperature != 1:
+        optional["pool_temperature"] = checkpoint.pool_temperature
+    if checkpoint.code:
+        optional["code"] = checkpoint.code
     config = {
         "format": FORMAT,
         "format_version": ".".join(map(str, FORMAT_VERSION)),
@@ -307,7 +310,10 @@ def _write(folder: Path, checkpoint: Checkpoint, name: str) -> None:
         "parts": parts,
     }
     if parts:
-        write_text(folder / CARD, card_of(checkpoint, name))
+        write_text(
+            folder / CARD,
+            card_of(name, checkpoint.model, checkpoint.parts, checkpoint.class_names, checkpoint.code),
+        )
     write_text(folder / CONFIG, seal(config) + "\n")
 
 

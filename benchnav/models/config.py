@@ -200,7 +200,9 @@ class MDNConfig(NetworkConfig):
         """Refuses numbers that cannot train."""
         super().__post_init__()
         _check_least(self, 1, "components", "hidden")
-        _check(self, set(self.inputs) - {"slope_deg"}, "inputs", "with a layer beside slope_deg")
+        _check(
+            self, any(name != "slope_deg" for name in self.inputs), "inputs", "with a layer beside slope_deg"
+        )
 
 
 def check_seed(seed: int, count: int = 1) -> None:

@@ -328,7 +328,7 @@ def test_an_ensemble_is_calibrated_as_a_whole_and_again_when_a_member_joins(
         found.append(load_checkpoint(folder).pool_temperature)
         if members > 1:
             assert found[-1] == fit_pool_temperature(classifiers, valid, 4)
-            assert f"pool of {members} classifiers: temperature {found[-1]:.3f}" in capfd.readouterr().out
+            assert f"pool of {members} networks: temperature {found[-1]:.3f}" in capfd.readouterr().out
     assert found[0] == 1
     assert len(set(found)) == 3
     # A member alone is what its own seed alone would have given.

@@ -96,7 +96,12 @@ class MixtureDensityModel(TrainableModel):
 
     def configure_losses(self) -> Loss:
         """The negative log likelihood of λ as observed."""
-        return lambda outputs, observed: censored_nll(*outputs, observed)
+
+        def loss(outputs: tuple[Tensor, Tensor, Tensor], observed: Tensor) -> Tensor:
+            log_weights, means, stds = outputs
+            return censored_nll(log_weights, means, stds, observed)
+
+        return loss
 
     def forward(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor]:
         """Computes the mixtures of maps of any size; their parameters are float32 under autocast too.

@@ -1,8 +1,8 @@
 """What a trainable model is: named hooks that a subclass fills in.
 
-`benchnav-train fit` trains any `TrainableModel`, a user's own as well as ours. It learns one field of the maps, observed
-λ, from layers of the same maps. A subclass says which layers (`inputs` among its settings), makes its network, its
-loss and its distribution, and leaves the rest as it is:
+`benchnav-train fit` trains any `TrainableModel`, a user's own as well as ours. It learns one field of the maps, λ as it
+was observed, from layers of the same maps. A subclass says which layers (`inputs` among its settings), makes its
+network, its loss and its distribution, and leaves the rest as it is:
 
     class Mine(TrainableModel):
         def __init__(self, config: MyConfig = MyConfig()) -> None:
@@ -117,7 +117,7 @@ class TrainableNetwork(lightning.LightningModule):
             torch.default_generator.manual_seed(seed)
             self.make_modules(scale)
         # A loss that is no number is to be seen, not left out.
-        measured = {"loss": MeanMetric(nan_strategy=math.nan), **self.configure_metrics()}
+        measured: dict[str, Any] = {"loss": MeanMetric(nan_strategy=math.nan), **self.configure_metrics()}
         self.metrics = MetricCollection(measured, prefix="valid_", compute_groups=False)
         self.loss = self.configure_losses()
         return self

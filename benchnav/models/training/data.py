@@ -38,13 +38,13 @@ class MapKey(NamedTuple):
     """Which maps a batch holds, and what is done to each.
 
     Args:
-        index: of the maps, int64, shape [b].
+        maps: indices of the maps, int64, shape [b].
         symmetry: that each is turned by, int64, shape [b].
         factors: of `apply_jitter`, shape [b, 3].
         origin: first row and column of the square that is cut from each, int64, shape [b, 2].
     """
 
-    index: Tensor
+    maps: Tensor
     symmetry: Tensor
     factors: Tensor
     origin: Tensor
@@ -77,7 +77,7 @@ class MapDataset(TerrainMaps):
 
     def __getitem__(self, key: MapKey) -> Batch:  # type: ignore[override]
         """Gives every field of the maps in `key`, shape [b, *, H, W]."""
-        which, place = key.index.unique(return_inverse=True)  # squares of one map are cut from one reading
+        which, place = key.maps.unique(return_inverse=True)  # squares of one map are cut from one reading
         read = self.read(which.tolist())
         batch = {}
         for name, values in read.items():
@@ -282,7 +282,7 @@ class MapData(lightning.LightningDataModule):
                 known = values.double().nan_to_num()
                 sums[name] += torch.stack([known.sum(), known.square().sum()])
                 cells[name] += int(values.isfinite().sum())
-        scale = {name: _layer_scale(name, *sums[name], cells[name]) for name in inputs if name != "rgb"}
+        scale = {name: _layer_scale(name, sums[name], cells[name]) for name in inputs if name != "rgb"}
         if "rgb" in inputs:
             share, level = (
                 counts.double() / counts.sum(1, keepdim=True),
@@ -323,11 +323,11 @@ class MapData(lightning.LightningDataModule):
         )  # fmt: skip
 
 
-def _layer_scale(name: str, total: Tensor, squares: Tensor, cells: int) -> LayerScale:
+def _layer_scale(name: str, sums: Tensor, cells: int) -> LayerScale:
     """The scale of a layer from its sum and its sum of squares over so many known cells; directions keep theirs."""
     if is_azimuth(name):
         return LayerScale(torch.zeros(2), torch.ones(2), torch.ones(()))
-    mean, square = total / max(1, cells), squares / max(1, cells)
+    mean, square = (sums / max(1, cells)).unbind()
     std = (
         (square - mean**2).clamp(min=_LEAST_VARIANCE).sqrt()
     )  # a layer that is the same everywhere has no scale
