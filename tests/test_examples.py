@@ -31,7 +31,7 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
 ) -> None:
     os.symlink(EXAMPLES / "own_model.py", tmp_path / "own_model.py")
     run(tmp_path, "benchnav-datagen", "create", "tiny-v1", "--out", "tiny.h5")
-    quick = ("--settings.batch_size", "2", "--settings.learning_rate", "0.02", "--trainer.precision", "32-true")
+    quick = ("--settings.batch_size", "2", "--settings.learning_rate", "0.02")
     said = run(
         tmp_path, "benchnav-train", "fit", "own_model.py:CellModel", "--data", "tiny.h5", "--out", "mine",
         "--members", "2", *quick,
@@ -48,8 +48,8 @@ def test_a_model_of_ones_own_is_trained_calibrated_measured_and_driven_with(
     for split, own in measured[model].items():
         true = dataset.terrain(split).truth.mean()
         constant = float((true - float(observed.mean())).square().mean().sqrt())
-        own, oracle = own["traversability"], measured["oracle"][split]["traversability"]
-        assert own["rmse_expected"] < 0.8 * constant
+        oracle = measured["oracle"][split]
+        assert own["rmse_expected"] < 0.7 * constant
         assert oracle["crps"] < own["crps"]
     rows = evaluate(dataset_path, tmp_path, "--model", model, "--planners", "[astar_dwa]")
     assert set(rows["model"]) == {"mine"}

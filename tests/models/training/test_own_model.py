@@ -168,7 +168,7 @@ def test_a_checkpoint_of_a_users_class_needs_the_class(trained: Path) -> None:
     with pytest.raises(CheckpointError, match=r"of the class Other, got .* which is one of 'CellModel'"):
         load_model(f"{trained / 'other.py'}:Other@{trained / 'c'}")
     with pytest.raises(ConfigError, match=r"to be a benchnav\.models\.TrainableModel or ModelFamily"):
-        load_model(f"{trained / 'own.py'}:gaussian@{trained / 'c'}")
+        load_model(f"{trained / 'own.py'}:CellConfig@{trained / 'c'}")
 
 
 @pytest.mark.parametrize("where", ["model", "code", "config", "parts"])
@@ -203,20 +203,20 @@ def test_a_hostile_checkpoint_imports_nothing(trained: Path, tmp_path: Path, whe
 
 
 BROKEN = {
-    "shape": ("return (nll * seen).sum() / seen.sum().clamp(min=1)", "return nll",
+    "shape": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores",
         "a loss that is one number, got shape"),
-    "nan": ("(nll * seen).sum()", "(nll * seen).sum() * float('nan')", "a finite loss, got nan"),
-    "no gradient": ("(nll * seen).sum() /", "(nll * seen).sum().detach() /", "that has a gradient"),
-    "no number": ("return beta_nll", "return lambda outputs, observed: 3.0", "one number, got float"),
-    "distribution": ("return TraversabilityMixture(torch.ones_like(mean), mean, variance.sqrt())", "return mean",
+    "nan": ("(scores * seen).sum()", "(scores * seen).sum() * float('nan')", "a finite loss, got nan"),
+    "no gradient": ("(scores * seen).sum() /", "(scores * seen).sum().detach() /", "that has a gradient"),
+    "no number": ("return crps", "return lambda outputs, observed: 3.0", "one number, got float"),
+    "distribution": ("return TraversabilityMixture(torch.ones_like(mean), mean, std)", "return mean",
                      "to give a TraversabilityDistribution, got Tensor"),
-    "distribution's shape": ("TraversabilityMixture(torch.ones_like(mean), mean, variance.sqrt())",
-                             "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, variance)))",
+    "distribution's shape": ("TraversabilityMixture(torch.ones_like(mean), mean, std)",
+                             "TraversabilityMixture(*(v[..., 1:] for v in (torch.ones_like(mean), mean, std)))",
                              r"to give one of shape \[2, 32, 32\], got \[2, 32, 31\]"),
-    "means": ("variance.sqrt())", "variance.sqrt() * torch.nan)", r"means of λ in \[0, 1\]"),
+    "means": ("mean, std)\n\n", "mean, std * torch.nan)\n\n", r"means of λ in \[0, 1\]"),
     "raises": ("hidden = self.config.hidden", "hidden = self.config.width",
         "'CellConfig' object has no attribute 'width'"),
-    "device": ("return (nll * seen).sum() / seen.sum().clamp(min=1)", "return nll.sum().to('meta')",
+    "device": ("return (scores * seen).sum() / seen.sum().clamp(min=1)", "return scores.sum().to('meta')",
         "on cpu, got one on meta"),
 }  # fmt: skip
 
@@ -252,7 +252,10 @@ def test_a_hook_that_does_not_fit_is_refused_before_anything_is_trained(
         (["own.py:CellModel", "--settings.width", "3"], "got 'width'"),
         (["own.py:CellModel", "--crop", "33"], r"`crop` in 8–32 cells"),
         (["own.py:CellModel", "--members", "0"], "`members` ≥ 1"),
-        (["own.py:gaussian"], "Expected a model that can be trained, fused, .*mdn.* got 'own.py:gaussian'"),
+        (
+            ["own.py:CellConfig"],
+            "Expected a model that can be trained, fused, .*mdn.* got 'own.py:CellConfig'",
+        ),
         (["own.py:CellMode"], "Did you mean 'CellModel'"),
         (["oracle"], "got 'oracle'"),
         (["mdm"], "Did you mean 'mdn'"),
