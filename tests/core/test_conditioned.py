@@ -123,3 +123,12 @@ def test_scores_of_another_shape_are_refused() -> None:
     for wrong in ((mean[:1], mean), (mean, mean[..., 1:])):
         with pytest.raises(ConfigError, match=r"base's shape \[2, 5, 7\]"):
             ConditionedDistribution(base, *wrong)
+
+
+def test_in_float32_a_narrow_posterior_is_as_in_float64() -> None:
+    base, mean = mixture(3, 0.1, 0.3, dtype=torch.float32), torch.full(SHAPE, 2.0)
+    law = ConditionedDistribution(base, mean, torch.full_like(mean, 1e-4))
+    at = base.from_normal(mean + 5e-5)
+    wanted = law._exact().cdf(at)
+    assert bool(((wanted > 0.05) & (wanted < 0.95)).any())
+    torch.testing.assert_close(law.cdf(at).double(), wanted, rtol=0, atol=1e-6)
