@@ -23,6 +23,7 @@ from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
 from benchnav.models.nets.trainable import MapScale
+from benchnav.models.training.map_order import map_order
 
 TRAIN, VALID = "train", "valid"
 
@@ -99,6 +100,7 @@ class MapSampler(Sampler[MapKey]):
         shuffle: whether to change the order each epoch.
         share: (i, n): of every batch take the i-th of n interleaved parts, for one of n processes.
         epoch: that the next iteration gives.
+        shards: how many maps each file of the dataset holds, in order; none where one holds them all.
     """
 
     maps: int
@@ -109,6 +111,7 @@ class MapSampler(Sampler[MapKey]):
     shuffle: bool = False
     share: tuple[int, int] = (0, 1)
     epoch: int = 0
+    shards: tuple[int, ...] = ()
 
     def set_epoch(self, epoch: int) -> None:
         """Chooses the epoch that the next iteration gives; the trainer calls this."""
@@ -122,7 +125,7 @@ class MapSampler(Sampler[MapKey]):
         """Yields the batches of the epoch."""
         order, epoch = np.arange(self.maps), np.array([self.epoch])
         if self.shuffle:
-            order = rng.permutation(rng.stream_key(self.seed, "models", "map order"), epoch, self.maps)[0]
+            order = map_order(self.shards or (self.maps,), self.seed, self.epoch)
         drawn = rng.uniform(rng.stream_key(self.seed, "models", "map symmetry"), epoch, (self.maps,))[0]
         symmetry = np.array(self.symmetries)[(drawn * len(self.symmetries)).astype(np.int64)]
         drawn = rng.uniform(rng.stream_key(self.seed, "models", "map jitter"), epoch, (self.maps, 3))[0]
@@ -202,7 +205,8 @@ class MapData(lightning.LightningDataModule):
 
     def _load(self, maps: MapDataset, **order: Any) -> DataLoader[Batch]:
         share = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        sampler = MapSampler(len(maps), self.batch_size, self.seed, share=share, **order)
+        shards = tuple(piece.maps for piece in maps.dataset.pieces[maps.split])
+        sampler = MapSampler(len(maps), self.batch_size, self.seed, share=share, shards=shards, **order)
         # A generator of its own keeps the loader from drawing on PyTorch's global one.
         return DataLoader(
             maps, batch_size=None, sampler=sampler, generator=torch.Generator(),
