@@ -2,17 +2,22 @@ from benchnav.models.base import ModelFamily, TraversabilityModel, predict
 from benchnav.models.checkpoint import Checkpoint, Part, load_checkpoint, save_checkpoint
 from benchnav.models.predictor import find_checkpoint, list_checkpoints, load_model
 from benchnav.models.quality.measure import evaluate as evaluate_model
+from benchnav.models.tiles import Window, measure_margin, predict_tiles, write_risk_maps
 
 __all__ = [
     "Checkpoint",
     "ModelFamily",
     "Part",
     "TraversabilityModel",
+    "Window",
     "evaluate_model",
     "find_checkpoint",
     "list_checkpoints",
     "load_checkpoint",
     "load_model",
+    "measure_margin",
     "predict",
+    "predict_tiles",
     "save_checkpoint",
+    "write_risk_maps",
 ]

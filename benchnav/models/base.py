@@ -95,15 +95,20 @@ def predict(model: TraversabilityModel, terrain: Terrain) -> TraversabilityMixtu
     """
     if isinstance(model, PrivilegedModel):
         return model.predict_terrain(terrain)
+    return predict_observation(model, terrain.observe())
+
+
+def predict_observation(model: TraversabilityModel, observation: Observation) -> TraversabilityMixture:
+    """As `predict`, where the truth is not at hand; refuses privileged models."""
     with exact_convolutions():
-        mixture: Any = model.predict(terrain.observe())
-    height, width = terrain.grid.shape
+        mixture: Any = model.predict(observation)
+    maps, (height, width) = len(observation.rgb), observation.grid.shape
     got: Any = type(mixture).__name__
     if isinstance(mixture, TraversabilityMixture):
         got = list(mixture.weights.shape)
-        if [*got[:-3], *got[-2:]] == [len(terrain), height, width]:
+        if [*got[:-3], *got[-2:]] == [maps, height, width]:
             return mixture
     raise ConfigError(
-        f"Expected the model to give a TraversabilityMixture of shape [{len(terrain)}, K, {height}, {width}], "
+        f"Expected the model to give a TraversabilityMixture of shape [{maps}, K, {height}, {width}], "
         f"got {got}."
     )
