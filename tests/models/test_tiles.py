@@ -155,6 +155,28 @@ def test_tiles_begin_where_the_pools_of_a_network_do(stride: int) -> None:
         assert greatest_error(Pool(stride), observation, tile, 0) < 1e-12
 
 
+class Picky(Blur):
+    """Looks around where a row is of one colour, or where it is not."""
+
+    def __init__(self, smooth: bool) -> None:
+        super().__init__(40, 40)
+        self.smooth = smooth
+
+    def predict(self, observation: Observation) -> TraversabilityMixture:
+        mixture, image = super().predict(observation), observation.rgb[:, :1].double() / 255
+        most, least = (sign * functional.max_pool2d(sign * image, (1, 9), 1, (0, 4)) for sign in (1, -1))
+        means = torch.where((most == least) == self.smooth, mixture.means, image)
+        return TraversabilityMixture(mixture.weights, means, mixture.stds)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_model_is_tried_on_ground_as_it_lies_and_on_cells_from_all_over_the_map(smooth: bool) -> None:
+    observation = observe(300, 500, block=64) if smooth else observe(300, 500)
+    if not smooth:
+        observation.rgb[..., 10:-10, 10:-10] = 80
+    assert measure_margin(Picky(smooth), observation) == 64
+
+
 class Everywhere(Blur):
     """Takes the mean of the map away."""
 
