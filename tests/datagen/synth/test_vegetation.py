@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe.classes import Vegetation
 from benchnav.datagen.recipe.recipe import Recipe, load_recipe, recipe_from_dict
 from benchnav.datagen.schema import FIELDS, LAYERS, entry_digests
-from benchnav.datagen.synth.generate import generate
+from benchnav.datagen.synth.generate import _vegetation as vegetation_of
+from benchnav.datagen.synth.generate import class_map, generate
 from benchnav.datagen.synth.vegetation import grow
 from tests.datagen.small import small_stakes, terrain_class
 from tests.factories import tiny_recipe
@@ -104,6 +105,24 @@ def test_a_map_is_the_same_in_any_batch_and_its_own_in_each_split() -> None:
     for other in (generate(renamed, "valid", np.arange(8))["vegetation_m"], sibling):
         assert not (other == whole).all(axis=(1, 2))[grows].any()
     assert grows.sum() > 3
+
+
+def test_seed_split_draw_and_map_each_have_vegetation_of_their_own() -> None:
+    """On one class map, so that nothing else differs."""
+    class_id, indices = np.ones((2, 32, 32), int), np.arange(2)
+
+    def drawn(recipe: Recipe = RECIPE, split: str = "train", attempt: int = 0) -> np.ndarray:
+        height_m = vegetation_of(recipe, split, indices, class_id, attempt)
+        assert height_m is not None
+        return height_m
+
+    several = [drawn(), drawn(replace(RECIPE, seed=5)), drawn(split="test/hg"), drawn(attempt=1)]
+    maps = [own for each in several for own in each]
+    for one, other in combinations(maps, 2):
+        assert ((one > 0) & (other > 0)).mean() < 0.7 * 0.4
+    # Nor does it follow the classes or the ground.
+    classes = class_map(RECIPE, "train", indices) == class_map(RECIPE, "train", indices)[:, :1, :1]
+    assert abs(np.corrcoef(classes.ravel(), (several[0] > 0).ravel())[0, 1]) < 0.2
 
 
 def test_patches_are_as_large_as_the_period_says() -> None:
