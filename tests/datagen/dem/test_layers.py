@@ -163,6 +163,7 @@ def test_a_name_stands_once() -> None:
     ("text", "raster", "unit"),
     [
         ("moss=a.tif", "a.tif", "1"),
+        ("moss=canopy", "canopy", "1"),
         ("moss_m=a.tif", "a.tif", "m"),
         ("moss_m=a.tif:cm", "a.tif", "cm"),
         ("moss=https://host/a.tif", "https://host/a.tif", "1"),
