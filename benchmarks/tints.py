@@ -17,7 +17,11 @@ from benchnav.datagen.synth.generate import generate
 
 FIGURE = Path(__file__).parents[1] / "docs/figures/scenarios-tints.png"
 EXAMPLE = 13  # of test/std, as in the other figures of the note
-RAIN = {"classes": ["wet_clay", "packed_soil", "loose_soil", "fine_sand"], "colour": [36, 30, 26], "share": 0.5}
+RAIN = {
+    "classes": ["wet_clay", "packed_soil", "loose_soil", "fine_sand"],
+    "colour": [36, 30, 26],
+    "share": 0.5,
+}
 SCENARIOS: dict[str, Any] = {
     "std": {"preset": "std"},
     "wet": {"preset": "wet"},
