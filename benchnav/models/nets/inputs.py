@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from benchnav.core.errors import ConfigError, expect
+from benchnav.core.grid import is_azimuth
 from benchnav.core.settings import hint
 
 Maps = Mapping[str, Tensor]  # by field, `rgb` of shape [B, 3, H, W], all others [B, H, W]
@@ -27,11 +28,6 @@ class LayerScale(NamedTuple):
     mean: Tensor
     std: Tensor
     rms: Tensor
-
-
-def is_azimuth(layer: str) -> bool:
-    """Tells a layer of directions in degrees, from +x towards +y, which turn with the map."""
-    return layer.endswith("_azimuth_deg")
 
 
 class InputStack(nn.Module):

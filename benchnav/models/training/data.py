@@ -20,10 +20,11 @@ from torchvision.transforms.v2 import functional as photometry
 from benchnav.core import rng
 from benchnav.core.device import CPU
 from benchnav.core.errors import DatasetError, expect
+from benchnav.core.grid import is_azimuth
 from benchnav.datagen.files.maps import TerrainMaps
 from benchnav.datagen.files.reader import TerrainDataset, find_dataset
 from benchnav.datagen.schema import UNLABELLED
-from benchnav.models.nets.inputs import LayerScale, is_azimuth
+from benchnav.models.nets.inputs import LayerScale
 from benchnav.models.training.map_order import map_order
 
 TRAIN, VALID = "train", "valid"
