@@ -128,7 +128,7 @@ def test_any_slope_has_a_prediction(slope: float) -> None:
 def test_a_classifier_of_other_classes_is_refused() -> None:
     class Two(nn.Module):
         def forward(self, maps: Mapping[str, Tensor]) -> Tensor:
-        rgb = maps["rgb"]
+            rgb = maps["rgb"]
             return rgb[:, :2].float()
 
     with pytest.raises(ConfigError, match="of one shape"):
