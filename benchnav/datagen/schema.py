@@ -75,6 +75,9 @@ OPTIONAL: dict[str, Field] = {
     "group": Field(
         "<i8", (), "1", 0, 2**53, "maps of one number overlap, directly or by others between them"
     ),
+    # Of the measured λ, so no model may see them.
+    "drive_count": Field("<i4", ("H", "W"), "1", 0, 2**31 - 1, "rows of drives that λ is the mean of"),
+    "drive_std": Field("<f4", ("H", "W"), "1", 0, 1, "standard deviation of λ over them; NaN under two"),
 }
 
 KNOWN = FIELDS | OPTIONAL

@@ -19,17 +19,12 @@ ENDINGS = (".csv", ".tsv", ".csv.gz", ".tsv.gz", ".parquet")
 _MISSING = ["", "NA", "N/A", "nan", "NaN", "null", "None"]
 
 
-def read_log(path: Path, columns: Collection[str]) -> pd.DataFrame:
-    """Reads a log.
-
-    Args:
-        path: a file that ends in one of `ENDINGS`.
-        columns: that it has to have; others are read too.
+def require_columns(rows: pd.DataFrame, columns: Collection[str], path: Path) -> None:
+    """Refuses a log that lacks a column.
 
     Raises:
-        DatasetError: there is no such file, it cannot be read, or lacks a column.
+        DatasetError: it does.
     """
-    rows = _read(path)
     names = [str(name) for name in rows.columns]
     if missing := [name for name in columns if name not in names]:
         near = hint(missing[0], [name for name in names if name not in columns])
@@ -37,10 +32,14 @@ def read_log(path: Path, columns: Collection[str]) -> pd.DataFrame:
             f"Expected columns {', '.join(columns)} in {path}, got no {' and no '.join(missing)}. "
             f"It has {', '.join(names) or 'none'}.{near}"
         )
-    return rows
 
 
-def _read(path: Path) -> pd.DataFrame:
+def read_log(path: Path) -> pd.DataFrame:
+    """Reads a log, a file that ends in one of `ENDINGS`.
+
+    Raises:
+        DatasetError: there is no such file, or it cannot be read.
+    """
     try:
         if path.suffix == ".parquet":
             return pd.read_parquet(path).reset_index(drop=True)

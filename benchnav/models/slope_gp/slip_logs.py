@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.settings import hint
-from benchnav.datagen.files.robot_logs import read_log, read_names, read_numbers
+from benchnav.datagen.files.robot_logs import read_log, read_names, read_numbers, require_columns
 from benchnav.models.slope_gp.cells import Cells
 
 _LIMITS = {"slope_deg": (0, 90), "traversability": (0, 1)}
@@ -55,7 +55,8 @@ def read_slip_logs(path: str | Path, class_names: tuple[str, ...] = ()) -> SlipL
             lacks, or a value is no number or out of range.
     """
     path = Path(path)
-    rows = read_log(path, COLUMNS)
+    rows = read_log(path)
+    require_columns(rows, COLUMNS, path)
     for name, limits in _LIMITS.items():
         rows[name] = read_numbers(rows, name, path, limits)
     observed = rows.dropna(subset=list(_LIMITS))
