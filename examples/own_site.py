@@ -15,7 +15,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import rasterio
 import torch
@@ -100,12 +99,22 @@ def main(folder: Path) -> None:
     log.to_csv(folder / "drives.csv.gz", index=False)
     print(f"{DRIVES} drives of {len(log)} rows, {log['measured_m_s'].sum() * 0.1:.0f} m")
     rasters = "--dem dem.tif --photo photo.tif --classes classes.tif"
-    command(f"benchnav-datagen import-drives drives.csv.gz {rasters} --recipe stakes-v1 --solvable --out site.h5", folder, *MAPS)
+    command(
+        f"benchnav-datagen import-drives drives.csv.gz {rasters} --recipe stakes-v1 --solvable --out site.h5",
+        folder,
+        *MAPS,
+    )
     network = "--mdn.encoder_name tu-edgenext_xx_small" if False else ""
-    command(f"benchnav-train mdn --data site.h5 --out mine --mdn.max_epochs 20 --mdn.batch_size 4 {network}", folder)
+    command(
+        f"benchnav-train mdn --data site.h5 --out mine --mdn.max_epochs 20 --mdn.batch_size 4 {network}",
+        folder,
+    )
     command("benchnav-train evaluate mine --data site.h5 --out quality", folder)
     parts = "--planners [straight,astar_dwa] --risks [mean,cvar:0.8] --objectives [travel_time]"
-    command(f"benchnav-eval run --data site.h5 --model mine --world stakes --scenarios [site] --maps 0 {parts} --record none --jobs 2 --out run", folder)
+    command(
+        f"benchnav-eval run --data site.h5 --model mine --world stakes --scenarios [site] --maps 0 {parts} --record none --jobs 2 --out run",
+        folder,
+    )
 
 
 if __name__ == "__main__":

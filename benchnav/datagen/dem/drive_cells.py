@@ -91,6 +91,20 @@ def lay_out(log: DriveLog, ground: Raster, crs: Any, bounds: Any) -> DriveLog:
     return replace(log, rows=log.rows.assign(x=x, y=y)).without("off_dem", off)
 
 
+def check_enough(log: DriveLog, splits: Sequence[str]) -> None:
+    """Refuses a log of fewer drives than splits.
+
+    Raises:
+        DatasetError: it is.
+    """
+    drives = log.rows["drive"].nunique()
+    if drives < len(splits):
+        raise DatasetError(
+            f"Expected a drive for each of the {len(splits)} splits {', '.join(splits)}, got {drives} in "
+            f"{log.settings.file}. Name drives in a column `drive`, or take fewer --splits."
+        )
+
+
 def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> tuple[DriveLog, DrivenCells]:
     """Gives each drive to a split and takes the mean of λ over the rows on each cell.
 
@@ -104,7 +118,7 @@ def drive_over(log: DriveLog, tiling: Tiling, row: ndarray, column: ndarray) -> 
         The log with the rows that are used, and what they say of the cells.
 
     Raises:
-        DatasetError: there are fewer drives than splits, or none lies on the ground of a split.
+        DatasetError: no drive is left for a split.
     """
     rows = log.rows.assign(row=row, column=column, split=tiling.split_of(row, column))
     log = replace(log, rows=rows)
@@ -141,11 +155,6 @@ def _owners(log: DriveLog, splits: Sequence[str]) -> ndarray:
 
     Every split gets a drive for which the fewest rows are lost by that; the others go where most of their rows lie.
     """
-    if len(log.names) < len(splits):
-        raise DatasetError(
-            f"Expected a drive for each of the {len(splits)} splits {', '.join(splits)}, got {len(log.names)} in "
-            f"{log.settings.file}. Name drives in a column `drive`, or take fewer --splits."
-        )
     counts = np.zeros((len(splits), len(log.names)))
     np.add.at(counts, (log.rows["split"], log.rows["drive"]), 1)
     owner = counts.argmax(axis=0)

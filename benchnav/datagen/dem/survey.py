@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from benchnav.core.errors import DatasetError, expect
 from benchnav.core.sources import digest_of_path
-from benchnav.datagen.dem.drive_cells import BANDS, describe_drives, drive_over, lay_out
+from benchnav.datagen.dem.drive_cells import BANDS, check_enough, describe_drives, drive_over, lay_out
 from benchnav.datagen.dem.drive_log import Drives, read_drives
 from benchnav.datagen.dem.raster import Layer, Rasters, load_rasterio, opened
 from benchnav.datagen.dem.tiling import Run, cut, cut_around
@@ -106,6 +106,7 @@ class Survey:
         edge_m, size_m = np.zeros(2), whole_m
         if log is not None:
             log = lay_out(log, ground, crs, bounds)
+            check_enough(log, list(shares))
             map_m, apart_m = np.multiply(recipe.grid.shape, step), np.multiply(stride, step)
             edge_m, size_m = cut_around(log.places_m, whole_m, np.array(cell_m), map_m, apart_m)
         cells = np.floor(size_m / step + _SLACK).astype(int).tolist()
