@@ -14,7 +14,7 @@ import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
+from matplotlib.colors import Colormap, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
@@ -47,6 +47,7 @@ LINE_COLOURS = COLOURS[:-1]
 BLIND = "0.45"
 
 TRAVERSABILITY_COLOURS = "viridis"
+_LAYER_COLOURS, _DIRECTION_COLOURS = "YlGnBu", "twilight"
 _HATCH_CELLS = 4
 # Of cells of which nothing is known.
 LACKING = "0.7"
@@ -271,3 +272,20 @@ def save_twice(figure: Figure, path: Path, trim: bool = False, dpi: float = DPI)
     for suffix in (".png", ".pdf"):
         with replacing(path.with_suffix(suffix)) as partial:
             save(figure, partial, suffix[1:], dpi, trim)
+
+
+def layer_scale(name: str, values: np.ndarray) -> dict[str, Any]:
+    """How a layer is coloured, as keywords of `imshow`: from 0 or below to its greatest value, or around the compass.
+
+    Args:
+        name: of the layer; one that ends in `_azimuth_deg` holds directions.
+        values: of any shape, NaN where nothing is known.
+    """
+    if name.endswith("_azimuth_deg"):
+        return {"cmap": _colour_map(_DIRECTION_COLOURS), "vmin": 0.0, "vmax": 360.0}
+    low, high = (float(end(values[np.isfinite(values)], initial=0.0)) for end in (np.min, np.max))
+    return {"cmap": _colour_map(_LAYER_COLOURS), "vmin": low, "vmax": high if high > low else low + 1.0}
+
+
+def _colour_map(name: str) -> Colormap:
+    return matplotlib.colormaps[name].with_extremes(bad=LACKING)

@@ -3,8 +3,8 @@
 Traversability is in [0, 1] and higher is better. Letters in shapes: B maps, H×W cells.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -24,17 +24,21 @@ class Observation(Batch):
         elevation_m: shape [B, H, W].
         slope_deg: inclination by Horn's method, shape [B, H, W].
         grid: size and resolution.
+        layers: what else there is of the ground, by name, such as `vegetation_m`; float32, NaN where nothing is
+            known, each of shape [B, H, W].
     """
 
     rgb: Tensor
     elevation_m: Tensor
     slope_deg: Tensor
     grid: Grid
+    layers: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Checks that the layers fit the grid and one another."""
         batch = self.rgb.shape[0]
-        _check_shapes(self.grid, batch, elevation_m=self.elevation_m, slope_deg=self.slope_deg)
+        maps = {"elevation_m": self.elevation_m, "slope_deg": self.slope_deg}
+        _check_shapes(self.grid, batch, maps, self.layers)
         expect(
             self.rgb.dtype == torch.uint8 and self.rgb.shape == (batch, 3, *self.grid.shape),
             f"`rgb` as uint8 of shape [B, 3, {self.grid.height}, {self.grid.width}], "
@@ -56,9 +60,10 @@ class Terrain(Batch):
             class is not known.
         traversability: one realised λ, shape [B, H, W].
         grid: size and resolution.
-        look_alikes: gives what colours can tell at best, from classes and slopes [B, H, W]: the truth of all
-            classes that look like the cell's own, weighted alike; None where no two classes look alike, so
-            that it is the truth.
+        look_alikes: gives what colours can tell of a terrain at best: in each cell the truth of all classes that
+            look like the cell's own, weighted by how often they do; None where no two classes look alike, so that
+            it is the truth.
+        layers: optional fields, by name, as an `Observation` has them.
     """
 
     rgb: Tensor
@@ -68,33 +73,38 @@ class Terrain(Batch):
     truth: TraversabilityMixture
     traversability: Tensor
     grid: Grid
-    look_alikes: Callable[[Tensor, Tensor], TraversabilityMixture] | None = None
+    look_alikes: "Callable[[Terrain], TraversabilityMixture] | None" = None
+    layers: Mapping[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Checks that the layers fit the grid and one another."""
-        _check_shapes(
-            self.grid,
-            self.rgb.shape[0],
-            class_id=self.class_id,
-            elevation_m=self.elevation_m,
-            slope_deg=self.slope_deg,
-            truth=self.truth.weights.select(-3, 0),
-            traversability=self.traversability,
-        )
+        maps = {
+            "class_id": self.class_id,
+            "elevation_m": self.elevation_m,
+            "slope_deg": self.slope_deg,
+            "truth": self.truth.weights.select(-3, 0),
+            "traversability": self.traversability,
+        }
+        _check_shapes(self.grid, self.rgb.shape[0], maps, self.layers)
 
     def __len__(self) -> int:
         """Number of maps B."""
         return self.rgb.shape[0]
 
     def observe(self) -> Observation:
-        """Gives the Observation of these maps: colour, elevation, slope, grid, and nothing else."""
-        return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid)
+        """Gives the Observation of these maps: colour, elevation, slope, grid, layers, and nothing else."""
+        return Observation(self.rgb, self.elevation_m, self.slope_deg, self.grid, self.layers)
 
 
-def _check_shapes(grid: Grid, batch: int, **layers: Tensor) -> None:
-    for name, layer in layers.items():
+def _check_shapes(grid: Grid, batch: int, maps: Mapping[str, Tensor], layers: Mapping[str, Tensor]) -> None:
+    for name, values in {**maps, **layers}.items():
         expect(
-            layer.shape == (batch, *grid.shape),
-            f"`{name}` of shape [{batch}, {grid.height}, {grid.width}], got {list(layer.shape)}. "
+            values.shape == (batch, *grid.shape),
+            f"`{name}` of shape [{batch}, {grid.height}, {grid.width}], got {list(values.shape)}. "
             "Pass a batch of maps on one grid.",
+        )
+    for name, values in layers.items():
+        expect(
+            name not in maps and name != "rgb" and values.dtype == torch.float32,
+            f"layer `{name}` as float32 under a name of its own, got {values.dtype}.",
         )

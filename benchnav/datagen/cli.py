@@ -97,7 +97,7 @@ def list_datasets(folder: str = "") -> None:
     print("recipes:")
     for name in datagen.shipped_recipes():
         sizes = ", ".join(f"{split} {maps}" for split, maps in shipped_sizes(name).items())
-        print(f"  {name:12} {sizes}")
+        print(f"  {name:14} {sizes}")
     expect(not folder or Path(folder).is_dir(), f"`folder` to be one, got {folder!r}.")
     for place in [Path(folder)] if folder else dataset_folders():
         folders = [manifest.parent for manifest in place.glob(f"*/{FOLDER_MANIFEST}")]
@@ -110,7 +110,8 @@ def list_datasets(folder: str = "") -> None:
                 print(f"  {path.name:20} not readable: {error}")
                 continue
             sizes = ", ".join(f"{split} {entry['maps']}" for split, entry in dataset.splits.items())
-            print(f"  {path.name:20} {dataset.id:12} {sizes}")
+            layers = f"; layers {', '.join(dataset.layer_names)}" if dataset.layer_names else ""
+            print(f"  {path.name:20} {dataset.id:14} {sizes}{layers}")
 
 
 def show(file: str, json: bool = False) -> None:

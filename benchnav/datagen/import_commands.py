@@ -77,6 +77,7 @@ def import_drives(
     photo: str = "",
     classes: str = "",
     class_ids: dict[int, str | None] | None = None,
+    layer: tuple[str, ...] = (),
     least_speed: float = 0.1,
     id: str = "",
     recipe: str = "paper-v1",
@@ -99,6 +100,7 @@ def import_drives(
         photo: Raster of red, green and blue; painted by the class when not given.
         classes: Raster of terrain classes; no cell has one when not given.
         class_ids: Class names by value of that raster, such as '{1: gravel, 9: null}', null for no label; else indices.
+        layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as [vegetation_m=canopy.tif].
         least_speed: Least commanded speed, forward or backward, of rows that are used, m/s.
         id: Id of the dataset; the name of the output when not given.
         recipe: Id or path of a recipe that gives size, resolution, start, goal, class table and light.
@@ -121,7 +123,9 @@ def import_drives(
         overrides,
         splits,
         dem=dem,
-        rasters=Rasters(photo=photo, classes=classes, class_ids=class_ids, unlabelled=not classes),
+        rasters=Rasters(
+            photo=photo, classes=classes, class_ids=class_ids, layer=layer, unlabelled=not classes
+        ),
         drives=Drives(file=drives, least_speed=least_speed),
         stride_m=stride,
         solvable=solvable,

@@ -29,6 +29,7 @@ from benchnav.core.figures import (
     TWO_COLUMNS_IN,
     frame_map,
     hatching,
+    layer_scale,
     legend_outside,
     mark,
     mark_handle,
@@ -56,7 +57,7 @@ LACKING_PATCH = Patch(facecolor=LACKING, label="not known")
 
 
 def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) -> Figure:
-    """Draws maps of a split, a row each; the panel of a field has the label `FIELD ROW`.
+    """Draws maps of a split, a row each, layers to the right; the panel of a field has the label `FIELD ROW`.
 
     Args:
         dataset: where the maps are.
@@ -69,7 +70,8 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
     Raises:
         DatasetError: there is no such split or map, or its data are damaged.
     """
-    maps = dataset.read(split, indices, (*FIELDS, "start_m", "goal_m"))
+    layers = dataset.layer_names
+    maps = dataset.read(split, indices, (*FIELDS, *layers, "start_m", "goal_m"))
     maps["rgb"] = np.moveaxis(maps["rgb"], 1, -1)
     # Heights over each map's lowest point compare between maps; heights over a datum seldom do.
     maps["elevation_m"] -= maps["elevation_m"].min((1, 2), keepdims=True)
@@ -92,10 +94,11 @@ def preview_figure(dataset: TerrainDataset, split: str, indices: Sequence[int]) 
         SheetColumn("elevation_m", "Elevation [m]", maps["elevation_m"], relief, contours),
         SheetColumn("slope_deg", "Slope [°]", maps["slope_deg"], slopes, "", "max"),
         SheetColumn("traversability", "Traversability λ", maps["traversability"], shares, ""),
+        *(layer_column(name, maps[name], dataset.fields[name].unit) for name in layers),
     ]
     names = [f"{number} {classes[number].name.replace('_', ' ')}" for number in shown]
     marks: list[Artist] = [mark_handle(name, scale=_MARK_SIZE) for name in ("start", "goal")]
-    if unlabelled.any() or np.isnan(maps["traversability"]).any():
+    if unlabelled.any() or any(np.isnan(maps[name]).any() for name in ("traversability", *layers)):
         marks.append(LACKING_PATCH)
     if soft.any():
         marks.append(Patch(facecolor="white", ec="black", lw=0.5, hatch=_HATCH, label="may hide soft spots"))
@@ -151,6 +154,14 @@ class SheetColumn(NamedTuple):
     unit: str | None = None
     extend: str = "neither"
     most: int = 4
+
+
+def layer_column(name: str, values: np.ndarray, unit: str) -> SheetColumn:
+    """A layer as a column of a sheet, of shape [R, H, W]."""
+    words = name.removesuffix(f"_{unit}").replace("_", " ")
+    title = words[:1].upper() + words[1:] + {"1": "", "deg": " [°]"}.get(unit, f" [{unit}]")
+    shown = values % 360 if name.endswith("_azimuth_deg") else values
+    return SheetColumn(name, title, np.ma.masked_invalid(shown), layer_scale(name, values), "")
 
 
 @styled()

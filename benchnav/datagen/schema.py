@@ -77,11 +77,27 @@ OPTIONAL: dict[str, Field] = {
     ),
     # Of the measured λ, so no model may see them.
     "drive_count": Field("<i4", ("H", "W"), "1", 0, 2**31 - 1, "rows of a robot's log that λ is the mean of"),
-    "drive_std": Field("<f4", ("H", "W"), "1", 0, 1, "standard deviation of λ over these rows; NaN under two"),
+    "drive_std": Field(
+        "<f4", ("H", "W"), "1", 0, 1, "standard deviation of λ over these rows; NaN under two"
+    ),
 }
 
-KNOWN = FIELDS | OPTIONAL
+# Layers, what a model may see of the ground beside colour and shape. NaN is where nothing is known.
+LAYERS: dict[str, Field] = {
+    "vegetation_m": Field("<f4", ("H", "W"), "m", 0, 200, "height of the vegetation; 0 on bare ground"),
+}
+
+KNOWN = FIELDS | OPTIONAL | LAYERS
 MAP_FIELDS = tuple(name for name, field in FIELDS.items() if "H" in field.shape)
+
+
+def layer_names(fields: Fields) -> tuple[str, ...]:
+    """Names of the layers among fields: those of `LAYERS`, and float32 maps of a dataset's own."""
+    return tuple(
+        name
+        for name, field in fields.items()
+        if name in LAYERS or (name not in KNOWN and (field.dtype, field.shape) == ("<f4", ("H", "W")))
+    )
 
 
 def quantise(values: ndarray, bits: int) -> ndarray:

@@ -69,6 +69,9 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     | `elevation_m` | float32 | (H, W)    | elevation                                                     |
     | `slope_deg`   | float32 | (H, W)    | slope by Horn's method                                        |
 
+    and, where the dataset has layers, one key a layer by its name, such as `vegetation_m`: float32, (H, W), NaN where
+    nothing is known.
+
     S is 3 for the unicycle and the bicycle, 5 for the differential drive, whose velocities v and ω follow.
 
     ## Reward
@@ -100,6 +103,7 @@ class OffRoadEnv(gymnasium.Env[Any, np.ndarray]):
     | `distance_m`     | float | to the goal                                                |
 
     ## Version history
+    * v0 of benchnav 0.9: layers of the dataset.
     * v0 of benchnav 0.3: `world` in place of `noise` and `time_budget_s`.
     * v0 of benchnav 0.2: `robot` in place of `dynamics`; `objective`, `goal_radius_m` and `is_success` are
       new; `split` is `train` by default, was `test/std`; `noise` "stored", was "frozen".
@@ -223,6 +227,10 @@ class EnvBatch:
             if split != "train":
                 gymnasium.logger.warn(f"{dataset.path} has no split 'train'; its split {split!r} is taken.")
         self._maps = dataset.terrain(split)
+        taken = {"state", "goal"} & set(self._maps.layers)
+        expect(
+            not taken, f"layers that are not called 'state' or 'goal', got {sorted(taken)} in {dataset.path}."
+        )
         places = dataset.read(split, fields=["start_m", "goal_m", "reference_time_s"])
         self._places = Places(**{name: torch.from_numpy(values) for name, values in places.items()})
         # To be refused at once.
@@ -315,6 +323,7 @@ class EnvBatch:
             "rgb": self._maps.rgb[self._map].numpy(),
             "elevation_m": self._maps.elevation_m[self._map].numpy(),
             "slope_deg": self._maps.slope_deg[self._map].numpy(),
+            **{name: layer[self._map].numpy() for name, layer in self._maps.layers.items()},
         }
         info = {
             "map": self._map.copy(),
@@ -347,6 +356,10 @@ class EnvBatch:
                 "rgb": spaces.Box(0, 255, (3, height, width), np.uint8),
                 "elevation_m": spaces.Box(-np.inf, np.inf, (height, width), np.float32),
                 "slope_deg": spaces.Box(0, 90, (height, width), np.float32),
+                **{
+                    name: spaces.Box(-np.inf, np.inf, (height, width), np.float32)
+                    for name in self._maps.layers
+                },
             }
         )
 

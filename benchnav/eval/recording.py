@@ -6,7 +6,7 @@ Letters in shapes: N steps, H×W cells, S state and A action dimensions, P point
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -118,6 +118,7 @@ class Recording(Ground):
         actions: shape [N, A].
         traversability: observed λ, shape [N].
         plans: what was planned, in order of steps; those after the episode's end are left out.
+        layers: optional fields of the map, by name, each of shape [H, W].
     """
 
     elevation_m: np.ndarray
@@ -134,6 +135,7 @@ class Recording(Ground):
     actions: np.ndarray
     traversability: np.ndarray
     plans: Sequence[DrawnPlan] = ()
+    layers: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     _REMEDY: ClassVar[str] = "Remove it and its .rrd; `replay` makes them again."
 
@@ -196,12 +198,21 @@ class Recording(Ground):
         """Its values; plans are thinned but the one of figures, and packed into few arrays."""
         values, shown = super()._stored(), self.plan.step
         del values["plans"]
+        values |= {f"layers:{name}": layer for name, layer in values.pop("layers").items()}
         return values | _pack([plan if plan.step == shown else thinned(plan) for plan in self.own_plans])
 
     @classmethod
     def _read(cls, values: dict[str, Any]) -> Self:
         packed = {name: values.pop(name) for name in list(values) if name.startswith("plans:")}
-        return cls(**values | {"plans": _unpack(packed), "action_names": tuple(values["action_names"])})
+        layers = {name: values.pop(name) for name in list(values) if name.startswith("layers:")}
+        return cls(
+            **values
+            | {
+                "plans": _unpack(packed),
+                "action_names": tuple(values["action_names"]),
+                "layers": {name.removeprefix("layers:"): layer for name, layer in layers.items()},
+            }
+        )
 
 
 def read_recordings(folder: Path) -> list[Recording]:

@@ -49,7 +49,7 @@ class Ideal(PrivilegedModel):
         """Gives the true distributions of all classes that look like the cell's own."""
         if terrain.look_alikes is None:
             return terrain.truth
-        return terrain.look_alikes(terrain.class_id, terrain.slope_deg)
+        return terrain.look_alikes(terrain)
 
 
 class Clairvoyant(PrivilegedModel):

@@ -68,14 +68,15 @@ def import_dem(
 ) -> Iterator[tuple[int, int]]:
     """Makes a dataset from rasters, yielding (maps done, maps in all); to be iterated to the end.
 
-    Maps with cells without elevation or colour are left out. Cells without a class or a measured λ are kept as
-    such. A map's random numbers go by its number in the ground, so they are the same whichever others are left out.
+    Maps with cells without elevation or colour are left out. Cells without a class, a measured λ or a value of a layer
+    are kept as such. A map's random numbers go by its number in the ground, so they are the same whichever others are
+    left out.
 
     Args:
         dem: elevations in metres, by any name that rasterio opens.
         out: file to write, of suffix `.h5` or `.hdf5`; else a folder.
         recipe: id of the dataset, size, resolution, start and goal of the maps, class table, light, seed.
-        rasters: where classes, colours and λ come from.
+        rasters: where classes, colours, λ and layers come from.
         drives: log of drives that λ comes from, around which the ground is cut; maps that none crossed are left out.
         shares: of the maps, by split; None for all in `test/real`.
         scenario: which of the recipe's scenarios lights the maps.
@@ -106,6 +107,9 @@ def import_dem(
             parts[run.split].add(run)
             done += len(run.columns)
             yield done, ground.tiling.maps
+        for name in set(ground.fields) - ground.valued:
+            raster = ground.layers[f"layer {name}"].raster.name
+            raise DatasetError(f"Expected `layer {name}` with a value on some map, got none in {raster}.")
         for part in parts.values():
             part.finish()
         sizes = {name: replace(splits[name], maps=len(part.about["kept"])) for name, part in parts.items()}
@@ -114,15 +118,15 @@ def import_dem(
             recipes=[replace(recipe, splits=sizes)],
             splits={name: part.entry() for name, part in parts.items()},
             files={name: [folder / shard.name for shard in part.shards] for name, part in parts.items()},
-            fields=_fields(ground),
+            fields=_fields_of(ground),
         )
         assemble(contents, folder, out)
 
 
-def _fields(ground: Survey) -> Fields:
-    """What every map has; groups are added when all maps are known."""
+def _fields_of(ground: Survey) -> Fields:
+    """What the maps have; groups are added when all maps are known."""
     names = ["group"] * ground.tiling.overlaps + ["drive_count", "drive_std"] * (ground.driven is not None)
-    return FIELDS | {name: OPTIONAL[name] for name in OPTIONAL if name in names}
+    return FIELDS | {name: OPTIONAL[name] for name in OPTIONAL if name in names} | ground.fields
 
 
 @dataclass
@@ -184,9 +188,11 @@ class _Part:
         solved = ~np.isinf(maps["reference_time_s"])
         self.left_out["not_solvable"] += int((~solved).sum())
         about = {"kept": numbers, "lowest_m": lowest_m, "unlabelled": (~labelled).sum(axis=(1, 2))}
-        fields = {name: kind for name, kind in _fields(self.ground).items() if name != "group"}
+        maps |= {name: given[f"layer {name}"][:, 0] for name in self.ground.fields}
+        fields = {name: kind for name, kind in _fields_of(self.ground).items() if name != "group"}
         stored = {name: maps[name].astype(kind.dtype) for name, kind in fields.items()}
-        self.pending.append({name: values[solved] for name, values in (stored | about).items()})
+        stored |= {f"about {name}": values for name, values in about.items()}
+        self.pending.append({name: values[solved] for name, values in stored.items()})
         if sum(maps["class_id"].size for maps in self.pending) >= SHARD_CELLS:
             self._flush()
 
@@ -213,7 +219,7 @@ class _Part:
         maps = join_maps(self.pending)
         first = len(self.about["kept"])
         for name, values in self.about.items():
-            values += maps.pop(name).tolist()
+            values += maps.pop(f"about {name}").tolist()
         shard = ShardFile(self.name, first, len(self.about["kept"]))
         self.pending = []
         if shard.maps:
@@ -221,7 +227,8 @@ class _Part:
             self._write(shard, maps)
 
     def _write(self, shard: ShardFile, maps: Maps) -> None:
-        content = pack(self.recipe, self.name, self.entry(shard.first, shard.stop), maps)
+        about = self.entry(shard.first, shard.stop)
+        content = pack(self.recipe, self.name, about, maps, _fields_of(self.ground))
         (self.folder / shard.name).write_bytes(content)
 
     def _add_groups(self) -> None:

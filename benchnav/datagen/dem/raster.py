@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchnav.core.errors import ConfigError, DatasetError, expect
+from benchnav.datagen.dem.layer import LayerRaster, read_layer
 
 _MOST_STRETCH = 0.02  # of a projection against the ground; within a UTM zone it is at most 0.001
 _PROBE_M = 10.0  # to either side of a place where the scale of a projection is measured
@@ -31,6 +32,7 @@ class Rasters:
         unlabelled: Allow a photo and measured traversability without classes: no cell has one.
         photo: Raster of red, green and blue; painted by the class when not given.
         traversability: Raster of measured traversability in [0, 1]; drawn by the class table when not given.
+        layer: Optional fields as [NAME=RASTER, NAME=RASTER:UNIT], such as [vegetation_m=canopy.tif].
     """
 
     classes: str = ""
@@ -39,6 +41,7 @@ class Rasters:
     unlabelled: bool = False
     photo: str = ""
     traversability: str = ""
+    layer: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuses what does not go together."""
@@ -59,6 +62,14 @@ class Rasters:
                 "Pass --classes RASTER, --unlabelled for models that need none, or --random-classes if that is what "
                 "you want.",
             )
+        names = [layer.name for layer in self.layers]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        expect(not twice, f"each `layer` once, got {', '.join(twice)} more than once.")
+
+    @property
+    def layers(self) -> list[LayerRaster]:
+        """What `layer` says, read."""
+        return [read_layer(text) for text in self.layer]
 
 
 class Raster(NamedTuple):

@@ -19,7 +19,7 @@ from benchnav.core.errors import DatasetError, expect
 from benchnav.core.sources import digest_of_path
 from benchnav.datagen.dem.drive_cells import BANDS, check_enough, describe_drives, drive_over, lay_out
 from benchnav.datagen.dem.drive_log import Drives, read_drives
-from benchnav.datagen.dem.raster import Layer, Rasters, load_rasterio, opened
+from benchnav.datagen.dem.raster import Layer, Raster, Rasters, load_rasterio, opened
 from benchnav.datagen.dem.tiling import Run, cut, cut_around
 from benchnav.datagen.recipe.recipe import Recipe
 from benchnav.datagen.schema import Maps
@@ -45,6 +45,9 @@ class Survey:
         layers: by what the user calls the raster; under `NAME min` and `NAME max` what is averaged there.
         unlabelled: whether no cell has a class.
         driven: what drives say of the cells; None without a log.
+        given: what the user calls each raster; layers are `layer NAME`.
+        fields: those of layers, by name.
+        valued: layers of which some value was read.
         known: which rows and columns of all cells, framed by one, lie wholly on the elevation model.
         indices: of classes, by value of their raster; NaN for no label.
         cliff_m: height over 0 that only cells without a value leave bare; infinite where these are declared.
@@ -128,6 +131,12 @@ class Survey:
         for argument, kinds, how in _OTHERS:
             if name := getattr(rasters, argument):
                 sources.append((stack.enter_context(opened(argument, name, kinds)), how))
+        area = (west_m, south_m, west_m + width * step, south_m + height * step)
+        for own in rasters.layers:
+            raster = stack.enter_context(opened(f"layer {own.name}", own.raster))
+            _check_covers(raster, crs, area, step)
+            sources.append((raster, own.how))
+        self.fields = {own.name: own.field for own in rasters.layers}
         self.layers: dict[str, Layer] = {}
         for raster, how in sources:
             is_photo = raster.argument == "photo"
@@ -136,6 +145,7 @@ class Survey:
                 layer = raster.laid(frame, [1, 2, 3] if is_photo else [1], way)
                 self.layers[raster.argument + f" {way}" * (way in ends)] = layer
                 stack.enter_context(layer.warped)
+        self.given = [raster.argument for raster, _ in sources]
         origins: dict[str, Any] = {raster.argument: provenance(raster.name) for raster, _ in sources}
         if rasters.classes:
             origins["classes"]["ids"] = {str(value): name for value, name in sorted(named.items())}
@@ -149,6 +159,9 @@ class Survey:
             "stride_m": [cells * step for cells in reversed(tiling.stride)],
             **{argument: origins.get(argument) for argument, _, _ in _OTHERS},
         }
+        if self.fields:
+            self.source["layers"] = {name: origins[f"layer {name}"] for name in self.fields}
+        self.valued: set[str] = set()
         self.known = []
         for offset, count, size in zip(offset_m, tiling.cells, whole_m, strict=True):
             edges = offset + step * np.arange(-1, count + 2)
@@ -166,7 +179,7 @@ class Survey:
         """Reads some maps.
 
         Returns:
-            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by the names of `Rasters` and
+            Elevation with one cell of the ground beyond, shape [B, H + 2, W + 2], and by the names in `given` and in
             `BANDS` what others say, shape [B, K, H, W]; NaN where there is nothing.
 
         Raises:
@@ -198,7 +211,16 @@ class Survey:
             if low < 0 or high > 1:
                 expected = "values of `traversability` in [0, 1]"
                 raise self._out_of_range("traversability", expected, low, high, low if low < 0 else high)
-        given = {name: maps[:, :, 1:-1, 1:-1] for name, maps in framed.items() if " " not in name}
+        for name, kind in self.fields.items():
+            low, high = _range(f"layer {name}", framed)
+            if low < kind.least or high > kind.most:
+                expected = f"values of `layer {name}` in [{kind.least:g}, {kind.most:g}]"
+                raise self._out_of_range(
+                    f"layer {name}", expected, low, high, low if low < kind.least else high
+                )
+            if low <= high:
+                self.valued.add(name)
+        given = {name: framed[name][:, :, 1:-1, 1:-1] for name in self.given}
         if "classes" in given:
             given["classes"] = self._classes(given["classes"])
         elif self.unlabelled:
@@ -232,6 +254,30 @@ class Survey:
                 f"rio edit-info --nodata VALUE {name}"
             )
         return indices
+
+
+def _check_covers(raster: Raster, crs: Any, area: tuple[float, float, float, float], step: float) -> None:
+    """Refuses a raster that does not reach over all maps, but for a cell; within it values may be missing.
+
+    Args:
+        raster: of a layer.
+        crs: of the maps.
+        area: west, south, east and north end of the maps, in metres.
+        step: cell width of the maps.
+
+    Raises:
+        DatasetError: it lies elsewhere, or covers a part.
+    """
+    with raster.warped(crs) as warped:
+        bounds, slack = warped.bounds, max(step, *warped.res)
+    ours, theirs = (" ".join(f"{value:.10g}" for value in ends) for ends in (area, bounds))
+    lacking = np.subtract(bounds, area) * (1, 1, -1, -1)
+    if (lacking > slack).any():
+        raise DatasetError(
+            f"Expected `{raster.argument}` over all of the ground, WEST SOUTH EAST NORTH {ours} in "
+            f"{crs.to_string()[:80]}, got {raster.name} over {theirs}. Take a raster that covers it, with a value for "
+            "missing where nothing is known, or cut `dem` out: rio clip DEM part.tif --bounds 'WEST SOUTH EAST NORTH'"
+        )
 
 
 def _range(name: str, maps: Maps) -> tuple[float, float]:

@@ -179,10 +179,14 @@ def describe(dataset: TerrainDataset, splits: Collection[str]) -> str:
     recipes = [dataset.manifest["recipes"][part["recipe"]] for part in parts if "recipe" in part]
     origins = sorted({f"recipe {recipe['id']}, seed {recipe['seed']}" for recipe in recipes})
     origins += sorted({f"file {part['source']['file']}" for part in parts if "source" in part})
+    units = {name: dataset.fields[name].unit for name in dataset.layer_names}
+    layers = [name if unit == "1" else f"{name} [{unit}]" for name, unit in units.items()]
+    with_layers = f"; layers {', '.join(layers)}, NaN where nothing is known" if layers else ""
     return (
         f"{maps} maps of off-road terrain, {grid.height} × {grid.width} cells of {grid.resolution_m:g} m: colour "
         "image, terrain class, elevation, slope, and traversability in [0, 1], of which higher is better; with start, "
-        f"goal and reference time. Written by {generator['package']} {generator['version']} from {'; '.join(origins)}."
+        f"goal and reference time{with_layers}. "
+        f"Written by {generator['package']} {generator['version']} from {'; '.join(origins)}."
     )
 
 
@@ -272,8 +276,14 @@ def _classes(dataset: TerrainDataset) -> Node:
         row = {"id": number, **asdict(item), "colour": f"#{bytes(item.colour).hex()}"}
         soft = row.pop("soft") or {}
         row |= {f"soft_{key}": soft.get(key, 0.0) for key in ("weight", "mean", "std")}
+        vegetation = row.pop("vegetation")
+        if dataset.recipe.has_vegetation:
+            low, high = vegetation["height_m"] if vegetation else (0.0, 0.0)
+            row |= {"vegetation_cover": vegetation["cover"] if vegetation else 0.0}
+            row |= {"vegetation_least_m": low, "vegetation_most_m": high}
+            row |= {"vegetation_colour": f"#{bytes(vegetation['colour']).hex()}" if vegetation else ""}
         rows.append({f"classes/{key}": value for key, value in row.items()})
-    kinds = {"id": "sc:Integer", "name": "sc:Text", "colour": "sc:Text"}
+    kinds = {"id": "sc:Integer", **dict.fromkeys(("name", "colour", "vegetation_colour"), "sc:Text")}
     fields = [_node("Field", key, dataType=kinds.get(key.rpartition("/")[2], "sc:Float")) for key in rows[0]]
     meaning = (
         "Terrain classes. At a slope of ψ degrees traversability is normal with mean 1 − (scale·10⁻³·ψ^exponent + "

@@ -8,6 +8,7 @@ from benchnav.core.settings import plain
 from benchnav.core.tables import Table
 from benchnav.datagen import schema
 from benchnav.datagen.files.reader import READ_ERRORS, TerrainDataset, damage, open_file
+from benchnav.datagen.recipe.classes import plain_classes
 
 _DIGESTS = {
     "digest": "content digests",
@@ -17,8 +18,10 @@ _DIGESTS = {
 
 def describe(dataset: TerrainDataset) -> schema.Json:
     """Gathers what `show` shows, ready for JSON."""
-    manifest, about = dataset.manifest, plain(dataset.recipe)
-    made_by = ("environments", "stuck_threshold", "synthesis", "places", "correlation_m", "classes")
+    manifest, recipe = dataset.manifest, dataset.recipe
+    about = plain(recipe) | {"classes": plain_classes(recipe.classes)}
+    made_by = ["environments", "stuck_threshold", "synthesis", "places", "correlation_m", "classes"]
+    made_by[-1:-1] = ["vegetation_period_m"] if recipe.has_vegetation else []
     return {
         "path": str(dataset.path),
         "bytes": sum(path.stat().st_size for path in dataset.files),
@@ -72,6 +75,8 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
             f", start and goal drawn a map, at least {places['least_distance_m']:g} m apart and "
             f"{places['margin_m']:g} m from the edges"
         )
+    if "vegetation_period_m" in described:
+        making += f", vegetation in patches of a period of {described['vegetation_period_m']:g} m"
     if described["correlation_m"]:
         making += f", λ correlated over {described['correlation_m']:g} m"
     yield making
@@ -90,22 +95,43 @@ def tables(described: schema.Json) -> Iterator[Table | str]:
             for name, entry in described["splits"].items()
         ),
     )
-    extra = [name for name in described["fields"] if name not in schema.FIELDS]
+    fields = schema.read_field_table(described["fields"])
+    layers = schema.layer_names(fields)
+    if layers:
+        yield Table(
+            title="layers",
+            headings=("layer", "unit", "meaning"),
+            rows=tuple((name, fields[name].unit, fields[name].meaning) for name in layers),
+        )
+    extra = [name for name in fields if name not in (*schema.FIELDS, *layers)]
     if extra:
         yield f"fields beside those of every dataset: {', '.join(extra)}"
     for key, title in _DIGESTS.items():
         yield title
         yield from (f"  {name:12} {entry[key]}" for name, entry in described["splits"].items())
-    headings, rows = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots"], []
+    headings = ["id", "class", "colour", "a", "b", "o", "σ", "soft spots", "vegetation"]
+    rows = []
     for number, item in enumerate(described["classes"]):
         colour = f"#{bytes(item['colour']).hex()}"
         numbers = [f"{item[key]:g}" for key in ("scale", "exponent", "offset", "noise")]
         soft = "{weight:.0%} N({mean:g}, {std:g})".format(**item["soft"]) if item["soft"] else ""
-        rows.append((str(number), item["name"], colour, *numbers, soft))
-    if not any(row[-1] for row in rows):
-        headings, rows = headings[:-1], [row[:-1] for row in rows]
+        rows.append((str(number), item["name"], colour, *numbers, soft, _vegetation(item.get("vegetation"))))
+    # What no class has is left out.
+    shown = [place for place, cells in enumerate(zip(*rows, strict=True)) if any(cells)]
     title = "classes: f(ψ) = 1 − (a·10⁻³·ψ^b + o)"
-    yield Table(title=title, headings=tuple(headings), rows=tuple(rows))
+    yield Table(
+        title=title,
+        headings=tuple(headings[place] for place in shown),
+        rows=tuple(tuple(row[place] for place in shown) for row in rows),
+    )
+
+
+def _vegetation(grown: schema.Json | None) -> str:
+    """What grows on a class, in words."""
+    if grown is None:
+        return ""
+    low, high = grown["height_m"]
+    return f"{grown['cover']:.0%} #{bytes(grown['colour']).hex()} {low:g}–{high:g} m"
 
 
 def _origin(described: schema.Json, part: schema.Json) -> str:

@@ -96,7 +96,7 @@ def whole(recipe: Recipe, files: Mapping[str, Sequence[Path]]) -> Contents:
     splits = {
         name: recipe_entry(recipe, ShardFile(name, 0, spec.maps)) for name, spec in recipe.splits.items()
     }
-    return Contents(recipe.id, [recipe], splits, files)
+    return Contents(recipe.id, [recipe], splits, files, recipe.fields)
 
 
 def recipe_entry(recipe: Recipe, shard: ShardFile) -> schema.Json:
@@ -134,7 +134,9 @@ def _fill(file: h5py.File, contents: Contents, sources: Mapping[str, Iterable[So
     file.flush()
 
 
-def pack(recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps) -> bytes:
+def pack(
+    recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps, fields: schema.Fields = schema.KNOWN
+) -> bytes:
     """Makes what a file of a few maps of one split holds, in memory.
 
     Args:
@@ -142,8 +144,9 @@ def pack(recipe: Recipe, split: str, entry: schema.Json, maps: schema.Maps) -> b
         split: name of the split.
         entry: the manifest's entry of the split without its digest.
         maps: every field of `schema.FIELDS`, and others that the dataset has, of shape [B, *entry shape].
+        fields: what maps may have; those that they have are stored, in this order.
     """
-    fields = {name: field for name, field in schema.KNOWN.items() if name in maps}
+    fields = {name: field for name, field in fields.items() if name in maps}
     contents = Contents(recipe.id, [recipe], {split: entry}, fields=fields)
     with h5py.File("packed", "w", driver="core", backing_store=False, libver=_LIBRARY) as file:
         digests = {schema.ENTRY_DIGESTS: schema.entry_digests(maps, fields)}

@@ -24,7 +24,7 @@ from benchnav.datagen.recipe.recipe import Recipe, check_name, recipe_from_dict
 # What a map's meaning rests on: alike in all files of a merge.
 _SHARED = (
     "height", "width", "resolution_m", "stuck_threshold", "classes", "environments", "occupancy",
-    "synthesis", "places", "correlation_m",
+    "synthesis", "places", "correlation_m", "vegetation_period_m",
 )  # fmt: skip
 
 
@@ -148,10 +148,16 @@ def why_unlike(datasets: Sequence[TerrainDataset]) -> Iterator[str]:
 
 
 def _differences(first: TerrainDataset, second: TerrainDataset) -> Iterator[str]:
-    if first.fields != second.fields:
-        extra = sorted(set(first.fields) ^ set(second.fields)) or ["fields"]
+    if extra := sorted(set(first.fields) ^ set(second.fields)):
         hint = ": import both with overlap or both without, by --stride" if extra == ["group"] else ""
         yield f"unlike fields ({', '.join(extra)} of one alone{hint})"
+    elif list(first.fields.items()) != list(second.fields.items()):
+        changed = [name for name in first.fields if first.fields[name] != second.fields[name]]
+        yield (
+            f"fields of unlike dtype, unit or meaning ({', '.join(changed)})"
+            if changed
+            else (f"unlike order of fields ({', '.join(first.fields)} / {', '.join(second.fields)})")
+        )
     ours, theirs = plain(first.recipe), plain(second.recipe)
     for name in _SHARED:
         if ours[name] != theirs[name]:

@@ -20,10 +20,10 @@ import numpy as np
 
 from benchnav.core.errors import DatasetError
 from benchnav.core.grid import Grid
-from benchnav.core.settings import plain
 from benchnav.core.shipped_files import shipped_folder
 from benchnav.core.store import unseal
 from benchnav.datagen import schema
+from benchnav.datagen.recipe.classes import plain_classes
 from benchnav.datagen.recipe.recipe import Recipe, recipe_from_dict
 from benchnav.datagen.schema import Maps
 
@@ -112,6 +112,11 @@ class TerrainDataset:
         """Names of `fields`."""
         return tuple(self.fields)
 
+    @property
+    def layer_names(self) -> tuple[str, ...]:
+        """Names of the layers among `fields`: what a model may see of the ground beside colour and shape."""
+        return schema.layer_names(self.fields)
+
     def truth_of(self, split: str) -> Literal["generated", "unknown"]:
         """Whether the distribution of λ in each cell of a split is known.
 
@@ -136,9 +141,14 @@ class TerrainDataset:
         Raises:
             DatasetError: there is no such split.
         """
-        recipe = plain(self.recipe)
-        about = {name: recipe[name] for name in ("classes", "stuck_threshold", "resolution_m")}
-        text = json.dumps(about | {"truth": self.truth_of(split)}, sort_keys=True)
+        recipe = self.recipe
+        about = {
+            "classes": plain_classes(recipe.classes),
+            "stuck_threshold": recipe.stuck_threshold,
+            "resolution_m": recipe.resolution_m,
+            "truth": self.truth_of(split),
+        }
+        text = json.dumps(about, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def split_digest(self, split: str) -> str:
@@ -294,7 +304,7 @@ class TerrainDataset:
         """Reads maps as Terrain, float32 on the CPU, the latent functions evaluated on what is stored."""
         from benchnav.datagen.files.stored_terrain import terrain_of
 
-        return terrain_of(self.read(split, indices, schema.MAP_FIELDS), self.recipe)
+        return terrain_of(self.read(split, indices, (*schema.MAP_FIELDS, *self.layer_names)), self.recipe)
 
     def map_count(self, split: str) -> int:
         """Number of maps of a split.

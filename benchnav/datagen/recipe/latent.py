@@ -55,26 +55,66 @@ def truth(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Paramet
     return weights, np.where(labelled[:, None], means, np.nan), stds
 
 
-def look_alikes(class_id: ndarray, slope_deg: ndarray, classes: ClassTable) -> Parameters:
+def look_alikes(
+    class_id: ndarray, slope_deg: ndarray, classes: ClassTable, overgrown: ndarray | None = None
+) -> Parameters:
     """What the colours tell of λ at best: the mixture over all classes that look like a cell's own.
 
-    They are shown together, and which of them takes which ground is drawn anew in each map, so that each
-    weighs the same.
+    Classes of one colour are shown together, and which of them takes which ground is drawn anew in each map, so that
+    each weighs the same. An overgrown cell hides its ground. It looks like those of all classes of its map on which
+    the same grows, by its colour, and each weighs as much as it is covered.
+
+    Where classes with one vegetation have one ground colour too, which recipes then give one cover, this is all that
+    a whole picture tells. Where they have not, bare ground beside a patch hints at the ground within, so that a model
+    that looks around can do better than this.
+
+    Args:
+        class_id: 255 where not known, shape [B, H, W].
+        slope_deg: shape [B, H, W].
+        classes: the class table.
+        overgrown: where vegetation hides the ground, bool, shape [B, H, W]; None for nowhere.
 
     Returns:
         As `truth`, with a component for each of the most classes that look alike.
     """
-    alike = look_alike_classes(classes)
     labelled = class_id != UNLABELLED
     class_id = np.where(labelled, class_id, 0)
+    alike, look = look_alike_classes(classes), class_id
+    shares = [dict.fromkeys(own, 1 / len(own)) for own in alike]
+    if overgrown is not None:
+        look = class_id + len(classes) * overgrown
+        shares += [_covers(number, classes) for number in range(len(classes))]
+        cells = [labelled & (class_id == number) for number in range(len(classes))]
+        shown = np.stack([own.any(axis=(1, 2)) for own in cells], axis=1)
     pieces = []
-    for place in range(max(len(own) for own in alike)):
-        other = np.take([own[place % len(own)] for own in alike], class_id)
-        share = np.take([1 / len(own) if place < len(own) else 0.0 for own in alike], class_id)
+    for place in range(max(map(len, shares))):
+        members = [tuple(own.items())[place % len(own)] for own in shares]
+        other = np.take([member for member, _ in members], look)
+        share = np.take(
+            [w if place < len(own) else 0.0 for own, (_, w) in zip(shares, members, strict=True)], look
+        )
+        if overgrown is not None:
+            own_map = np.arange(len(look))[:, None, None]
+            share = np.where(overgrown & labelled & ~shown[own_map, other], 0.0, share)
         weights, means, stds = truth(np.where(labelled, other, UNLABELLED), slope_deg, classes)
-        pieces.append((weights * share[:, None], means, stds))
-    weights, means, stds = (np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True))
-    return weights, means, stds
+        pieces.append((weights, means, stds, share))
+    weights, means, stds, share = (np.stack(parts, axis=1) for parts in zip(*pieces, strict=True))
+    if overgrown is not None:
+        share = share / share.sum(axis=1, keepdims=True)
+    flat = len(look), -1, *look.shape[1:]
+    return (weights * share[:, :, None]).reshape(flat), means.reshape(flat), stds.reshape(flat)
+
+
+def _covers(number: int, classes: ClassTable) -> dict[int, float]:
+    """Covers by class, of the classes with one's vegetation colour; of a class without vegetation itself alone."""
+    own = classes[number].vegetation
+    if own is None:
+        return {number: 1.0}
+    return {
+        other: item.vegetation.cover
+        for other, item in enumerate(classes)
+        if item.vegetation and item.vegetation.colour == own.colour
+    }
 
 
 def expected_of(parameters: Parameters) -> ndarray:

@@ -19,11 +19,12 @@ from benchnav.core.errors import ConfigError, expect
 from benchnav.core.grid import Grid
 from benchnav.core.settings import changed, load_yaml, plain, read, read_yaml
 from benchnav.datagen.recipe import latent
-from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes
+from benchnav.datagen.recipe.classes import ClassTable, look_alike_classes, plain_classes
 from benchnav.datagen.recipe.environments import AlikeClasses, deal_classes, deal_units, never_shown
+from benchnav.datagen.recipe.looks import check_looks
 from benchnav.datagen.recipe.places import PlacesRule, check_places
-from benchnav.datagen.recipe.scenario import PRESETS, RECIPES, Scenario, load_presets, resolve
-from benchnav.datagen.schema import FIELDS, UNLABELLED
+from benchnav.datagen.recipe.scenario import DEFAULTS, PRESETS, RECIPES, Scenario, load_presets, resolve
+from benchnav.datagen.schema import FIELDS, LAYERS, UNLABELLED, Fields
 
 _MOST_CRATERED = 0.4  # share of a map; discs laid at random one by one jam at 0.55
 _LEAST_GAP = 0.3  # between classes of one colour, in E[λ] on flat ground
@@ -67,6 +68,8 @@ class Recipe:
             that look alike, drawn places and correlated λ, and makes the same ground at any size.
         correlation_m: ℓ of stored λ: at distance d the noise of two cells has the correlation exp(−d²/2ℓ²);
             at 0, as in synthesis 1, each cell's is its own.
+        vegetation_period_m: lattice spacing of the noise that vegetation grows by: a patch is about half as wide;
+            0 where no class has vegetation. Synthesis 2 only.
         environments: number of environments; each shows its own choice of classes.
         occupancy: share of the cells that each class of an environment covers, summing to 1.
         class_periods_m: lattice spacings of the class noise, one an octave.
@@ -92,6 +95,7 @@ class Recipe:
     synthesis: int = 1
     places: PlacesRule | None = None
     correlation_m: float = 0.0
+    vegetation_period_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuses recipes that contradict themselves."""
@@ -103,9 +107,16 @@ class Recipe:
         _check_scenarios(self)
         _check_environments(self)
         _check_splits(self)
+        check_looks(self.classes, self.scenarios)
+        _check_vegetation(self)
         if self.synthesis == 1:
             soft = any(item.soft for item in self.classes)
-            asked = {"soft": soft, "places": self.places, "correlation_m": self.correlation_m}
+            asked = {
+                "soft": soft,
+                "vegetation": self.has_vegetation,
+                "places": self.places,
+                "correlation_m": self.correlation_m,
+            }
             for name, value in asked.items():
                 expect(
                     not value,
@@ -124,6 +135,16 @@ class Recipe:
     def grid(self) -> Grid:
         """Size and resolution of every map."""
         return Grid(self.height, self.width, self.resolution_m)
+
+    @property
+    def has_vegetation(self) -> bool:
+        """Whether anything grows on some class."""
+        return any(item.vegetation for item in self.classes)
+
+    @property
+    def fields(self) -> Fields:
+        """What a dataset of the recipe's maps has of each."""
+        return FIELDS | (LAYERS if self.has_vegetation else {})
 
     def cells_of(self, positions_m: ndarray) -> tuple[ndarray, ndarray]:
         """Rows and columns of the cells that positions [B, 2] lie in, read in single precision as stored."""
@@ -154,8 +175,12 @@ class Recipe:
 
     def to_dict(self) -> dict[str, Any]:
         """Gives the recipe as plain data for JSON, fully resolved."""
-        data: dict[str, Any] = plain(self)
+        data: dict[str, Any] = plain(self) | {"classes": plain_classes(self.classes)}
+        for scenario in data["scenarios"].values():
+            if not scenario["tints"]:
+                del scenario["tints"]  # as versions without them wrote it
         unused = ["places"] if self.places is None else ["start_m", "goal_m"]
+        unused += [] if self.has_vegetation else ["vegetation_period_m"]
         if self.synthesis == 1:
             # As version 0.1 wrote it, so that its files and readers stay as they are.
             unused += ["synthesis", "correlation_m"]
@@ -235,7 +260,7 @@ def recipe_from_dict(data: Any, origin: str) -> Recipe:
     expect(isinstance(data, dict), f"a mapping in recipe {origin}, got {type(data).__name__}.")
     data = _with_class_table(data)
     _, presets = load_presets(data.get("synthesis"))
-    scenarios = data.get("scenarios", {name: {"preset": name} for name in presets})
+    scenarios = data.get("scenarios", {name: {"preset": name} for name in DEFAULTS})
     if isinstance(scenarios, dict):
         scenarios = {name: resolve(entry, presets, name) for name, entry in scenarios.items()}
     try:
@@ -344,3 +369,17 @@ def _check_look_alikes(recipe: Recipe) -> None:
             "colour together; got no choice of others that goes with "
             f"{', '.join(names[member] for member in unit)}. Change `occupancy` or a `colour`."
         )
+
+
+def _check_vegetation(recipe: Recipe) -> None:
+    period_m, least_m = recipe.vegetation_period_m, 2 * recipe.resolution_m
+    if not recipe.has_vegetation:
+        return expect(
+            period_m == 0,
+            f"`vegetation_period_m` with `vegetation` of a class, got {period_m:g} and none. Leave it out.",
+        )
+    expect(
+        least_m <= period_m < np.inf,
+        f"`vegetation_period_m` of at least two cells, {least_m:g} m, where a class has `vegetation`, "
+        f"got {period_m:g}.",
+    )

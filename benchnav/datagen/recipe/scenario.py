@@ -1,4 +1,4 @@
-"""Scenarios, the geometry and light of a family of maps, and the shipped ones that recipes build on.
+"""Scenarios, the geometry, light and tints of a family of maps, and the shipped ones that recipes build on.
 
 `presets.yaml` holds the shipped class table and scenarios, which a recipe may name or replace. A
 scenario's `severity` s moves every number of it from `std` (s = 0) to the preset (s = 1), and beyond.
@@ -6,7 +6,7 @@ scenario's `severity` s moves every number of it from `std` (s = 0) to the prese
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,41 @@ PRESETS = RECIPES / "presets.yaml"
 Range = tuple[float, float]
 SeriesOfShifts = dict[str, list[tuple[float, str]]]
 
+# Those of a recipe that names none.
+DEFAULTS = ("std", "hg", "hs")
+
 _NAMED = re.compile(r"(?P<scenario>.*[^/])(-(?P<hundredths>\d{3})|@(?P<severity>\d+(\.\d+)?))")
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tint:
+    """What changes the colour of the ground and nothing else, such as snow or wetness.
+
+    Args:
+        classes: names of the classes that it changes; all when empty.
+        colour: RGB in full light that it changes them towards, 0–255.
+        share: how far, in (0, 1): (1 − share) of the class's own colour is left.
+    """
+
+    classes: tuple[str, ...] = ()
+    colour: tuple[int, int, int]
+    share: float
+
+    def __post_init__(self) -> None:
+        """Refuses what is no colour, and what would leave no colour of the class."""
+        expect(
+            all(0 <= value <= 255 for value in self.colour),
+            f"`colour` of a tint in 0–255, got {self.colour}.",
+        )
+        expect(
+            0 < self.share < 1,
+            f"`share` of a tint in (0, 1), got {self.share:g}. At severity 1 a preset has its own share.",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """Geometry and light of a family of maps; each range is drawn from uniformly, a value a map.
+    """Geometry, light and tints of a family of maps; each range is drawn from uniformly, a value a map.
 
     Args:
         relief_m: highest minus lowest elevation of the fractal ground.
@@ -37,6 +66,7 @@ class Scenario:
         crater_depth_ratio: depth below the rim over diameter.
         light_height: z of the unit vector toward the light; 1 is overhead.
         ambient: share of ambient light.
+        tints: what changes the colours of classes, one after another. Vegetation keeps its own.
     """
 
     relief_m: Range = (1.4, 1.7)
@@ -46,6 +76,7 @@ class Scenario:
     crater_depth_ratio: float = 0.1
     light_height: Range = (0.8, 1.0)
     ambient: float = 0.1
+    tints: tuple[Tint, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuses ranges that are not finite, ordered, or physical."""
@@ -76,13 +107,18 @@ class Scenario:
 
 
 def blend(base: Scenario, full: Scenario, severity: float) -> Scenario:
-    """Moves every number of a scenario from `base` (severity 0) to `full` (severity 1)."""
+    """Moves every number of a scenario from `base` (severity 0) to `full` (severity 1).
+
+    Of a tint of `full` that is its share; `base` has none, as `std` has none.
+    """
 
     def between(low: Any, high: Any) -> Any:
         return tuple(map(between, low, high)) if isinstance(low, tuple) else low + severity * (high - low)
 
-    goals = asdict(full)
-    return Scenario(**{name: between(value, goals[name]) for name, value in asdict(base).items()})
+    numbers = [item.name for item in fields(Scenario) if item.name != "tints"]
+    moved = {name: between(getattr(base, name), getattr(full, name)) for name in numbers}
+    tints = tuple(replace(tint, share=severity * tint.share) for tint in full.tints if severity)
+    return Scenario(**moved, tints=tints)
 
 
 def load_presets(synthesis: Any) -> tuple[list[Any], dict[str, Any]]:

@@ -115,16 +115,16 @@ def shade(along_x: ndarray, along_y: ndarray, light: ndarray, ambient: float) ->
     return np.maximum(cosine, 0) * (1 - ambient) + ambient
 
 
-def paint(class_id: ndarray, colours: ndarray, brightness: ndarray) -> ndarray:
-    """Colours each cell by its class under the given brightness.
+def paint(look: ndarray, colours: ndarray, brightness: ndarray) -> ndarray:
+    """Colours each cell by what it shows under the given brightness.
 
     Args:
-        class_id: shape [B, H, W].
-        colours: RGB of each class in full light, 0–255, shape [C, 3].
+        look: number of a colour, such as that of a class, shape [B, H, W].
+        colours: RGB in full light, 0–255, shape [N, 3].
         brightness: in [0, 1], shape [B, H, W].
 
     Returns:
         Image, uint8, shape [B, 3, H, W].
     """
-    lit = np.take(colours.T, class_id, axis=1) * brightness
+    lit = np.take(colours.T, look, axis=1) * brightness
     return np.moveaxis(np.rint(lit).astype(np.uint8), 0, 1)

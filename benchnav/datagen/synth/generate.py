@@ -12,10 +12,11 @@ from numpy import ndarray
 from benchnav.core import copula, gridgraph, rng
 from benchnav.core.errors import ConfigError
 from benchnav.datagen.recipe import latent
+from benchnav.datagen.recipe.looks import shown_colours
 from benchnav.datagen.recipe.places import draw_places
 from benchnav.datagen.recipe.recipe import REFERENCE_M, Recipe
-from benchnav.datagen.schema import FIELDS, Maps, join_maps, quantise
-from benchnav.datagen.synth import appearance, elevation
+from benchnav.datagen.schema import Maps, join_maps, quantise
+from benchnav.datagen.synth import appearance, elevation, vegetation
 
 MOST_ATTEMPTS = 200
 _PIECE = 16  # maps at a time, so that what is worked on stays in the processor's cache; of large maps fewer
@@ -31,7 +32,7 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
         indices: which maps, ascending integers ≥ 0, shape [B].
 
     Returns:
-        The fields of `schema.FIELDS`, each of shape [B, *entry shape].
+        The fields of `recipe.fields`, each of shape [B, *entry shape].
 
     Raises:
         ConfigError: a split asks for solvable maps and the recipe yields none for some index.
@@ -40,7 +41,7 @@ def generate(recipe: Recipe, split: str, indices: ndarray) -> Maps:
     size = min(_PIECE, recipe.grid.maps_in(_PIECE_CELLS))
     starts = range(0, max(len(indices), 1), size)
     maps = join_maps([_generate_piece(recipe, split, indices[start : start + size]) for start in starts])
-    return {name: maps[name].astype(field.dtype, copy=False) for name, field in FIELDS.items()}
+    return {name: maps[name].astype(field.dtype, copy=False) for name, field in recipe.fields.items()}
 
 
 def _generate_piece(recipe: Recipe, split: str, indices: ndarray) -> Maps:
@@ -105,6 +106,7 @@ def complete(
     class_id: ndarray,
     framed_m: ndarray,
     attempt: int = 0,
+    vegetation_m: ndarray | None = None,
 ) -> Maps:
     """Derives all else from classes and elevation: slope, colour under a random light, λ.
 
@@ -116,9 +118,10 @@ def complete(
         framed_m: elevation, with one cell of the ground beyond, NaN where that is not known, shape
             [B, H + 2, W + 2]; it is quantised first, and everything follows what is stored.
         attempt: how many draws of these maps were rejected before.
+        vegetation_m: what grows, 0 where the ground shows, shape [B, H, W]; None where nothing does.
 
     Returns:
-        The fields of `schema.FIELDS` but `reference_time_s`.
+        The fields of `schema.FIELDS` but `reference_time_s`, and `vegetation_m` where it is given.
     """
     key = partial(rng.stream_key, recipe.seed, split)
     scenario = recipe.scenarios[recipe.splits[split].scenario]
@@ -135,14 +138,16 @@ def complete(
         noise = copula.correlated_normal(noise_key, indices, shape, cells)
     realised = latent.quantile_of(latent.truth(class_id, slope, recipe.classes), noise)
     brightness = appearance.shade(*gradient, light, scenario.ambient)
-    colours = np.array([c.colour for c in recipe.classes], dtype=np.float64)
+    colours, look = shown_colours(recipe.classes, scenario), class_id
+    if vegetation_m is not None:
+        look = class_id + len(recipe.classes) * (vegetation_m > 0)
     if recipe.places is None:
         ends = np.array([recipe.start_m, recipe.goal_m], dtype=np.float64)
         start_m, goal_m = np.tile(ends[:, None], (1, len(indices), 1))
     else:
         start_m, goal_m = draw_places(recipe.places, recipe.grid, key("places", attempt), indices)
     return {
-        "rgb": appearance.paint(class_id, colours, brightness),
+        "rgb": appearance.paint(look, colours, brightness),
         "class_id": class_id,
         "elevation_m": ground[:, 1:-1, 1:-1],
         "slope_deg": slope,
@@ -150,6 +155,7 @@ def complete(
         "environment": indices % recipe.environments,
         "start_m": start_m,
         "goal_m": goal_m,
+        **({} if vegetation_m is None else {"vegetation_m": vegetation_m}),
     }
 
 
@@ -174,7 +180,27 @@ def _draw(recipe: Recipe, split: str, indices: ndarray, attempt: int) -> Maps:
             *craters, grid.shape, grid.resolution_m, scenario.crater_depth_ratio
         )
     class_id = class_map(recipe, split, indices, attempt)
-    return complete(recipe, split, indices, class_id, elevation.framed(ground), attempt)
+    return complete(
+        recipe,
+        split,
+        indices,
+        class_id,
+        elevation.framed(ground),
+        attempt,
+        _vegetation(recipe, split, indices, class_id, attempt),
+    )
+
+
+def _vegetation(
+    recipe: Recipe, split: str, indices: ndarray, class_id: ndarray, attempt: int
+) -> ndarray | None:
+    """What grows on classes [B, H, W], in metres; None where the recipe has no vegetation."""
+    if not recipe.has_vegetation:
+        return None
+    cells = recipe.vegetation_period_m / recipe.resolution_m
+    names, periods = (split, "vegetation", attempt), (cells, cells / 2)
+    noise = appearance.fractal_perlin(recipe.seed, names, indices, recipe.grid.shape, periods)
+    return vegetation.grow(class_id, noise, recipe.classes)
 
 
 def _within(limits: tuple[float, float], share: ndarray) -> ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of, hatching, outline
+from benchnav.core.figures import TRAVERSABILITY_COLOURS, bytes_of, hatching, layer_scale, outline
 
 # Dark red lies far from all colours of λ, for the colour-blind too.
 IMMOBILISING = "#a00000"
@@ -80,6 +80,14 @@ def draw_soft(panel: Axes, soft: np.ndarray, resolution_m: float) -> None:
 def shades(values: np.ndarray) -> np.ndarray:
     """Colours of λ, uint8, from any shape to [..., 3]."""
     return np.round(255 * matplotlib.colormaps[TRAVERSABILITY_COLOURS](values)[..., :3]).astype(np.uint8)
+
+
+def layer_colours(name: str, layer: np.ndarray) -> np.ndarray:
+    """Colours a layer, of shape [H, W], in grey where nothing is known; as `field_colours` does."""
+    scale = layer_scale(name, layer)
+    shown = layer % 360 if name.endswith("_azimuth_deg") else layer
+    share = (np.ma.masked_invalid(shown) - scale["vmin"]) / (scale["vmax"] - scale["vmin"])
+    return np.round(255 * scale["cmap"](share)[..., :3]).astype(np.uint8)
 
 
 def predicted_colours(predicted: np.ndarray, free: np.ndarray) -> np.ndarray:

@@ -110,4 +110,5 @@ class Recorder:
             actions=actions,
             traversability=traversability,
             plans=self._plans.get(member, ()),
+            layers={name: own(layer) for name, layer in problem.observation.layers.items()},
         )

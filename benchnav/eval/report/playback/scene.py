@@ -13,7 +13,14 @@ import rerun as rr
 
 from benchnav.core.figures import MARKS, bytes_of, hatching, outline
 from benchnav.eval.recording import Recording, drawing_interval, thinned
-from benchnav.eval.report.plan_layers import SOFT, STYLES, field_colours, predicted_colours, shades
+from benchnav.eval.report.plan_layers import (
+    SOFT,
+    STYLES,
+    field_colours,
+    layer_colours,
+    predicted_colours,
+    shades,
+)
 
 TIMELINE = "time"
 
@@ -58,7 +65,7 @@ class Driver:
 
 
 def log_ground(stream: Any, recording: Recording) -> None:
-    """Logs the ground as a mesh, and the maps that are no planner's own: colour, soft ground, λ in truth."""
+    """Logs the ground as a mesh, and the maps that are no planner's own: colour, layers, soft ground, λ in truth."""
     grid = recording.grid
     rows, columns = np.mgrid[: grid.height, : grid.width]
     x_m, y_m = ((cells + 0.5) * grid.resolution_m for cells in (columns, rows))
@@ -73,6 +80,8 @@ def log_ground(stream: Any, recording: Recording) -> None:
     )
     stream.log("world/terrain", mesh, static=True)
     _log_image(stream, "map/colour", np.moveaxis(recording.rgb, 0, -1))
+    for name, layer in recording.layers.items():
+        _log_image(stream, layer_entity(name), layer_colours(name, layer))
     _log_image(stream, "map/true_mean", shades(recording.true_mean))
     if recording.field is not None:
         _log_image(stream, "map/field", field_colours(recording.field, recording.immobilising))
@@ -84,6 +93,11 @@ def log_ground(stream: Any, recording: Recording) -> None:
     for name, place in (("start", recording.track[0]), ("goal", recording.goal_m)):
         entities, colour = (f"world/{name}", f"map/places/{name}"), bytes_of(MARKS[name]["color"])
         _log_both(stream, recording, entities, _POINTS, [place], (0.35, 0.7), static=True, colors=[colour])
+
+
+def layer_entity(name: str) -> str:
+    """Path of the image of a layer."""
+    return f"map/layers/{rr.escape_entity_path_part(name)}"
 
 
 def log_driver(stream: Any, driver: Driver) -> None:

@@ -1,6 +1,6 @@
 """Files for the Rerun viewer: one episode, or several on one map.
 
-A file holds the terrain as a mesh, its colours, λ in truth and as it was, the λ̂ that each planner was given,
+A file holds the terrain as a mesh, its colours and layers, λ in truth and as it was, the λ̂ that each planner was given,
 each robot with its heading at every step, the path driven so far, what the planner was thinking, how it
 ended, and time series; and a blueprint that arranges them.
 """
@@ -9,15 +9,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from benchnav.core.figures import bytes_of, condition_colours
+from benchnav.core.figures import bytes_of, condition_colours, layer_scale
 from benchnav.core.store import replacing
 from benchnav.core.tables import Bold, Table, to_markdown
 from benchnav.eval.experiment.condition import NOT_USED
 from benchnav.eval.recording import Recording
-from benchnav.eval.report.playback.scene import TIMELINE, Driver, log_driver, log_ground
+from benchnav.eval.report.playback.scene import TIMELINE, Driver, layer_entity, log_driver, log_ground
 from benchnav.eval.report.words import NAMING, contender_names
 
 APPLICATION = "benchnav"
@@ -119,6 +120,10 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
     colour = "Colour, soft ground hatched" if recording.soft.any() else "Colour"
     views = {
         colour: ["/map/colour", "/map/soft/**", _ALL, _PLACES],
+        **{
+            layer_title(name, layer): [f"/{layer_entity(name)}", _ALL, _PLACES]
+            for name, layer in recording.layers.items()
+        },
         "Mean λ in truth": ["/map/true_mean", *own, _ALL, _PLACES],
     }
     if recording.field is not None:
@@ -127,6 +132,14 @@ def map_views(drivers: Sequence[Driver]) -> dict[str, list[str]]:
         name = f"λ̂ given to {driver.name or 'the planner'}, free: {free_rule(driver.recording)}"
         views[name] = [driver.entity("/map/risk"), driver.entity("/map/overlay", "**"), _PLACES]
     return views
+
+
+def layer_title(name: str, layer: np.ndarray) -> str:
+    """What the view of a layer is called: its name, and the values of its lightest and its darkest colour."""
+    if name.endswith("_azimuth_deg"):
+        return f"{name}, directions"
+    scale = layer_scale(name, layer)
+    return f"{name}, {scale['vmin']:.3g} to {scale['vmax']:.3g}"
 
 
 def describe(drivers: Sequence[Driver]) -> str:
