@@ -77,7 +77,9 @@ OPTIONAL: dict[str, Field] = {
     ),
     # Of the measured λ, so no model may see them.
     "drive_count": Field("<i4", ("H", "W"), "1", 0, 2**31 - 1, "rows of a robot's log that λ is the mean of"),
-    "drive_std": Field("<f4", ("H", "W"), "1", 0, 1, "standard deviation of λ over these rows; NaN under two"),
+    "drive_std": Field(
+        "<f4", ("H", "W"), "1", 0, 1, "standard deviation of λ over these rows; NaN under two"
+    ),
 }
 
 KNOWN = FIELDS | OPTIONAL
