@@ -592,6 +592,12 @@ def test_the_default_splits_are_for_training(
     assert datagen(common, monkeypatch) == 2
     assert "--overwrite" in capfd.readouterr().err
     assert datagen(common + " --class-ids '{7: null, 3: gravel}' --overwrite", monkeypatch) == 2
+    assert (
+        "no cell with a class or a measured λ, or cells without a class and no photo"
+        in capfd.readouterr().err
+    )
+    assert datagen(common + " --class-ids '{7: scree}' --overwrite", monkeypatch) == 0
+    assert not (TerrainDataset("site").read("train")["class_id"] == gravel).any()
 
 
 def test_an_import_of_drives_that_fails_leaves_nothing(dem: Path) -> None:
