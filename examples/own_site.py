@@ -57,7 +57,7 @@ def survey(folder: Path) -> Terrain:
 
 
 def drive(terrain: Terrain) -> pd.DataFrame:
-    """Lets a robot drive straight from place to place, several times, and logs what it knows of itself."""
+    """Lets robots drive straight from place to place, each several times, and logs what they know of themselves."""
     task = planning.Task(robot=planning.Unicycle(), objective=planning.GoalDistance(), rules=planning.Rules())
     extent = torch.tensor(terrain.grid.extent_m)
     share = torch.rand(DRIVES, 2, generator=GENERATOR)
@@ -67,18 +67,15 @@ def drive(terrain: Terrain) -> pd.DataFrame:
     for leg in range(LEGS):
         way = REACH_M * (2 * torch.rand(DRIVES, 2, generator=GENERATOR) - 1)
         goal = torch.minimum((position + way).clamp(min=2), extent - 2)
-        world = planning.World(
-            noise="stored", time_budget_s=LEG_S
-        )  # the λ of the ground is the same on every drive
-        places = planning.Places(
-            start_m=position, goal_m=goal, reference_time_s=torch.full((DRIVES,), torch.nan)
-        )
+        # The λ of the ground is the same on every drive.
+        world = planning.World(noise="stored", time_budget_s=LEG_S)
+        unknown = torch.full((DRIVES,), torch.nan)
+        places = planning.Places(start_m=position, goal_m=goal, reference_time_s=unknown)
         simulation = planning.Simulation(terrain, task, world, places, 0, range(DRIVES))
         maps = terrain.observe(), terrain.truth, terrain.traversability  # which `Straight` does not look at
         problem = planning.pose_problem(task, *maps, position, goal, LEG_S)
         planner, state = planning.Straight(), simulation.init(problem.start)
-        plan = planner.init(problem, GENERATOR)
-        met = torch.full((DRIVES,), torch.nan)
+        plan, met = planner.init(problem, GENERATOR), unknown
         for step in range(steps):
             now = planning.Step(state=state.state, traversability=met, time_s=step * task.robot.dt_s)
             action, plan, _ = planner.plan(now, plan)
