@@ -20,11 +20,8 @@ import pandas as pd
 import rasterio
 import torch
 
-from benchnav import Terrain
+from benchnav import Terrain, planning
 from benchnav.datagen import TerrainDataset, create_dataset, load_recipe
-from benchnav.planning import GoalDistance, Rules, Step, Straight, Task, Unicycle, pose_problem
-from benchnav.planning.world.simulation import Simulation
-from benchnav.planning.world.world import Places, World
 
 WEST, SOUTH, CELL = 500_000.0, 4_000_000.0, 0.5
 HEIGHT, WIDTH = 96, 640  # cells: 48 m × 320 m
@@ -60,8 +57,8 @@ def survey(folder: Path) -> Terrain:
 
 
 def drive(terrain: Terrain) -> pd.DataFrame:
-    """Lets a robot drive straight from place to place, several times, and logs what it knows of itself."""
-    task = Task(robot=Unicycle(), objective=GoalDistance(), rules=Rules())
+    """Lets robots drive straight from place to place, each several times, and logs what they know of themselves."""
+    task = planning.Task(robot=planning.Unicycle(), objective=planning.GoalDistance(), rules=planning.Rules())
     extent = torch.tensor(terrain.grid.extent_m)
     share = torch.rand(DRIVES, 2, generator=GENERATOR)
     share[:, 0] = (torch.arange(DRIVES) + 0.5) / DRIVES  # all along the site
@@ -70,16 +67,17 @@ def drive(terrain: Terrain) -> pd.DataFrame:
     for leg in range(LEGS):
         way = REACH_M * (2 * torch.rand(DRIVES, 2, generator=GENERATOR) - 1)
         goal = torch.minimum((position + way).clamp(min=2), extent - 2)
-        world = World(noise="stored", time_budget_s=LEG_S)  # the λ of the ground is the same on every drive
-        places = Places(start_m=position, goal_m=goal, reference_time_s=torch.full((DRIVES,), torch.nan))
-        simulation = Simulation(terrain, task, world, places, 0, range(DRIVES))
+        # The λ of the ground is the same on every drive.
+        world = planning.World(noise="stored", time_budget_s=LEG_S)
+        unknown = torch.full((DRIVES,), torch.nan)
+        places = planning.Places(start_m=position, goal_m=goal, reference_time_s=unknown)
+        simulation = planning.Simulation(terrain, task, world, places, 0, range(DRIVES))
         maps = terrain.observe(), terrain.truth, terrain.traversability  # which `Straight` does not look at
-        problem = pose_problem(task, *maps, position, goal, LEG_S)
-        planner, state = Straight(), simulation.init(problem.start)
-        plan = planner.init(problem, GENERATOR)
-        met = torch.full((DRIVES,), torch.nan)
+        problem = planning.pose_problem(task, *maps, position, goal, LEG_S)
+        planner, state = planning.Straight(), simulation.init(problem.start)
+        plan, met = planner.init(problem, GENERATOR), unknown
         for step in range(steps):
-            now = Step(state=state.state, traversability=met, time_s=step * task.robot.dt_s)
+            now = planning.Step(state=state.state, traversability=met, time_s=step * task.robot.dt_s)
             action, plan, _ = planner.plan(now, plan)
             after, met = simulation.step(state, action)
             moved = (after.state - state.state)[:, :2].norm(dim=1) / task.robot.dt_s

@@ -224,6 +224,11 @@ def test_gps_are_measured_on_whole_drives_of_a_log(
         assert f"gp: NLL of 20 rows held out, {whose}, " in said
     measured = {name: load_checkpoint(name).part("gp").metrics["held_out_nll"] for name in ("one", "none")}
     assert measured["one"] == measured["none"]
+    for seed in range(1, 4):
+        where = ("--data", "drives.csv", "--out", f"drives-{seed}", "--seed", seed)
+        assert call(monkeypatch, "gp", *where, *QUICK_GP) == 0
+        measured[f"{seed}"] = load_checkpoint(f"drives-{seed}").part("gp").metrics["held_out_nll"]
+    assert len({measured[f"{seed}"] for seed in range(1, 4)}) > 1
 
 
 def test_a_damaged_checkpoint_is_replaced_by_gps_of_a_log_where_that_is_asked_for(

@@ -254,6 +254,25 @@ def test_splits_share_no_drive_and_no_cell(
     np.testing.assert_array_equal(window, read[:, 3:9, 2:7])
 
 
+def test_a_split_that_would_be_without_a_drive_takes_the_one_that_loses_least() -> None:
+    tiling = cut((8, 80), (8, 8), (8, 8), {"a": 0.5, "b": 0.5})
+    columns = {"far": [(0, 10), (70, 3)], "near": [(0, 9), (70, 4)], "both": [(0, 20), (70, 1)]}
+    parts = [
+        pd.DataFrame({"column": column, "drive": place, "traversability": 0.5}, index=range(count))
+        for place, runs in enumerate(columns.values())
+        for column, count in runs
+    ]
+    rows = pd.concat(parts, ignore_index=True).assign(x=0.0, y=0.0, time_s=0.0, speed=1.0)
+    log = DriveLog(
+        settings=Drives(file="x.csv"), sha256="", names=tuple(columns), is_geographic=False, rows=rows
+    )
+    used, _ = drive_over(log, tiling, np.zeros(len(rows), int), rows["column"].to_numpy())
+    about = describe_drives(used, ["a", "b"])
+    assert about["drives"] == {"a": ["far", "both"], "b": ["near"]}
+    assert about["used"] == {"a": 30, "b": 4}
+    assert about["left_out"] == {"between_maps": 0, "other_split": 13}
+
+
 def best_dealing(counts: np.ndarray) -> int:
     """Most rows that a dealing of drives [D] to splits [S] uses, no split without a drive; by trying all."""
     best = {(False,) * counts.shape[1]: 0}
@@ -325,7 +344,9 @@ def test_drives_to_the_edge_of_the_ground_are_used_whole(dem: Path) -> None:
     corners = np.array([[0.01, 0.01], [WIDTH * CELL - 0.01, HEIGHT * CELL - 0.01]])
     x, y = np.linspace(*corners, 500).T
     rows = pd.DataFrame({"x": x, "y": y, "time_s": 0.0, "commanded_m_s": 1.0, "measured_m_s": field(x, y)})
-    rows = pd.concat([rows, rows.assign(x=rows["x"] - 2, y=-1.0)])  # and some of it off the ground
+    beyond = [rows.assign(y=y).head(100) for y in (-0.01, HEIGHT * CELL + 0.01)]
+    beyond += [rows.assign(x=x).head(150) for x in (-0.01, WIDTH * CELL + 0.01)]
+    rows = pd.concat([rows, *beyond])
     dataset = imported(dem, log_of(rows, dem.parent / "log.csv"), shares={"train": 1.0})
     about = source_of(dataset)
     assert about["drives"]["left_out"] == {
@@ -571,6 +592,12 @@ def test_the_default_splits_are_for_training(
     assert datagen(common, monkeypatch) == 2
     assert "--overwrite" in capfd.readouterr().err
     assert datagen(common + " --class-ids '{7: null, 3: gravel}' --overwrite", monkeypatch) == 2
+    assert (
+        "no cell with a class or a measured λ, or cells without a class and no photo"
+        in capfd.readouterr().err
+    )
+    assert datagen(common + " --class-ids '{7: scree}' --overwrite", monkeypatch) == 0
+    assert not (TerrainDataset("site").read("train")["class_id"] == gravel).any()
 
 
 def test_an_import_of_drives_that_fails_leaves_nothing(dem: Path) -> None:
