@@ -66,7 +66,7 @@ def test_of_a_checkpoint_of_a_users_class_both_count(tmp_path: Path, monkeypatch
     given = {"model": "own.py:CellModel@c"}
 
     def parts() -> dict[str, str]:
-        return describe_parts(condition(**given))["parts"]
+        return describe_parts(condition(planners="mppi", **given))["parts"]
 
     first = parts()
     assert set(first) == {"model own.py:CellModel@c", "class of model own.py:CellModel@c"}
