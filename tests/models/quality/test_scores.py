@@ -15,6 +15,7 @@ from torchmetrics.functional.classification import multiclass_calibration_error
 
 from benchnav.core import registry
 from benchnav.core.mixture import TraversabilityMixture
+from benchnav.core.quantiles import LEVELS, QuantileDistribution
 from benchnav.datagen.files.create import create
 from benchnav.datagen.files.reader import TerrainDataset
 from benchnav.datagen.recipe.recipe import load_recipe
@@ -381,3 +382,17 @@ def test_a_dataset_without_look_alikes_has_no_such_numbers(dataset: TerrainDatas
         json.loads(quality_json({}, qualities))["splits"]["test/std"]
     )
     assert "look-alike" not in quality_csv(qualities)
+
+
+def test_pit_is_drawn_within_any_atom() -> None:
+    levels = torch.tensor(LEVELS, dtype=torch.float64)
+    quantiles = torch.where((levels >= 0.1) & (levels <= 0.6), 0.3, 0.3 + levels - 0.6)
+    quantiles = torch.where(levels < 0.1, 3 * levels, quantiles).clamp(0, 1)
+    law = QuantileDistribution(quantiles.view(-1, 1, 1).expand(-1, 200, 200).contiguous())
+    observed = law.from_normal(torch.randn(200, 200, generator=generator(3), dtype=torch.float64))
+    assert float((observed == quantiles[30]).double().mean()) == pytest.approx(0.5, abs=0.01)
+    transformed = pit(law, observed, generator(1))
+    assert coverage(transformed) == pytest.approx(0.9, abs=0.006)
+    assert tail_rate(transformed) == pytest.approx(0.1, abs=0.006)
+    counts = pit_counts(transformed)
+    assert 1800 < int(counts.min()) <= int(counts.max()) < 2200
